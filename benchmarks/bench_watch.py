@@ -16,7 +16,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import begun_watch, resumed_watch
+from twin_master.watch.opening import begin_watch, resume_watch
 
 STEPS = 20_000
 REPETITIONS = 7
@@ -53,7 +53,7 @@ def taken_up(folder: Path, log: Path) -> tuple[float, float]:
     journal = folder / JOURNAL_NAME
     size = journal.stat().st_size
     begin = time.process_time()
-    with resumed_watch(folder, None, SilentProgress()) as watch:
+    with resume_watch(folder, None, SilentProgress()) as watch:
         prepared = time.process_time()
         try:
             watch.last_decision()
@@ -80,10 +80,10 @@ def run() -> list[Measurement]:
         for steps in (1, 99, STEPS + 19):  # 32 steps between two lines with all that is needed
             folder = place / str(steps)
             loaded = load_scenario(SCENARIO)
-            with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
+            with begin_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
                 if not log.exists():
                     record(watch, log, STEPS + 20)
-                watch.run(file_feed(log, watch.scenario), lambda _decision: None, steps=steps)
+                watch.run(file_feed(log, watch.scenario), lambda _decision: None, step_limit=steps)
             seconds[steps] = np.median(
                 [in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0
             )

@@ -17,7 +17,7 @@ from discrepancy.system.excitation import Excitation, Load, ReleasePoint
 from discrepancy.system.interface import Model
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.load_change import require_release
-from discrepancy.system.motion import motion_of
+from discrepancy.system.motion import simulate_motion
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 from discrepancy.system.scales import PortScale, Scales
@@ -192,12 +192,12 @@ class Cantilever(Model):
                 largest,
                 float(w**2 / (row @ system.shapes[:, 0]) ** 2),
                 w,
-                float(1.0 / (row @ system.flexibility(row))),
+                float(1.0 / (row @ system.apply_flexibility(row))),
             )
         dynamic = [trial for trial in campaign.fitted if trial.is_dynamic]
         return Scales(
             length=LENGTH,
-            tip_stiffness=float(1.0 / (TIP @ system.flexibility(TIP))),
+            tip_stiffness=float(1.0 / (TIP @ system.apply_flexibility(TIP))),
             modal_mass=float(1.0 / (TIP @ system.shapes[:, 0]) ** 2),
             angular_frequency=w,
             force=max(float(np.max(np.abs(trial.force))) for trial in campaign.fitted),
@@ -253,15 +253,15 @@ def _motion(
     laws = port_laws(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
-        excitation = Excitation(trial.time, conditions.stamps(trial.time))
+        excitation = Excitation(trial.time, conditions.motion_times(trial.time))
         if trial.kind is TrialKind.RINGDOWN:
             point = ReleasePoint(TIP, require_release(trial))
             excitation = replace(excitation, release=point, initial=conditions.initial)
         else:
             history = RecordedHistory(trial.time, force, trial.hold)
             excitation = replace(excitation, loads=[Load(row, history)])
-        motion = motion_of(system, excitation, laws, conditions.refinement)
-        response = motion.response([OutputEquation.of_row(row) for row in rows])
+        motion = simulate_motion(system, excitation, laws, conditions.refinement)
+        response = motion.response([OutputEquation.from_row(row) for row in rows])
         return response.values, response.rates, chord_offset * force
     loads = np.outer(force, row)
     for n in range(len(force)):

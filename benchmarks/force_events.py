@@ -27,7 +27,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.events import find_events
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.model_choice import load_model
-from discrepancy.workflow import checked
+from discrepancy.workflow import check_and_prepare
 
 MASS = "mass = 2.0\nstiffness = 200.0\ndamping = { matrix = 1.2 }\n" + (
     entry("input", name="drive", vector=1.0, quantity="force")
@@ -304,7 +304,7 @@ def write_record(
 def problem_of(case: Case) -> Problem:
     """Return a case with its model, all of its records fitted."""
     model = load_model(case.folder / "model.toml")
-    campaign, _ = checked(read_campaign(case.folder), model, hold_out=False)
+    campaign, _ = check_and_prepare(read_campaign(case.folder), model, hold_out=False)
     return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
 
 

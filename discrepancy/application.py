@@ -31,7 +31,7 @@ ENDINGS = (".toml", ".json", ".fmu")
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedVerdict:
     """A patched model.
 
     Attributes
@@ -57,7 +57,7 @@ def apply_verdict(
     member: str | None = None,
     replace: bool = False,
     progress: Progress | None = None,
-) -> Applied:
+) -> AppliedVerdict:
     """Write the model of a verdict with the effects that were found, and its parameters.
 
     Parameters
@@ -99,7 +99,7 @@ def apply_verdict(
     stored = files.read_verdict_file(verdict_file)
     applied_patch = _patch_to_apply(stored, verdict_file, member)
     choice = model_of(stored.origin, verdict_file, progress)
-    patch = changed(applied_patch, origin=stored.origin).upon(choice.built_in)
+    patch = changed(applied_patch, origin=stored.origin).combine_with(choice.built_in)
     has_laws_only = choice.kind is ModelKind.LUMPED and all(
         isinstance(primitive, PortForce) and not primitive.windows for primitive in patch.patch
     )
@@ -108,11 +108,11 @@ def apply_verdict(
         out = f"{stem}_patched{'.toml' if has_laws_only else '.json'}"
     path = Path(out)
     _check_destination(path, choice, verdict_file, replace=replace)
-    sentence = f"{_applied_effects(applied_patch)}, {_certainty(applied_patch, stored)}."
+    sentence = f"{_applied_effects(applied_patch)}, {_certainty_clause(applied_patch, stored)}."
     patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
     if path.suffix == ".fmu":
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
-        return Applied(path, sentence, "")
+        return AppliedVerdict(path, sentence, "")
     if path.suffix == ".toml":
         if not has_laws_only:
             raise ModelError(
@@ -122,7 +122,7 @@ def apply_verdict(
         atomic_write_text(path, _lumped_text(choice, patch))
     else:
         files.write_patch(path, patch)
-    return Applied(path, sentence, _command_with_model(stored.origin.command, path))
+    return AppliedVerdict(path, sentence, _command_with_model(stored.origin.command, path))
 
 
 def _check_destination(
@@ -162,7 +162,7 @@ def _applied_effects(patch: files.StoredPatch) -> str:
     return capital(" and ".join(phrases))
 
 
-def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
+def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
     """Return how certain the effects of a patch are, as the end of a sentence."""
     certainty = {
         VerdictKind.NAMED: "named",
@@ -177,12 +177,12 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
     return certainty[patch.verdict]
 
 
-def gives(verdict: Verdict, proof: Proof | None) -> bool:
+def has_applicable_effects(verdict: Verdict, proof: Proof | None) -> bool:
     """Return whether a verdict has effects that can be applied to the model.
 
     Effects that increase the error are never applied.
     """
-    if proof is not None and proof.grew:
+    if proof is not None and proof.has_grown:
         return False
     if verdict.kind is VerdictKind.UNEXPLAINED:
         return _proved_hypothesis(verdict, proof) is not None
@@ -215,7 +215,7 @@ def _patch_to_apply(
         raise DiscrepancyError(
             f"--member {member!r} is none of {file}, which has {members}: leave it out."
         )
-    if stored.proof is not None and stored.proof.grew:
+    if stored.proof is not None and stored.proof.has_grown:
         raise DiscrepancyError(
             f"{file} gives nothing to apply: its proof says that the error grows with what was "
             "found."
@@ -391,13 +391,15 @@ def pack_patched(
     return [f"effect.{effect.id}.active" for effect in effects.effects]
 
 
-def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
+def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> str:
     """Pack the FMU of a wing with the patch of a verdict, and return a sentence about it.
 
     Its effects are switched off.
     """
     try:
-        switches = pack_patched(choice, files.read_patch(patch_file).upon(choice.built_in), path)
+        switches = pack_patched(
+            choice, files.read_patch(patch_file).combine_with(choice.built_in), path
+        )
     except PatchFileError as cause:
         return f"There is no patched FMU: {cause}"
     return f"{path.name} carries it, off until {', '.join(switches)} is set to 1."

@@ -165,7 +165,7 @@ def shipped_schema(name: str) -> dict[str, Any]:
     return schema
 
 
-def plain(value: Any) -> Any:
+def plain_data(value: Any) -> Any:
     """Return a record as plain data for JSON, with nan as None and infinity as "Infinity"."""
 
     def not_finite(number: float) -> str | None:
@@ -197,7 +197,7 @@ def write_document(path: Path, schema: str, record: object) -> Path:
     reporting.errors.FileNotWrittenError
         If it cannot be written.
     """
-    content = plain(record)
+    content = plain_data(record)
     try:
         _record_of(type(record), content)
     except _InvalidDocumentError as cause:

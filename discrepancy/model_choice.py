@@ -97,13 +97,13 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         If there is no such model, or its file cannot be used.
     """
     if name is None:
-        return _wing(WingModel.of_design(None, progress), ModelKind.WING, None)
+        return _choose_wing(WingModel.of_design(None, progress), ModelKind.WING, None)
     path = Path(name)
     file = str(path.resolve() if path.exists() else name)
-    return replace(_chosen(path, progress), file=file)
+    return replace(_choose(path, progress), file=file)
 
 
-def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
+def _choose(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a file or a folder, or the shipped one of this name.
 
     The entry `file` of the result is not set yet.
@@ -121,9 +121,9 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
             f"There is no model file {path}; give a calibration (.nc) or a model (.toml)."
         )
     if path.suffix == ".nc":
-        return _wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path)
+        return _choose_wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path)
     if path.suffix == ".json":
-        return _patched(path, progress)
+        return _choose_patched(path, progress)
     if path.suffix not in ("", ".toml"):
         shipped_names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
         raise ModelError(
@@ -134,14 +134,14 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix == ".toml":
         content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
-            return _fmu(path)
+            return _choose_fmu(path)
         if is_structure(content):
-            return _structure(path, progress)
+            return _choose_structure(path, progress)
         if "format" not in content:  # a wing design has none
-            return _wing(WingModel.of_design(path, progress), ModelKind.WING, path)
+            return _choose_wing(WingModel.of_design(path, progress), ModelKind.WING, path)
     is_name = not path.exists()
     if is_name and str(path) in structure_files():
-        return _structure(structure_files()[str(path)], progress)
+        return _choose_structure(structure_files()[str(path)], progress)
     if is_name and not path.suffix:
         _refuse_near_structure(str(path))
     model = LumpedModel.load(path)
@@ -227,14 +227,14 @@ def choice_of_run(folder: Path) -> ModelChoice:
     """
     model, wing_file, patch_file = run_model(folder)
     kind = ModelKind.CALIBRATION if wing_file.suffix == ".nc" else ModelKind.WING
-    choice = _wing(model, kind, wing_file)
+    choice = _choose_wing(model, kind, wing_file)
     if patch_file is None:
         return choice
     source_hash = hash_record({"model": choice.source_hash, "patch": hash_file(patch_file)})
     return replace(choice, source_hash=source_hash)
 
 
-def _patched(path: Path, progress: Progress | None) -> ModelChoice:
+def _choose_patched(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a patch file: the model that the patch was made for, with its effects."""
     stored = read_patch(path)
     base = model_of(stored.origin, path, progress)
@@ -243,15 +243,15 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
     }
     return replace(
         base,
-        model=base.model.patched(stored.patch, calibrated),
+        model=base.model.with_patch(stored.patch, calibrated),
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
-        built_in=stored.upon(base.built_in),
+        built_in=stored.combine_with(base.built_in),
         beneath=(*base.beneath, base.file),
     )
 
 
-def _structure(path: Path, progress: Progress | None) -> ModelChoice:
+def _choose_structure(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a structure's file, reduced with its ports."""
     with ModelError.instead_of(FiniteElementError):
         reduced = reduced_model(path, progress=progress, with_ports=True)
@@ -266,7 +266,7 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     )
 
 
-def _fmu(path: Path) -> ModelChoice:
+def _choose_fmu(path: Path) -> ModelChoice:
     """Return the model of an FMU's description.
 
     Its `source_hash` covers the description, the FMU and the binding.
@@ -287,7 +287,7 @@ def _fmu(path: Path) -> ModelChoice:
     )
 
 
-def _wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
+def _choose_wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
     """Return the choice of a wing model, from its calibration, its design or the shipped design.
 
     Parameters

@@ -86,7 +86,7 @@ class ClosedShare:
     trial_count: int
 
     @property
-    def grew(self) -> bool:
+    def has_grown(self) -> bool:
         """Whether the error is larger with the hypothesis than without it.
 
         Either it is clearly larger, or the whole interval says so.
@@ -129,6 +129,6 @@ class Proof:
     effects: tuple[str, ...] = ()
 
     @property
-    def grew(self) -> bool:
+    def has_grown(self) -> bool:
         """Whether the error is larger with the hypothesis than without it."""
-        return self.closed is not None and self.closed.grew
+        return self.closed is not None and self.closed.has_grown

@@ -14,32 +14,32 @@ class SearchSettings:
     # data
     prior_none: float = 0.5
     """Probability that nothing is missing: a name has to be earned."""
-    set_shares: tuple[float, ...] = (0.97, 0.029, 0.001)
+    set_probabilities: tuple[float, ...] = (0.97, 0.029, 0.001)
     """Fractions of the remaining probability for sets of one, two and three effects.
 
     Larger sets are not searched.
     """
 
     # ---------------------------------------------------------------- what is named
-    sure: float = 0.95
+    name_probability: float = 0.95
     """Least probability of a named set of effects."""
-    bayes_factor: float = 3.0
+    least_log_bayes_factor: float = 3.0
     """Least log Bayes factor of a named set against 'none'."""
-    unsure: float = 0.5
+    inconclusive_probability: float = 0.5
     """Probability of 'none' below which the data leave open whether something is missing."""
     largest_group: int = 6
     """Most members of a group; a larger group would say nothing."""
 
     # ---------------------------------------------------------------- screening: what is worth a
     # fit
-    levels: tuple[tuple[float, ...], ...] = (
+    grid_levels: tuple[tuple[float, ...], ...] = (
         (),
         (-1.5, -0.5, 0.5, 1.5),
         (-1.3, 0.0, 1.3),
         (-1.2, 0.0, 1.2),
     )
     """Grid of the scaled parameters other than magnitudes, by the number of such parameters."""
-    levels_of_many: tuple[float, ...] = (-1.0, 1.0)
+    grid_levels_if_many: tuple[float, ...] = (-1.0, 1.0)
     """The same grid for four or more of them: its size grows exponentially with their number."""
     largest_start: float = 2.5
     """Largest scaled magnitude at which fits begin; farther out, scales mean little."""
@@ -48,84 +48,85 @@ class SearchSettings:
 
     An effect that shifts phases (clock, drift) is nonlinear at one deviation, before nuisances can
     compensate for the part that they share with it."""
-    first_order: float = 25.0
+    first_order_change: float = 25.0
     """Squared change of all readings [noise variances] to which an effect is reduced, so that its
     direction can be computed to first order."""
     zero_padding: int = 4
     """Factor of zero padding of spectra, because lines lie between the frequencies of a record."""
     most_peaks: int = 3
     """Peaks of a spectrum that are tried."""
-    starts: int = 2
+    starts_near_data: int = 2
     """Starts of the fit of each effect, if the model is close to the data."""
-    far_starts: int = 2
+    starts_far_from_data: int = 2
     """The same if the model is far from the data; the starts are the best points of a grid."""
-    far_levels: tuple[int, ...] = (1, 25, 5, 5, 3)
+    grid_levels_far_from_data: tuple[int, ...] = (1, 25, 5, 5, 3)
     """Levels of each parameter on that grid, by the number of parameters.
 
     The grid is fine, because friction that ends motions has many local optima over its size, and
     the right one is narrow."""
     few_places: int = 3
     """Effects with more places than this concern single channels, and are linear in their size."""
-    worth_fitting: float = 2.0
+    least_gain_to_fit: float = 2.0
     """Screened gain below which an effect is not fitted at all: it could not win a name."""
-    worth_adding: float = 4.0
+    least_gain_to_add: float = 4.0
     """The same for a further effect in a set, whose prior probability is smaller."""
-    pairs_fitted: int = 8
+    most_fitted_pairs: int = 8
     """Most pairs of effects that are fitted, of all that are screened."""
 
     # ---------------------------------------------------------------- rough fits
-    rough_steps: int = 8
+    rough_fit_iterations: int = 8
     """Iterations of a rough fit, which begins at the result of a screen."""
-    out_of_reach: float = 36.0
-    """A rough fit ends early if it cannot come within this log evidence of the best: 3 `close`."""
+    largest_rough_deficit: float = 36.0
+    """A rough fit ends early if it cannot come within this log evidence of the best: three times
+    `exact_fit_range`."""
 
-    none_steps: int = 20
+    no_effect_iterations: int = 20
     """Most iterations of the fit without effects.
 
     If the model is far from the data, the minimum lies in a long valley and is not worth
     reaching."""
 
     # ---------------------------------------------------------------- exact fits
-    close: float = 12.0
+    exact_fit_range: float = 12.0
     """Candidates this close to the best log evidence are fitted exactly; rough fits err by less."""
-    close_share: float = 0.5
+    exact_fit_share: float = 0.5
     """The same as a fraction of the best gain, because rough fits of a poor model err more."""
-    exact_fits: int = 4
+    most_exact_fits: int = 4
     """Most candidates of a scan that are fitted exactly."""
-    gained_again: float = 5.0
+    refit_gain: float = 5.0
     """A candidate is fitted again if a rough fit is better than its exact fit by this."""
-    hopeless: float = 6.0
+    largest_single_deficit: float = 6.0
     """Single effects this far below 'none' are not fitted exactly."""
-    hopeless_longer: float = 2.0
+    largest_longer_set_deficit: float = 2.0
     """Sets this far below the set with one effect fewer are not fitted exactly."""
-    rivals: float = 30.0
+    family_fit_range: float = 30.0
     """Families of effects within this log evidence of the best are fitted: they may overtake it."""
 
     # ---------------------------------------------------------------- far from the truth
-    far: float = 1.5
+    far_chi_square: float = 1.5
     """Chi-squared per sample above which a model counts as far from the data."""
-    strained: float = 4.0
+    far_prior_deviations: float = 4.0
     """Prior deviations of a shared unknown above which the model counts as far, too."""
-    far_fits: int = 6
+    most_far_fits: int = 6
     """Most sets, chosen by their fit to the missing force, that are fitted to the readings."""
 
     # ---------------------------------------------------------------- named by the missing force
-    followed: float = 25.0
+    force_fit_range: float = 25.0
     """Sets within this log evidence of the best, in fits to the missing force, are fitted."""
-    least_end: float = 0.25
+    least_low_end: float = 0.25
     """Least lower end of the fraction of the missing force that a partly named set explains."""
-    contenders: float = 12.0
+    contender_range: float = 12.0
     """Sets within this log evidence are compared by the fraction of the missing force that they
     explain."""
-    slim: float = 0.01
+    least_added_share: float = 0.01
     """Least fraction of the missing force that a further effect or a free shape must add.
 
     In the trials that it was fitted to it must add three times as much, because any freedom gains
     there."""
-    nearly_all: float = 0.9
+    nearly_complete_share: float = 0.9
     """Least explained fraction of the missing force for laws to be named without an additional
     error of the readings."""
-    force_rival: float = 10.0
+    force_rival_range: float = 10.0
     """Another effect within this log evidence, in a fit to the missing force, counts as equal.
 
     That fit takes the motion as known. Trials that were not fitted may distinguish the two."""
@@ -152,51 +153,51 @@ class SearchSettings:
 
     They are used if no fit leaves only noise. Friction that ends a motion has local optima that
     are an eighth to a quarter of its size apart."""
-    restarts: int = 6
+    most_restarts: int = 6
     """Most such fits, from the sizes with the smallest residuals.
 
     They end with the first that leaves only noise.
     """
 
     # ---------------------------------------------------------------- weighed with a remainder
-    weighed_sets: tuple[int, ...] = (8, 4, 2)
+    most_weighed_sets: tuple[int, ...] = (8, 4, 2)
     """Most sets of one, two and three effects that are fitted together with a remainder."""
-    weighed_fits: int = 7
+    most_weighed_fits: int = 7
     """Most of these sets that are fitted in all."""
-    weighed_within: float = 60.0
+    weighed_range: float = 60.0
     """Sets farther below the best log evidence are not fitted: such a fit changes it by less."""
-    least_share: float = 0.5
+    least_gap_share: float = 0.5
     """Fraction of the gap that the interval of a partly named set must reach.
 
     If readings are compared, also the lower end of the interval must reach it.
     """
-    widened: float = 2.0
+    prior_widening: float = 2.0
     """Factor by which priors of calibrated parameters and gains count as wider for a partly named
     set, because these explain part of the remainder."""
-    told_by_data: float = 0.8
+    determined_shape_deviation: float = 0.8
     """Largest posterior deviation of a shape, in prior deviations, that a verdict reports."""
-    sliver: float = 0.004
+    negligible_share: float = 0.004
     """Fraction of the gap below which a further effect must be better than a remainder."""
-    sliver_gain: float = 10.0
+    least_gain_of_negligible_effect: float = 10.0
     """Least gain of log evidence plus log prior by such an effect over the set without it.
 
     It is high because the effect was chosen among many."""
-    stand_in_range: float = 3.0
+    reported_prior_deviations: float = 3.0
     """Distance from the prior mean, in deviations, of a calibrated parameter that is reported."""
 
     # ---------------------------------------------------------------- what is judged is computed
     # finely
-    solver_share: float = 0.1
+    largest_step_error: float = 0.1
     """Largest error by the time steps, over the noise (rms over a channel of a trial)."""
-    finest: int = 8
+    largest_step_reduction: int = 8
     """Largest factor by which the time steps are reduced for this, from the model's own steps."""
-    refitted: int = 3
+    most_refitted: int = 3
     """Number of candidates that are fitted again with smaller steps."""
 
     @property
     def largest_set(self) -> int:
         """Number of effects in the largest set that is searched."""
-        return len(self.set_shares)
+        return len(self.set_probabilities)
 
 
 SEARCH = SearchSettings()

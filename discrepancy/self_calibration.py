@@ -2,9 +2,10 @@
 
 Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. A
 third of them contains no effect. The others contain a hidden effect that is drawn from its prior,
-at a size that this campaign can detect (d^2 >= 25, see `discrepancy.judgement.separability`).
-Each campaign is investigated like the real one, and its verdict is compared with the hidden effect.
-Motion is simulated with half the time step of the fits.
+at a size that this campaign can detect (d^2 >= 25, see
+`discrepancy.judgement.separability`). Each campaign is investigated like the real one, and
+its verdict is compared with the hidden effect. Motion is simulated with half the time step of the
+fits.
 """
 
 import json
@@ -21,13 +22,13 @@ from scipy.stats import binomtest
 
 from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.document import Origin, plain
+from discrepancy.document import Origin, plain_data
 from discrepancy.errors import ModelError
 from discrepancy.judgement.separability import usable_effects
-from discrepancy.simulation import Hidden, Simulator
+from discrepancy.simulation import HiddenEffect, Simulator
 from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import checked, investigate
+from discrepancy.workflow import check_and_prepare, investigate
 from reporting.files import atomic_write_text
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
@@ -43,7 +44,7 @@ OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 
 
 @dataclass(frozen=True)
-class Covered:
+class ParameterCoverage:
     """A parameter of a named effect: its true value, and the 90 % interval that was found."""
 
     parameter: str
@@ -52,7 +53,7 @@ class Covered:
     high: float
 
     @property
-    def inside(self) -> bool:
+    def contains_true_value(self) -> bool:
         """Whether the interval holds the true value."""
         return self.low <= self.true <= self.high
 
@@ -77,7 +78,7 @@ class CalibrationCase:
     outcome : str
         "right", "wrong", "missed", "in part", "group", "family", "unexplained", "below
         detectability" or "data error"; see `outcome_of`.
-    covered : tuple of Covered
+    covered : tuple of ParameterCoverage
         Parameters of the effect with their intervals, if it was named correctly.
     """
 
@@ -87,7 +88,7 @@ class CalibrationCase:
     kind: VerdictKind
     named: tuple[str, ...]
     outcome: str
-    covered: tuple[Covered, ...]
+    covered: tuple[ParameterCoverage, ...]
 
 
 @dataclass(frozen=True)
@@ -134,12 +135,14 @@ class SelfCalibration:
             True for campaigns in which nothing was hidden.
         """
         cases = [case for case in self.cases if (case.hidden == NOTHING) is null]
-        return wilson(sum(case.outcome == outcome for case in cases), len(cases))
+        return wilson_interval(sum(case.outcome == outcome for case in cases), len(cases))
 
     def coverage(self) -> Proportion:
         """Return the fraction of 90 % intervals of named effects that contain the true value."""
-        are_inside = [covered.inside for case in self.cases for covered in case.covered]
-        return wilson(sum(are_inside), len(are_inside))
+        are_inside = [
+            covered.contains_true_value for case in self.cases for covered in case.covered
+        ]
+        return wilson_interval(sum(are_inside), len(are_inside))
 
     def confusion(self) -> tuple[list[str], list[str], IntArray]:
         """Return the confusion matrix.
@@ -155,7 +158,7 @@ class SelfCalibration:
         """
         hidden = {case.hidden for case in self.cases}
         rows = sorted(hidden, key=lambda name: (name != NOTHING, name))
-        verdicts = {_column(case) for case in self.cases}
+        verdicts = {_confusion_column(case) for case in self.cases}
         other_verdicts = [name for name in dict.fromkeys(OTHER.values()) if name in verdicts]
         names = verdicts.difference(other_verdicts)
         columns = [name for name in rows if name in names]
@@ -166,16 +169,16 @@ class SelfCalibration:
         columns += [name for name in other_verdicts if name not in columns]
         counts = np.zeros((len(rows), len(columns)), dtype=np.int64)
         for case in self.cases:
-            counts[rows.index(case.hidden), columns.index(_column(case))] += 1
+            counts[rows.index(case.hidden), columns.index(_confusion_column(case))] += 1
         return rows, columns, counts
 
 
-def _column(case: CalibrationCase) -> str:
+def _confusion_column(case: CalibrationCase) -> str:
     """Return the column of a case in the confusion matrix: the name, or the kind of verdict."""
     return " + ".join(case.named) if case.kind is VerdictKind.NAMED else OTHER[case.kind]
 
 
-def wilson(count: int, total: int) -> Proportion:
+def wilson_interval(count: int, total: int) -> Proportion:
     """Return a fraction with its 90 % interval (Wilson 1927); from 0 to 1 without cases."""
     if total == 0:
         return Proportion(0, 0, 0.0, 1.0)
@@ -221,7 +224,7 @@ def self_calibrate(
     DiscrepancyError
         If nothing can be tested here.
     """
-    campaign, _ = checked(campaign, model)
+    campaign, _ = check_and_prepare(campaign, model)
     simulator = Simulator(campaign, model)
     testable = usable_effects(effects, simulator.setting)
     drawing_seed, *case_seeds = np.random.SeedSequence(seed).spawn(count + 1)
@@ -229,7 +232,7 @@ def self_calibrate(
         simulator, testable, count, np.random.default_rng(drawing_seed)
     )
     cases: list[CalibrationCase] = []
-    investigate_case = partial(_investigated, simulator, effects)
+    investigate_case = partial(_investigate_simulated, simulator, effects)
     with ProcessPoolExecutor(max(workers, 1), get_context("spawn")) as pool:
         map_cases = pool.map if workers > 1 and count > 1 else map
         for case in map_cases(investigate_case, hidden, case_seeds):
@@ -244,7 +247,7 @@ def _hidden_effects(
     testable: Sequence[Effect],
     count: int,
     generator: np.random.Generator,
-) -> tuple[list[Hidden | None], list[str]]:
+) -> tuple[list[HiddenEffect | None], list[str]]:
     """Draw the effects that are hidden in the campaigns.
 
     All testable effects are used in a random order before one is used again. Every `NULL_SHARE`-th
@@ -263,7 +266,7 @@ def _hidden_effects(
 
     Returns
     -------
-    hidden : list of Hidden or None
+    hidden : list of HiddenEffect or None
         The effect of each campaign; None for none.
     not_detectable : list of str
         Identifiers of the effects of which no draw was detectable.
@@ -271,10 +274,10 @@ def _hidden_effects(
     screen = simulator.screen()
     queue: list[Effect] = []
     not_detectable: list[str] = []
-    hidden: list[Hidden | None] = []
-    for number in range(count):
-        drawn: Hidden | None = None
-        hides_nothing = number % NULL_SHARE == 0
+    hidden: list[HiddenEffect | None] = []
+    for case_number in range(count):
+        drawn: HiddenEffect | None = None
+        hides_nothing = case_number % NULL_SHARE == 0
         while not hides_nothing and drawn is None and len(not_detectable) < len(testable):
             if not queue:
                 queue = [testable[index] for index in generator.permutation(len(testable))]
@@ -288,10 +291,10 @@ def _hidden_effects(
     return hidden, not_detectable
 
 
-def _investigated(
+def _investigate_simulated(
     simulator: Simulator,
     effects: Sequence[Effect],
-    hidden: Hidden | None,
+    hidden: HiddenEffect | None,
     seed: np.random.SeedSequence,
 ) -> CalibrationCase:
     """Simulate a campaign, investigate it, and compare the verdict with the hidden effect.
@@ -302,7 +305,7 @@ def _investigated(
         Simulates the campaign.
     effects : sequence of Effect
         The catalogue.
-    hidden : Hidden or None
+    hidden : HiddenEffect or None
         The effect that the structure has; None for none.
     seed : SeedSequence
         Seed of the campaign.
@@ -319,7 +322,7 @@ def _investigated(
         distance = hidden.distance
     named = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     outcome = outcome_of(identifier, verdict.kind, named, verdict.group)
-    covered: list[Covered] = []
+    covered: list[ParameterCoverage] = []
     if outcome == "right" and hidden is not None:
         true_values = hidden.term.physical_values(hidden.normal)
         for effect in verdict.effects:
@@ -327,7 +330,9 @@ def _investigated(
                 continue
             for estimate in effect.parameters:
                 true_value = true_values[estimate.name]
-                covered.append(Covered(estimate.name, true_value, estimate.low, estimate.high))
+                covered.append(
+                    ParameterCoverage(estimate.name, true_value, estimate.low, estimate.high)
+                )
     return CalibrationCase(
         hidden=identifier,
         place=place,
@@ -382,7 +387,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
     rows, columns, counts = self_calibration.confusion()
     content = {
         "schema": SCHEMA,
-        **plain(origin),
+        **plain_data(origin),
         "seed": self_calibration.seed,
         "not_detectable": list(self_calibration.not_detectable),
         "outcomes": {
@@ -391,7 +396,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
         },
         "coverage_90": _proportion_table(self_calibration.coverage()),
         "confusion": {"hidden": rows, "verdict": columns, "counts": counts.tolist()},
-        "cases": [plain(case) for case in self_calibration.cases],
+        "cases": [plain_data(case) for case in self_calibration.cases],
     }
     return atomic_write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
@@ -407,17 +412,17 @@ def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str
         True for campaigns without an effect, False for those with one.
     """
     table = {}
-    for outcome in outcomes(self_calibration, null=null):
+    for outcome in ordered_outcomes(self_calibration, null=null):
         table[outcome] = _proportion_table(self_calibration.share(outcome, null=null))
     return table
 
 
 def _proportion_table(proportion: Proportion) -> dict[str, Any]:
     """Return a proportion as plain data."""
-    return {**plain(proportion), "share": plain(proportion.value)}
+    return {**plain_data(proportion), "share": plain_data(proportion.value)}
 
 
-def outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:
+def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, and "right" and "wrong" always, in a fixed order.
 
     Parameters

@@ -14,10 +14,14 @@ from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_initial_state
+from discrepancy.judgement.separability import (
+    DETECTION_DISTANCE,
+    campaign_as_predicted,
+    has_free_initial_state,
+)
 from discrepancy.system.interface import Model
 
-TRIES = 60
+MOST_DRAWS = 60
 """Most draws of an effect's prior until one is detectable.
 
 If none is, the effect counts as not detectable in this campaign.
@@ -27,7 +31,7 @@ REFINEMENT = 2
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenEffect:
     """An effect to hide in a simulated campaign.
 
     Attributes
@@ -75,7 +79,7 @@ class Simulator:
 
         It is linearised about a fit to the predictions of the model as data.
         """
-        predicted = as_predicted(self.campaign, self.model, self.setting)
+        predicted = campaign_as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
         return Screen(
             problem, fit(problem, Candidate(), problem.prior_mean_point(Candidate()), iterations=1)
@@ -83,8 +87,10 @@ class Simulator:
 
     def draw_effect(
         self, effect: Effect, screen: Screen, generator: np.random.Generator
-    ) -> Hidden | None:
-        """Draw an effect's place and parameters until it is detectable; None after `TRIES` draws.
+    ) -> HiddenEffect | None:
+        """Draw an effect's place and parameters until it is detectable.
+
+        None is returned if it is not after `MOST_DRAWS` draws.
 
         Parameters
         ----------
@@ -96,23 +102,23 @@ class Simulator:
             Source of places and sizes.
         """
         places = effect.places(self.setting)
-        for _ in range(TRIES):
+        for _ in range(MOST_DRAWS):
             term = EffectTerm(effect, places[int(generator.integers(len(places)))])
             normal = generator.standard_normal(len(term.parameters))
             try:
                 distance = screen.change_by_effect(term, normal).squared_size
             except DiscrepancyError:  # the structure cannot carry an effect of this size
                 continue
-            if distance >= DETECTED:
-                return Hidden(term, normal, distance)
+            if distance >= DETECTION_DISTANCE:
+                return HiddenEffect(term, normal, distance)
         return None
 
-    def simulate(self, hidden: Hidden | None, generator: np.random.Generator) -> Campaign:
+    def simulate(self, hidden: HiddenEffect | None, generator: np.random.Generator) -> Campaign:
         """Return a campaign with simulated readings in place of the measured ones.
 
         Parameters
         ----------
-        hidden : Hidden or None
+        hidden : HiddenEffect or None
             The effect that the structure has; None for none.
         generator : Generator
             Source of nuisances and noise.
@@ -124,15 +130,15 @@ class Simulator:
         """
         problem = self.problem
         candidate = Candidate() if hidden is None else Candidate((hidden.term,))
-        shared = _drawn(self.nuisances.shared, problem.shared.precision, generator)
+        shared = _draw_unknowns(self.nuisances.shared, problem.shared.precision, generator)
         no_patch = Candidate().patch(self.setting, np.empty(0))
         patch = no_patch if hidden is None else candidate.patch(self.setting, hidden.normal)
         noise_ratios = {name: self._noise_ratio(name, generator) for name in self.campaign.channels}
         trials: list[Trial] = []
-        for number, data in enumerate(problem.trials):
+        for trial_index, data in enumerate(problem.trials):
             trial = data.trial
-            fitted_local = self.nuisances.local[number]
-            local = _drawn(fitted_local, data.unknowns.precision, generator)
+            fitted_local = self.nuisances.local[trial_index]
+            local = _draw_unknowns(fitted_local, data.unknowns.precision, generator)
             if has_free_initial_state(
                 trial
             ):  # the prior has no information: the state stays as fitted
@@ -140,13 +146,13 @@ class Simulator:
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
             response, _ = problem.response(
-                number, shared, local, patch if effect_acts else no_patch, REFINEMENT
+                trial_index, shared, local, patch if effect_acts else no_patch, REFINEMENT
             )
-            earlier_trials = self.nuisances.local[:number]
+            earlier_trials = self.nuisances.local[:trial_index]
             point = Point(shared, (*earlier_trials, local), np.empty(0))
-            values = problem.prediction(number, point, response).copy()
+            values = problem.prediction(trial_index, point, response).copy()
             for column, name in enumerate(trial.channels):
-                noise = _noise(data.noise_models[column], trial, generator)
+                noise = _draw_noise(data.noise_models[column], trial, generator)
                 values[:, column] += noise_ratios[name] * trial.noise_factor * noise
             trials.append(replace(trial, values=values))
         name = f"{self.campaign.name} (simulated)"
@@ -164,7 +170,9 @@ class Simulator:
         return float(np.sqrt(freedom / generator.chisquare(freedom)))
 
 
-def _drawn(fitted: FloatArray, precision: FloatArray, generator: np.random.Generator) -> FloatArray:
+def _draw_unknowns(
+    fitted: FloatArray, precision: FloatArray, generator: np.random.Generator
+) -> FloatArray:
     """Draw scaled unknowns (K,) from their priors; those without a prior keep their fitted values.
 
     Parameters
@@ -180,7 +188,7 @@ def _drawn(fitted: FloatArray, precision: FloatArray, generator: np.random.Gener
     return np.where(precision > 0.0, draws, fitted)
 
 
-def _noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> FloatArray:
+def _draw_noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> FloatArray:
     """Draw noise (N,) of one channel in a trial, with the autocorrelation of its noise record.
 
     Parameters
@@ -198,7 +206,7 @@ def _noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> F
         Noise [channel's unit].
     """
     count = len(trial.time)
-    if not trial.is_dynamic or not model.applies(trial.interval):
+    if not trial.is_dynamic or not model.can_whiten(trial.interval):
         return np.asarray(model.static_deviation * generator.standard_normal(count))
     # samples before the record, after which the filter has forgotten its zero initial state
     lead_in = 20 * len(model.autoregression)

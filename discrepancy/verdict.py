@@ -158,7 +158,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Gate:
-    """Outcome of one gate: "absolute fit" or "shape".
+    """Outcome of one test of a hypothesis, such as "absolute fit", "shape" or "consistency".
 
     Attributes
     ----------
@@ -177,6 +177,11 @@ class Gate:
     statistic: Number
     limit: Number
     reason: str
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether the hypothesis failed; a gate that could not be applied has not failed."""
+        return self.passed is False
 
 
 @dataclass(frozen=True)

@@ -95,11 +95,11 @@ def write_verdict_folder(
     """
     check_verdict_folder(folder, replace_it=replace_it)
     with whole_folder(folder) as fresh:
-        _write(fresh, content, report=report)
+        _write_files(fresh, content, report=report)
     return folder / REPORT_NAME if report else folder
 
 
-def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
+def _write_files(folder: Path, content: ReportInput, *, report: bool) -> None:
     """Write all files of an investigation into an empty folder."""
     investigation = content.investigation
     origin = content.origin

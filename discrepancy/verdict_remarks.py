@@ -13,16 +13,16 @@ from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import NotFitted
 from reporting.words import listing
 
-IMPLAUSIBLE = 4.0
+IMPLAUSIBLE_DEVIATIONS = 4.0
 """Least distance from the prior mean, in prior deviations, of a parameter that is remarked on."""
 
 
-def strained(problem: Problem, fit: CandidateFit) -> list[str]:
+def implausible_value_remarks(problem: Problem, fit: CandidateFit) -> list[str]:
     """Return a remark on each calibrated parameter and gain that a fit moves far from its prior.
 
-    A gap that an implausible value of such a nuisance explains leaves no residual, so that only
-    this remark shows it. The gate of absolute fit judges all gains together and all parameters
-    together, not each of them.
+    An implausible value of a parameter or gain can explain what the model lacks. Nothing then
+    remains in the residuals, so that only this remark shows it: the test of absolute fit judges all
+    gains together and all parameters together, and not each of them.
     """
     names = [f"The parameter {parameter.name!r}" for parameter in problem.model.parameters]
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
@@ -30,7 +30,7 @@ def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     precisions = problem.shared.precision.tolist()
     remarks = []
     for subject, value, precision in zip(names, values, precisions, strict=True):
-        if precision > 0.0 and abs(value) > IMPLAUSIBLE:
+        if precision > 0.0 and abs(value) > IMPLAUSIBLE_DEVIATIONS:
             remarks.append(
                 f"{subject} lies {abs(value):.1f} of its stated deviations off in the hypothesis "
                 "of the verdict, which rests on that deviation: check it."
@@ -38,7 +38,7 @@ def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     return remarks
 
 
-def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
+def missing_port_remark(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     """Return the remark on effects that were not tested because the model has no port.
 
     The list is empty if there is no such effect.
@@ -58,7 +58,7 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     ]
 
 
-def not_fitted(
+def effects_not_fitted(
     setting: Setting, effects: Sequence[Effect], search: Search
 ) -> tuple[NotFitted, ...]:
     """Return the effects of a catalogue that were not fitted, each with the reason.
@@ -85,11 +85,11 @@ def not_fitted(
         elif identifier not in fitted:
             gain = search.screened_gains.get(identifier, nan)
             refusal = search.problem.refusals.get(identifier)
-            if refusal is not None and not 0.0 < gain < SEARCH.worth_fitting:
+            if refusal is not None and not 0.0 < gain < SEARCH.least_gain_to_fit:
                 reason = f"could not be fitted: {refusal}"
             elif isnan(gain):
-                where = "along the missing force" if along_force else "at first sight"
-                reason = f"less promising than others {where}"
+                place_clause = "along the missing force" if along_force else "at first sight"
+                reason = f"less promising than others {place_clause}"
             else:
                 reason = f"screened out: {gain:.1f} nat at most beside the model as it is"
             rows.append(NotFitted(identifier, reason, gain))

@@ -53,7 +53,7 @@ class SearchInProgress:
 
     search: Search | None = None
 
-    def begin(self, search: Search) -> None:
+    def remember_search(self, search: Search) -> None:
         """Remember a search that begins."""
         self.search = search
 

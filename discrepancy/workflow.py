@@ -16,7 +16,7 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.outliers import mark_outliers, wrong_ends
+from discrepancy.checks.outliers import mark_outliers, wrong_end_readings
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.beginnings import refit_from_first_readings
@@ -30,8 +30,13 @@ from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
-from discrepancy.judgement.proof import prove
-from discrepancy.judgement.remarks import NO_GAP, look_alike_remark, with_date, with_untested
+from discrepancy.judgement.proof import prove_effects
+from discrepancy.judgement.remarks import (
+    KINDS_WITHOUT_GAP,
+    look_alike_remark,
+    sentence_with_times,
+    verdict_with_untested_effects,
+)
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
@@ -45,7 +50,11 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
 from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
-from discrepancy.verdict_remarks import not_fitted, strained, without_port
+from discrepancy.verdict_remarks import (
+    effects_not_fitted,
+    implausible_value_remarks,
+    missing_port_remark,
+)
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
 from reporting.words import brief, is_or_are
@@ -141,17 +150,19 @@ def investigate(
         If the campaign cannot be compared with the model at all.
     """
     campaign, model = _read_input(campaign, model)
-    shown, seconds = reporter(progress), {}
+    progress_reporter = reporter(progress)
+    seconds: dict[str, float] = {}
 
     @contextmanager
     def stage(description: str, key: str) -> Iterator[OnProgress]:
-        began = time.perf_counter()
-        with shown.stage(description) as under_way:
-            yield lambda what: under_way.advance(0, what)
-        seconds[key] = time.perf_counter() - began
+        """Report a stage of the work, and record its duration [s]."""
+        start = time.perf_counter()
+        with progress_reporter.stage(description) as shown_stage:
+            yield lambda message: shown_stage.advance(0, message)
+        seconds[key] = time.perf_counter() - start
 
     with stage("Checking the data", "check"):
-        campaign, faults = checked(campaign, model)
+        campaign, faults = check_and_prepare(campaign, model)
     remarks = [fault.sentence for fault in faults]
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
@@ -159,29 +170,29 @@ def investigate(
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     with stage("Fitting what is known, and searching the catalogue", "name") as tell:
-        problem = without_wrong_ends(campaign, model)
-        campaign, setting = problem.campaign, problem.setting
+        problem = problem_without_wrong_ends(campaign, model)
+        campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = reach_verdict(
             problem, catalogue, on_progress=tell, on_search=on_search
         )
-        verdict = with_untested(verdict, setting, catalogue)
+        verdict = verdict_with_untested_effects(verdict, problem.setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = time_step_error(problem, fit)
-        if share > SEARCH.solver_share:
+        if share > SEARCH.largest_step_error:
             remarks.append(
                 f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
-                f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
+                f"{SEARCH.largest_step_error:g} that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.no_effect, sensitivities=thorough)
-        after = (
-            residual_set(problem, fit, sensitivities=False)
-            if fit is not search.no_effect
-            else before
-        )
-    location, missing, proof = None, None, None
+        after = before
+        if fit is not search.no_effect:
+            after = residual_set(problem, fit, sensitivities=False)
+    location = None
+    missing = None
+    proof = None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
         with stage("Locating the gap", "locate"):
@@ -192,24 +203,24 @@ def investigate(
             windows = add_window_sizes(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
-    if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
+    if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
             missing = missing_force_of_verdict(
                 problem, search.force_search, search.force_hypotheses, fit
             )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
-            proof = prove(before, after, effects=added_effects(fit), seed=seed)
+            proof = prove_effects(before, after, effects=effect_labels(fit), seed=seed)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
         verdict,
-        sentence=with_date(verdict, windows),
+        sentence=sentence_with_times(verdict, windows),
         remarks=tuple(remarks),
         next_experiments=experiments,
-        not_fitted=not_fitted(problem.setting, catalogue, search),
+        not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
         force=None if missing is None else missing.at_port,
@@ -231,7 +242,7 @@ def investigate(
     )
 
 
-def added_effects(fit: CandidateFit) -> tuple[str, ...]:
+def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
     """Return the effects of a fit with their places, sorted, as `Hypothesis.labels` has them."""
     terms = fit.candidate.terms
     labels = [
@@ -250,9 +261,9 @@ def _remarks(
 ) -> list[str]:
     """Return the remarks on a verdict, without those on its residuals."""
     remarks = [*problem.campaign.remarks]
-    remarks += strained(problem, fit)
-    remarks += without_port(problem.setting, catalogue)
-    if verdict.kind not in NO_GAP:
+    remarks += implausible_value_remarks(problem, fit)
+    remarks += missing_port_remark(problem.setting, catalogue)
+    if verdict.kind not in KINDS_WITHOUT_GAP:
         remarks += exact_sensor_remarks(problem, search.no_effect)
     look_alikes = look_alike_remark(verdict, search.effects)
     if look_alikes is not None:
@@ -283,7 +294,7 @@ def _read_input(
     return campaign, model
 
 
-def checked(
+def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
     """Return the campaign with outliers marked and trials held out, and the faults of its data.
@@ -316,11 +327,11 @@ def checked(
     return choose_held_out(campaign) if hold_out else campaign, faults
 
 
-def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
+def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     """Return the problem of a campaign and a model, with wrong readings at record ends left out.
 
-    The model need not describe the data well; `outliers.wrong_ends` states the rule. Each such
-    reading is reported by a remark.
+    The model need not describe the data well; `outliers.wrong_end_readings` states the rule. Each
+    such reading is reported by a remark.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     from_start = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
@@ -339,7 +350,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             # it counts as not known, which is 0 here.
             has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
             noise = np.array(has_noise, dtype=float)
-            is_wrong = wrong_ends(residual, data.weight > 0.0, noise)
+            is_wrong = wrong_end_readings(residual, data.weight > 0.0, noise)
             is_wrong &= ~_accepts_outliers(campaign, trial)
             for column in np.flatnonzero(is_wrong.any(axis=0)):
                 count = int(is_wrong[:, column].sum())
@@ -359,7 +370,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
 def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
     """Return for which channels (C,) of a trial the campaign accepts readings like outliers."""
     word = FaultKind.OUTLIERS.value
-    return np.array([word in campaign.accepted(name, trial.name) for name in trial.channels])
+    return np.array([word in campaign.accepted_faults(name, trial.name) for name in trial.channels])
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:

@@ -34,6 +34,7 @@ from twin_master.command_options import (
 )
 from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
+from twin_master.watch.cause_search import CauseSearch
 
 Decision = Mapping[str, Any]
 """The decision of a twin in a step, as `decision_from_line` returns it."""
@@ -470,6 +471,7 @@ def watch(
     ] = 1000,
     view: ViewOption = False,
     no_report: NoReportOption = False,
+    cause_search: CauseSearch | None = None,
 ) -> None:
     """Watch a real asset: observations in, a decision for each step out, as a line of JSON.
 
@@ -514,11 +516,11 @@ def watch(
             report=not no_report,
             otherwise="-",
             begun=begin_watch,
+            cause_search=cause_search,
             progress=terminal.progress(),
         )
         _write_to_output("", flush=True)
-        if not terminal.loudness.quiet:
-            _print_end_of_watch(folder, watches[0], report=not no_report)
+        _print_end_of_watch(folder, watches[0], report=not no_report)
     _exit_on_complaint(watches[0])
 
 
@@ -531,6 +533,8 @@ def _exit_on_complaint(watched: "parts.Watch") -> None:
 
 def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -> None:
     """Print how many messages a watch has received, and where its folder and its report are."""
+    if terminal.loudness.quiet:
+        return
     counts = watched.intake.counts
     refused = ""
     if counts.rejected:

@@ -1,11 +1,8 @@
-"""The errors of `twin_master`, by cause, and the messages in `sentences.toml`."""
+"""The errors of `twin_master`, by cause."""
 
 from collections.abc import Collection, Iterable, Mapping
 
 from reporting.errors import StandsForOthersError
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said
 
 
 class TwinMasterError(StandsForOthersError):

@@ -92,7 +92,7 @@ def watch(
     server = ViewServer(parts.is_fleet, parts.serve_fleet)
     try:
         with (
-            parts.listening(watched.ask),
+            parts.call_on_end_signal(watched.ask),
             view_beside(view, server) as begun,
             console.live_display,
         ):

@@ -54,7 +54,7 @@ from twin_master.mission.sensor_design import choose_sensors as choose_sensors
 from twin_master.mission.sensor_design import draw_readings as draw_readings
 from twin_master.mission.sensor_design import level_separations as level_separations
 from twin_master.network.belief_planning import BeliefPlan as BeliefPlan
-from twin_master.network.belief_planning import DecisionProblem as DecisionProblem
+from twin_master.network.decision_problem import DecisionProblem as DecisionProblem
 from twin_master.report.planning import design_figure as design_figure
 from twin_master.report.planning import plan_figure as plan_figure
 from twin_master.report.structure import gauge_places as gauge_places
@@ -67,10 +67,10 @@ from twin_master.store.writing import SUMMARY_NAME as SUMMARY_NAME
 from twin_master.store.writing import RunOutcome as RunOutcome
 from twin_master.viewer.flight import is_prepared as is_prepared
 from twin_master.viewer.server import serve as serve
-from twin_master.watch.feeds import is_broker as is_broker
+from twin_master.watch.broker_address import is_broker as is_broker
 from twin_master.watch.folder import Watch as Watch
-from twin_master.watch.intake import listening as listening
 from twin_master.watch.opening import watch as watch
+from twin_master.watch.signals import call_on_end_signal as call_on_end_signal
 from twin_master.workflow import check_scenario as check_scenario
 from twin_master.workflow import fly as fly
 from twin_master.workflow import resume as resume

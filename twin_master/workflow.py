@@ -18,7 +18,11 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
-from twin_master.assets.asset_source import AssetSource, calibration_sentence, noise_free_observations
+from twin_master.assets.asset_source import (
+    AssetSource,
+    calibration_sentence,
+    noise_free_observations,
+)
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
@@ -39,7 +43,13 @@ from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import truth_mismatch
-from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
+from twin_master.store.writing import (
+    TIMING_NAME,
+    RunOutcome,
+    finished_run,
+    read_outcome,
+    store_flight,
+)
 
 POLICY_NAME = "policy.npy"
 """The file of a run folder with the policy that is flown instead of a plan."""

@@ -48,9 +48,9 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.report.page import write_report as write_report
     from twin_master.scenario.reading import load_scenario as load_scenario
     from twin_master.watch.opening import open_run as open_run
-    from twin_master.watch.opening import watch as watch
     from twin_master.workflow import fly as fly
     from twin_master.workflow import resume as resume
+    from uav_twin.watching import watch as watch
 
 _HOMES = {
     "identify_modes": "calibration.dynamics.modal_identification",
@@ -90,7 +90,7 @@ _HOMES = {
     "write_report": "twin_master.report.page",
     "load_scenario": "twin_master.scenario.reading",
     "open_run": "twin_master.watch.opening",
-    "watch": "twin_master.watch.opening",
+    "watch": "uav_twin.watching",
     "fly": "twin_master.workflow",
     "resume": "twin_master.workflow",
 }

@@ -16,6 +16,7 @@ from uav_twin import (
     fmu,
     fmu_simulation,
     structure,
+    watch_command,
     wing_commands,
 )
 
@@ -119,7 +120,7 @@ app.command("run", rich_help_panel=MISSIONS)(command.run)
 app.command("plan", rich_help_panel=MISSIONS)(plan_command.plan)
 app.command("design", rich_help_panel=MISSIONS)(plan_command.design)
 app.command("view", rich_help_panel=MISSIONS)(command.view)
-app.command("watch", rich_help_panel=MISSIONS)(command.watch)
+app.command("watch", rich_help_panel=MISSIONS)(watch_command.watch)
 app.command("compare", rich_help_panel=MISSIONS)(fleet_command.compare)
 app.command("scenarios", rich_help_panel=MISSIONS)(command.list_scenarios)
 

@@ -315,7 +315,7 @@ def _print_understanding(understanding: "LaboratoryImport") -> None:
         cells = sheet.columns[sheet.heads.index(column.head)]
         nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
         row = nonzero_rows[0] if nonzero_rows else -1
-        si_value = column.in_si(understanding.decimals[sheet.name])[row]
+        si_value = column.cells_in_si(understanding.decimals[sheet.name])[row]
         rows.append(
             (
                 sheet.name,
@@ -443,12 +443,12 @@ def example(
     Example: `uav-twin discrepancy example ringdown measured --effect coulomb_friction`
     """
     from discrepancy.model_choice import choose_model
-    from discrepancy.sources.examples import example_campaign, plan_of, write_example
+    from discrepancy.sources.examples import example_campaign, usual_plan, write_example
     from fe.runtime.patch import ModelPatch
 
     refuse_filled(out, "folder")
     chosen = choose_model(model).model
-    plan = plan_of(chosen)
+    plan = usual_plan(chosen)
     patch = ModelPatch()
     if effect:
         plain = example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks

@@ -95,7 +95,7 @@ def run(
 
     Example: `uav-twin discrepancy run measured --model single_mass_rig --out verdict`
     """
-    from discrepancy.application import packed_beside
+    from discrepancy.application import pack_beside_verdict
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.report.figures import ReportInput
     from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
@@ -122,12 +122,12 @@ def run(
     in_progress = SearchInProgress()
     with terminal.interruptible(lambda: _write_search_so_far(folder, in_progress, origin)):
         investigation = investigate(
-            data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
+            data, choice.model, catalogue, seed=seed, on_search=in_progress.remember_search
         )
     separability, self_calibration = _assess_campaign(
         investigation, choice, catalogue, calibrate, seed
     )
-    pack = None if choice.design is None else partial(packed_beside, choice)
+    pack = None if choice.design is None else partial(pack_beside_verdict, choice)
     content = ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack
     )
@@ -223,7 +223,7 @@ def _assess_campaign(
         Both are None if the records could not be compared with the model; the second is also None
         if no number of simulated campaigns is given.
     """
-    from discrepancy.judgement.separability import separability as separability_of_campaign
+    from discrepancy.judgement.separability import compute_separability
     from discrepancy.model_choice import ModelKind
     from discrepancy.self_calibration import self_calibrate
 
@@ -231,7 +231,7 @@ def _assess_campaign(
         return None, None
     tested_campaign = investigation.campaign
     with stage("What this campaign can decide"):
-        separability = separability_of_campaign(
+        separability = compute_separability(
             tested_campaign, choice.model, investigation.problem.setting, catalogue
         )
     if calibrate is None:
@@ -277,7 +277,7 @@ def _print_conclusion(
     json : bool
         Whether to print JSON.
     """
-    from discrepancy.application import gives
+    from discrepancy.application import has_applicable_effects
     from discrepancy.files.verdict import VERDICT_NAME
     from discrepancy.verdict import VerdictKind
 
@@ -298,7 +298,7 @@ def _print_conclusion(
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if has_faulty_data:
         raise typer.Exit(1)
-    if not json and gives(verdict, investigation.proof):
+    if not json and has_applicable_effects(verdict, investigation.proof):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
@@ -323,12 +323,12 @@ def _read_campaign_and_model(
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.sources.from_run import run_campaign
-    from twin_master.watch.opening import flown
+    from twin_master.watch.opening import copy_of_run_until
 
     if from_run is None:
         assert campaign is not None
         return read_campaign(campaign), choose_model(model)
-    with flown(from_run, first_step, last_step, reporter()) as folder:
+    with copy_of_run_until(from_run, first_step, last_step, reporter()) as folder:
         try:
             data = run_campaign(folder, first_step, last_step)
             if model is not None:
@@ -381,7 +381,7 @@ def _repeatable_command(
 def _print_verdict(content: "ReportInput", folder: Path) -> None:
     """Print a verdict, with the intervals of its patch if there is one in the folder."""
     from discrepancy.files.verdict import PATCH_NAME, read_patch
-    from discrepancy.report.page import said_on_page
+    from discrepancy.report.page import template_values
     from discrepancy.report.text import WORDS
 
     patch_file = folder / PATCH_NAME
@@ -389,7 +389,7 @@ def _print_verdict(content: "ReportInput", folder: Path) -> None:
         intervals = [effect.intervals for effect in read_patch(patch_file).effects]
         content = dataclasses.replace(content, intervals=intervals)
     terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
-    terminal.show("run", words=WORDS, **said_on_page(content))
+    terminal.show("run", words=WORDS, **template_values(content))
 
 
 def check(
@@ -406,18 +406,18 @@ def check(
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import load_catalogue
-    from discrepancy.judgement.separability import separability as separability_of_campaign
+    from discrepancy.judgement.separability import compute_separability
     from discrepancy.model_choice import choose_model
-    from discrepancy.workflow import checked
+    from discrepancy.workflow import check_and_prepare
 
     catalogue = load_catalogue(effects or ())
     chosen = choose_model(model).model
-    data, faults = checked(read_campaign(campaign), chosen)
+    data, faults = check_and_prepare(read_campaign(campaign), chosen)
     separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
             setting = Setting(data, chosen, chosen.scales(data))
-            separability = separability_of_campaign(data, chosen, setting, catalogue)
+            separability = compute_separability(data, chosen, setting, catalogue)
     if json:
         terminal.print_json(_check_record(data, chosen.name, faults, separability))
     else:
@@ -436,7 +436,12 @@ def _print_check(
     separability: "Separability | None",
 ) -> None:
     """Print the faults of a campaign, and what it can decide unless a fault prevents that."""
-    from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
+    from discrepancy.report.decidability_text import (
+        campaign_needs,
+        confused_effects,
+        detectability_texts,
+        group_lines,
+    )
     from discrepancy.report.text import WORDS
 
     terminal.show(
@@ -447,10 +452,10 @@ def _print_check(
         model=model,
         faults=faults,
         catalogue=catalogue,
-        seen_of=seen_of,
-        neighbours=neighbours,
+        detectability_texts=detectability_texts,
+        confused_effects=confused_effects,
         group_lines=group_lines,
-        needs=needs,
+        campaign_needs=campaign_needs,
     )
 
 

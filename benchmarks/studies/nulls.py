@@ -1,12 +1,12 @@
 """How often campaigns without a fault raise a false alarm; docs/benchmarks.md shows the rate.
 
-`python -m benchmarks.studies.nulls --campaigns 200` draws one to three kinds of trials of a
-shipped rig: their rows, stamps (even, jittered, with gaps, on a logger's clock), noise (white or
-coloured; its deviation known from a record, a number or nothing), zeros, gain errors, units and
-digits, and parameters from the prior. Nothing is hidden, so every finding of `check`, the fit and
-`locate` is a false alarm. Locating and the fit run where coloured noise has a record. The exit
-code is 1 if more than `FATAL` of the campaigns have a fatal fault, or more than `LOCATED` of those
-with white noise disagree, have discoveries in their map or are not explained.
+`python -m benchmarks.studies.nulls --campaigns 200` draws one to three kinds of trials of a shipped
+rig: their rows, stamps (even, jittered, with gaps, on a logger's clock), noise (white or coloured;
+its deviation known from a record, a number or nothing), zeros, gain errors, units and digits, and
+parameters from the prior. Nothing is hidden, so every finding of `check`, the fit and
+`locate` is a false alarm. Locating and the fit run where coloured noise has a record. The exit code
+is 1 if more than `FATAL` of the campaigns have a fatal fault, or more than `LOCATED` of those with
+white noise disagree, have discoveries in their map or are not explained.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.model_check import check_against_model, prior_mean
+from discrepancy.checks.model_check import check_against_model, prior_conditions
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import DiscrepancyError
@@ -135,7 +135,7 @@ def draw_load_test(
 def draw_release(
     generator: np.random.Generator, name: str, outputs: tuple[str, ...], time: Float, size: float
 ) -> Trial:
-    """Return a ring-down without readings, released from up to `size` [m]."""
+    """Return a ring-down without readings, released from up to `rms_over_noise` [m]."""
     deflection = size * generator.choice([-1.0, 1.0]) * generator.uniform(0.3, 1.0)
     mode_count = int(generator.integers(1, 4))
     deviation = float(generator.choice([0.02, 0.05, 0.2]))
@@ -247,7 +247,7 @@ def readings_without_noise(
     ]
     readings = {}
     for trial in bare.trials:
-        initial = prior_mean(bare, model, trial).initial.copy()
+        initial = prior_conditions(bare, model, trial).initial.copy()
         if trial.release is not None:
             deviation = trial.release.deviation * generator.standard_normal()
             if trial.release.at_rest:
@@ -360,7 +360,7 @@ def findings(campaign: Campaign, model: Model, seed: int) -> list[str]:
         problem, replace(best, residual_process=estimate_residual_process(problem, best))
     )
     is_found = {
-        "not explained": gate.passed is False,
+        "not explained": gate.has_failed,
         "disagrees": location.disagrees,
         "discovery in the map": any(cell.significant for cell in location.cells),
     }

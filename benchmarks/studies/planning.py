@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
+from twin_master.network.belief_planning import plan_on_belief
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.transition import TransitionModel
 
 

@@ -395,7 +395,7 @@ def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, 
             [list(hypothesis.identifiers), hypothesis.log_evidence]
             for hypothesis in verdict.hypotheses[:6]
         ],
-        "gates": [gate.reason for gate in verdict.gates if gate.passed is False],
+        "gates": [gate.reason for gate in verdict.gates if gate.has_failed],
     }
 
 

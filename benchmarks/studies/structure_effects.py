@@ -24,7 +24,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.model_choice import load_model
 from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
-from discrepancy.system.motion import motion_of
+from discrepancy.system.motion import simulate_motion
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
@@ -172,8 +172,8 @@ def campaign(file: Path, hidden: BracketEffect, seed: int, *, ringdown: bool = F
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
             excitation = Excitation(time, time, initial=initial, release=ReleasePoint(end, release))
-            moved = motion_of(system, excitation, laws)
-            values = moved.response([OutputEquation.of_row(row) for row in rows]).values
+            moved = simulate_motion(system, excitation, laws)
+            values = moved.response([OutputEquation.from_row(row) for row in rows]).values
         else:
             values = (
                 system.static_path(np.outer(hidden.force * force + hidden.tare, end), laws).values

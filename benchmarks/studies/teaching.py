@@ -34,8 +34,9 @@ from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
-from twin_master.watch.opening import begun_watch
+from twin_master.watch.opening import begin_watch
 from twin_master.watch.tutor import Tutor
+from uav_twin.cause_search import DiscrepancySearch
 
 HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "nothing": (),
@@ -83,11 +84,11 @@ def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
 def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
     """Watch the strains of a run."""
     loaded = load_scenario(scenario)
-    with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
+    with begin_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
         feed = file_feed(run / "run.nc", watch.scenario)
         if teach:
-            with closing(Tutor(watch, wait=True)) as tutor:
-                watch.run(feed, lambda _decision: None, tutor.act)
+            with closing(Tutor(watch, DiscrepancySearch(), wait=True)) as tutor:
+                watch.run(feed, lambda _decision: None, tutor.teach)
         else:
             watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]

@@ -37,7 +37,7 @@ class Questionnaire:
         self.questions: dict[tuple[str, str], list[str]] = {}
         self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
 
-    def stated(self, option: str, subject: str) -> str | None:
+    def stated_answer(self, option: str, subject: str) -> str | None:
         """Return the answer about exactly this subject; None if there is none.
 
         The question is not noted as open.

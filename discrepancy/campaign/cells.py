@@ -71,7 +71,7 @@ def _has_date(cell: str) -> bool:
     return match is not None and bool(match[1])
 
 
-def _seconds(cell: str, place: str) -> Decimal:
+def _seconds_of_cell(cell: str, place: str) -> Decimal:
     """Return the time in a cell, with or without a date, in seconds; in UTC if it has an offset.
 
     Parameters
@@ -128,23 +128,25 @@ def seconds_of_clock_times(
     """
     seconds_of_columns: dict[int, dict[int, Decimal]] = {}
     starts: dict[bool, Decimal] = {}  # first time of columns with, and without, a date
-    for number, cells in enumerate(columns):
+    for column, cells in enumerate(columns):
         if not any(map(CLOCK.fullmatch, cells)):
             continue
-        seconds = {row: _seconds(cell, places[row]) for row, cell in enumerate(cells) if cell}
+        seconds = {
+            row: _seconds_of_cell(cell, places[row]) for row, cell in enumerate(cells) if cell
+        }
         is_dated = any(map(_has_date, cells))
         if not is_dated:
-            seconds = dict(zip(seconds, _past_midnight([*seconds.values()]), strict=True))
-        seconds_of_columns[number] = seconds
-        first = next(iter(seconds.values()))
-        starts[is_dated] = min(first, starts.get(is_dated, first))
+            seconds = dict(zip(seconds, _continue_past_midnight([*seconds.values()]), strict=True))
+        seconds_of_columns[column] = seconds
+        first_seconds = next(iter(seconds.values()))
+        starts[is_dated] = min(first_seconds, starts.get(is_dated, first_seconds))
 
     cells_of_times = {}
-    for number, seconds in seconds_of_columns.items():
-        start = starts[any(map(_has_date, columns[number]))]
-        cells_of_times[number] = tuple(
+    for column, seconds in seconds_of_columns.items():
+        start = starts[any(map(_has_date, columns[column]))]
+        cells_of_times[column] = tuple(
             ExactNumber(seconds[row] - start) if row in seconds else ""
-            for row in range(len(columns[number]))
+            for row in range(len(columns[column]))
         )
     return cells_of_times
 
@@ -158,7 +160,7 @@ def _offset_seconds(offset: str) -> int:
     return -seconds if offset[0] == "-" else seconds
 
 
-def _past_midnight(times: Sequence[Decimal]) -> list[Decimal]:
+def _continue_past_midnight(times: Sequence[Decimal]) -> list[Decimal]:
     """Return times of day [s] of a record that may go past midnight.
 
     If a time is earlier than the previous one by more than half a day, one day is added to it and

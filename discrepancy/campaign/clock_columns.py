@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from discrepancy.campaign.columns import LEFT_OUT, LaboratoryColumn
-from discrepancy.campaign.heads import shared_words, words
+from discrepancy.campaign.heads import shared_words, words_of_head
 from discrepancy.errors import CampaignFileError
 from reporting.words import listing
 
@@ -18,7 +18,7 @@ class TableClock(NamedTuple):
     columns: tuple[LaboratoryColumn, ...]
 
 
-def own_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
+def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
     """Return the clocks of a table with several columns of times, and the columns that each stamps.
 
     Either the names show it, as in `acc2` and `time2`, or the positions: every column of times
@@ -67,10 +67,12 @@ def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str,
         None if a column fits no clock or several, or a clock has no column.
     """
     common = shared_words(times)
-    labels = {time: words(time) - common for time in times}
+    labels = {time: words_of_head(time) - common for time in times}
     stamped: dict[str, list[str]] = {time: [] for time in times}
     for head in readings:
-        matching = [time for time, label in labels.items() if label and label <= words(head)]
+        matching = [
+            time for time, label in labels.items() if label and label <= words_of_head(head)
+        ]
         if len(matching) != 1:
             return None
         stamped[matching[0]].append(head)

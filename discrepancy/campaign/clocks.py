@@ -17,12 +17,16 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.clock_columns import TIME, TableClock
 from discrepancy.campaign.columns import INPUT, NOISE, LaboratoryColumn
 from discrepancy.campaign.records import FloatArray, Hold, TrialKind
-from discrepancy.campaign.sampling import EVEN, as_meant, time_goes_back
+from discrepancy.campaign.sampling import (
+    EVENNESS_TOLERANCE,
+    decreasing_times_message,
+    undo_rounding,
+)
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.words import counted, is_or_are, listing
 
 
-class OneClock(NamedTuple):
+class MergedTable(NamedTuple):
     """A table whose N rows have one clock.
 
     Attributes
@@ -56,9 +60,9 @@ class _ClockTimes:
     rows: list[int]
 
 
-def on_one_clock(
+def merge_clocks(
     clocks: Sequence[TableClock], kind: str, decimal: str, holds: Mapping[str, str | None]
-) -> OneClock:
+) -> MergedTable:
     """Merge the clocks of a table into one, and return its columns in SI.
 
     Parameters
@@ -89,41 +93,45 @@ def on_one_clock(
     if kind in (TrialKind.STATIC, TrialKind.FLIGHT) and not clocks_are_equal:
         heads = listing(repr(clock.times.head) for clock in clocks)
         raise CampaignFileError(
-            f"{_file(clocks)}: the times {heads} differ, and a row of a {kind} trial is one state "
-            "at rest: leave all but one out with --column NAME=-."
+            f"{_file_name(clocks)}: the times {heads} differ, and a row of a {kind} trial is one "
+            "state at rest: leave all but one out with --column NAME=-."
         )
-    sentence = f"{_who_is_stamped(clocks)}: the clocks are equal and become one"
-    if not clocks_are_equal:
-        sentence = (
-            f"{_who_is_stamped(clocks)}: one clock has the {count} stamps of all, and a channel "
-            "has no reading where its own clock has no stamp"
-        )
-
-    cells: dict[str, list[str]] = {TIME: _printed(seconds)}
+    cells: dict[str, list[str]] = {TIME: _time_cells(seconds)}
     loads_are_known = np.ones(count, dtype=bool)
     filled_loads = []
     for clock, own_times, position in zip(clocks, times, positions, strict=True):
+        has_all_times = len(position) == count
         for column in clock.columns:
-            column_cells = _at_positions(column.in_si(decimal), own_times.rows, position, count)
-            if _must_be_known_throughout(column, kind) and len(position) < count:
-                is_after_begin = seconds >= own_times.seconds[0]
-                loads_are_known &= is_after_begin & (seconds <= own_times.seconds[-1])
-                hold = _hold(column, holds)
+            column_cells = _place_cells(
+                column.cells_in_si(decimal), own_times.rows, position, count
+            )
+            if _must_be_known_throughout(column, kind) and not has_all_times:
+                hold = _hold_of_load(column, holds)
                 _fill_between_samples(column_cells, seconds, position, hold)
                 filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
+                is_after_first_sample = seconds >= own_times.seconds[0]
+                is_before_last_sample = seconds <= own_times.seconds[-1]
+                loads_are_known &= is_after_first_sample & is_before_last_sample
             cells[column.title] = column_cells
 
+    # rows in which all loads are known
     rows = np.flatnonzero(loads_are_known).tolist()
     cells_of_rows = {title: tuple(column[row] for row in rows) for title, column in cells.items()}
     unread = [title for title, column in cells_of_rows.items() if not any(column)]
     if unread:
         raise CampaignFileError(
-            f"{_file(clocks)}: there is no time at which both {listing(filled_loads)} and "
+            f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
             f"{unread[0]!r} are known, and a load must be known while a channel is read."
         )
+    sentence = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    if not clocks_are_equal:
+        sentence = (
+            f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
+            "channel has no reading where its own clock has no stamp"
+        )
     sentence += _remark_on_loads(filled_loads, outside=count - len(rows))
-    lines = _lines(clocks, times, positions, count)
-    return OneClock(cells_of_rows, tuple(lines[row] for row in rows), sentence)
+    lines = _line_numbers(clocks, times, positions, count)
+    return MergedTable(cells_of_rows, tuple(lines[row] for row in rows), sentence)
 
 
 def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
@@ -147,12 +155,12 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
     return remark
 
 
-def _printed(seconds: FloatArray) -> list[str]:
+def _time_cells(seconds: FloatArray) -> list[str]:
     """Return times [s] as cells of a table."""
     return [f"{moment:.15g}" for moment in seconds.tolist()]
 
 
-def _file(clocks: Sequence[TableClock]) -> str:
+def _file_name(clocks: Sequence[TableClock]) -> str:
     """Return the name of the file that the clocks are from."""
     return clocks[0].times.sheet.name
 
@@ -163,17 +171,17 @@ def _must_be_known_throughout(column: LaboratoryColumn, kind: str) -> bool:
     return is_force or INPUT in column.role or column.role == "temperature"
 
 
-def _hold(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> Hold:
+def _hold_of_load(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> Hold:
     """Return the course of a load between its samples: smooth for a motion, else as stated.
 
     It is linear if it is not stated.
     """
-    if column.quantity is not None and column.quantity.moving:
+    if column.quantity is not None and column.quantity.motion_chain:
         return Hold.SMOOTH
     return Hold(holds.get(column.head) or Hold.LINEAR)
 
 
-def _at_positions(
+def _place_cells(
     cells: Sequence[str], rows: Sequence[int], positions: Sequence[int], count: int
 ) -> list[str]:
     """Return `count` cells, with cells of a table at some positions and empty ones elsewhere.
@@ -195,7 +203,7 @@ def _at_positions(
     return result
 
 
-def _lines(
+def _line_numbers(
     clocks: Sequence[TableClock],
     times: Sequence[_ClockTimes],
     positions: Sequence[Sequence[int]],
@@ -213,7 +221,7 @@ def _lines(
 
 def _rest_samples_in_order(
     clocks: Sequence[TableClock], times: Sequence[_ClockTimes], decimal: str
-) -> OneClock:
+) -> MergedTable:
     """Return samples at rest of several clocks in the order of their samples.
 
     The k-th samples of all clocks share a row, although their times differ. Only the sampling
@@ -228,29 +236,29 @@ def _rest_samples_in_order(
     for own_times in times:
         duration = own_times.seconds[-1] - own_times.seconds[0]
         intervals.append(duration / max(len(own_times.seconds) - 1, 1))
-    if max(intervals) - min(intervals) > EVEN * min(intervals):
+    if max(intervals) - min(intervals) > EVENNESS_TOLERANCE * min(intervals):
         each = listing(
             f"{interval:.6g} s by {clock.times.head!r}"
             for clock, interval in zip(clocks, intervals, strict=True)
         )
         raise CampaignFileError(
-            f"{_file(clocks)}: samples at rest were taken every {each}, and a campaign has one "
-            "interval for all: save those of one rate, or state `noise` of the other channels in "
-            "campaign.toml."
+            f"{_file_name(clocks)}: samples at rest were taken every {each}, and a campaign has "
+            "one interval for all: save those of one rate, or state `noise` of the other channels "
+            "in campaign.toml."
         )
     longest = max(times, key=lambda own_times: len(own_times.seconds))
     count = len(longest.seconds)
-    cells = {TIME: tuple(_printed(longest.seconds))}
+    cells = {TIME: tuple(_time_cells(longest.seconds))}
     for clock, own_times in zip(clocks, times, strict=True):
         first_positions = range(len(own_times.rows))
         for column in clock.columns:
-            column_cells = _at_positions(
-                column.in_si(decimal), own_times.rows, first_positions, count
+            column_cells = _place_cells(
+                column.cells_in_si(decimal), own_times.rows, first_positions, count
             )
             cells[column.title] = tuple(column_cells)
     lines = tuple(clocks[0].times.sheet.lines[row] for row in longest.rows)
-    sentence = f"{_who_is_stamped(clocks)}: samples at rest stand in their order"
-    return OneClock(cells, lines, sentence)
+    sentence = f"{_stamped_columns_text(clocks)}: samples at rest stand in their order"
+    return MergedTable(cells, lines, sentence)
 
 
 def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
@@ -264,10 +272,10 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
         If times do not increase.
     """
     sheet = clock.times.sheet
-    cells = clock.times.in_si(decimal)
+    cells = clock.times.cells_in_si(decimal)
     rows = [row for row, cell in enumerate(cells) if cell]
     for column in clock.columns:
-        for row, cell in enumerate(column.in_si(decimal)):
+        for row, cell in enumerate(column.cells_in_si(decimal)):
             if cell and not cells[row]:
                 raise CampaignFileError(
                     f"{sheet.name}, line {sheet.lines[row]}: {column.head!r} has a reading and "
@@ -278,9 +286,11 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
     backwards = np.flatnonzero(np.diff(seconds) <= 0.0)
     if backwards.size:
         user = f"the column {clock.times.head!r}"
-        raise CampaignDataError(time_goes_back(sheet.name, user, printed, int(backwards[0])))
+        raise CampaignDataError(
+            decreasing_times_message(sheet.name, user, printed, int(backwards[0]))
+        )
     if len(rows) > 1:
-        seconds = as_meant(seconds, printed)
+        seconds = undo_rounding(seconds, printed)
     return _ClockTimes(seconds, rows)
 
 
@@ -307,7 +317,7 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
         for own_times in times
         if len(own_times.seconds) > 1
     ]
-    tolerance = EVEN * min(steps, default=0.0)
+    tolerance = EVENNESS_TOLERANCE * min(steps, default=0.0)
     all_times = np.concatenate([own_times.seconds for own_times in times])
     counts = [len(own_times.seconds) for own_times in times]
     clock_numbers = np.repeat(np.arange(len(times)), counts)
@@ -363,7 +373,7 @@ def _fill_between_samples(
             cells[index] = f"{values[index]:.15g}"
 
 
-def _who_is_stamped(clocks: Sequence[TableClock]) -> str:
+def _stamped_columns_text(clocks: Sequence[TableClock]) -> str:
     """Return the beginning of a remark: which columns are stamped by which column of times."""
     phrases = []
     for clock in clocks:

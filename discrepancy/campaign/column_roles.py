@@ -21,8 +21,8 @@ from discrepancy.campaign.units import (
     LOGGER_NAMES,
     NEVER_CONVERTED,
     UNITS,
-    conversion,
-    conversion_of,
+    conversion_factor,
+    factor_to_si,
 )
 from discrepancy.errors import CampaignFileError
 from reporting.words import listing
@@ -59,7 +59,7 @@ class ColumnReader:
         self._questionnaire = questionnaire
         self._quantity_of = quantity_of
 
-    def column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
+    def read_column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
         """Return a column of a table by its head and the unit that the file states."""
         cell_unit, reading_unit, factor = self._scaled_unit(head, unit)
         column = self._column_of_readings(sheet, head, reading_unit)
@@ -68,16 +68,16 @@ class ColumnReader:
 
     def _scaled_unit(self, head: str, unit: str) -> tuple[str, str, float]:
         """Return the units of a column's cells and of its readings, and the factor between them."""
-        stated_unit = self._questionnaire.stated("unit", head)
+        stated_unit = self._questionnaire.stated_answer("unit", head)
         unit = unit if stated_unit is None else stated_unit
-        scale = self._questionnaire.stated("scale", head)
+        scale = self._questionnaire.stated_answer("scale", head)
         if scale is None:
             return unit, unit, 1.0
         return scaled_unit(head, unit, scale)
 
     def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
         """Return a column whose cells are readings in a unit; ask for its role and its unit."""
-        role = self._role(sheet, head, unit)
+        role = self._determine_role(sheet, head, unit)
         if not unit and role != LEFT_OUT:
             self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
         if not unit or role == LEFT_OUT:
@@ -102,7 +102,7 @@ class ColumnReader:
 
         Its quantity is None while it is not known.
         """
-        quantity = self._quantity(head, role, unit)
+        quantity = self._determine_quantity(head, role, unit)
         if quantity is None:
             return LaboratoryColumn(sheet, head, role, unit)
         plain_name = LOGGER_NAMES.get(unit, unit)
@@ -113,16 +113,16 @@ class ColumnReader:
             unit=unit,
             si=plain_name if plain_name in NEVER_CONVERTED else UNITS[quantity].si,
             quantity=quantity,
-            to_si=conversion_of(quantity, unit),
+            to_si=factor_to_si(quantity, unit),
         )
 
     def _output_quantity(self, role: str) -> Quantity | None:
         """Return the quantity of a model's output; None for what is not one, or without a model."""
         return None if self._quantity_of is None else self._quantity_of(role)
 
-    def _role(self, sheet: Sheet, head: str, unit: str) -> str:
+    def _determine_role(self, sheet: Sheet, head: str, unit: str) -> str:
         """Return the role of a column: as answered, by its name, or as the only time or force."""
-        answer = self._questionnaire.stated("column", head)
+        answer = self._questionnaire.stated_answer("column", head)
         if answer is not None:
             return answer
         reads_force = self.kinds[sheet.name] in (
@@ -148,9 +148,9 @@ class ColumnReader:
         expected = f"the model's output that it measures, {other_roles}"
         return self._questionnaire.ask("column", head, expected)
 
-    def _quantity(self, head: str, role: str, unit: str) -> Quantity | None:
+    def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity of a channel or an input, None while that is not known."""
-        answer = self._questionnaire.stated("quantity", head)
+        answer = self._questionnaire.stated_answer("quantity", head)
         possible = possible_quantities(unit, answer)
         if self._quantity_of is not None and role and INPUT not in role:
             modelled = self._quantity_of(role)
@@ -178,11 +178,11 @@ def _column_of_table(sheet: Sheet, head: str, role: str, unit: str) -> Laborator
     """
     si = _UNITS_OF_INPUT_COLUMNS[role]
     if role == "force":
-        to_si = conversion_of(Quantity.FORCE, unit)
+        to_si = factor_to_si(Quantity.FORCE, unit)
     elif role == "temperature":
-        to_si = conversion_of(Quantity.TEMPERATURE, unit)
+        to_si = factor_to_si(Quantity.TEMPERATURE, unit)
     elif role == "load_factor" and unit == "g":
         to_si = 1.0
     else:
-        to_si = conversion(unit, si)
+        to_si = conversion_factor(unit, si)
     return LaboratoryColumn(sheet, head, role, unit, si, to_si=to_si)

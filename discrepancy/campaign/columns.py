@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from discrepancy.campaign.heads import load_or_time, times_among
+from discrepancy.campaign.heads import load_or_time_role, time_heads
 from discrepancy.campaign.records import Quantity, TrialKind
-from discrepancy.campaign.sampling import as_meant
+from discrepancy.campaign.sampling import undo_rounding
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
+from discrepancy.campaign.units import UNITS, conversion_factor, factor_to_si, quantities_of
 from discrepancy.errors import CampaignFileError
 from reporting.words import counted, is_or_are, listing
 
@@ -76,7 +76,7 @@ class LaboratoryColumn:
         """Its name in the campaign."""
         return self.head if self.is_channel else self.role.removeprefix(INPUT)
 
-    def in_si(self, decimal: str) -> tuple[str, ...]:
+    def cells_in_si(self, decimal: str) -> tuple[str, ...]:
         """Return its cells in SI; all are empty while its unit or its decimal mark is not known.
 
         Parameters
@@ -91,7 +91,7 @@ class LaboratoryColumn:
             return cells
         values = np.array([float(cell or "nan") for cell in cells])
         if self.role == "time" and len(cells) > 1 and np.all(np.diff(values) > 0.0):
-            values = as_meant(values, cells)  # minutes with few digits may be even
+            values = undo_rounding(values, cells)  # minutes with few digits may be even
         cells_in_si = []
         for cell, value in zip(cells, values.tolist(), strict=True):
             # two digits fewer than a float may need, so that no rounding shows: 4.387 mm is
@@ -105,7 +105,7 @@ def role_by_unit(
 ) -> str:
     """Return the role of a column, "time" or "force", if its unit alone determines it.
 
-    A column is a time if `times_among` finds it among the times of the table, of which there may be
+    A column is a time if `time_heads` finds it among the times of the table, of which there may be
     several. Otherwise its unit determines a role only if no other column of the table has a unit of
     the same role, and if `roles` allows it. The result is an empty text if it determines none.
 
@@ -119,9 +119,9 @@ def role_by_unit(
         Roles that a unit may determine. It lacks "force" for trials that do not read a column
         `force`, in which a column in newtons may be a channel.
     """
-    if head in times_among(heads, units):
+    if head in time_heads(heads, units):
         return "time"
-    roles_of_units = [load_or_time(unit) for unit in units]
+    roles_of_units = [load_or_time_role(unit) for unit in units]
     role_of_unit = roles_of_units[heads.index(head)]
     return role_of_unit if role_of_unit in roles and roles_of_units.count(role_of_unit) == 1 else ""
 
@@ -155,20 +155,20 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
         raise CampaignFileError(
             f"--scale of {head!r} must be a number and units such as 200 N/V, and {scale!r} came."
         )
-    number, ratio_of_units = amount.groups()
+    amount_text, ratio_of_units = amount.groups()
     if not ratio_of_units:
-        return unit, unit, float(number)
+        return unit, unit, float(amount_text)
     reading_unit, slash, per = ratio_of_units.rpartition("/")
     if not slash:
         reading_unit, per = ratio_of_units, "1"
     try:
-        factor = conversion(unit or per, per)
+        factor = conversion_factor(unit or per, per)
     except ValueError:
         raise CampaignFileError(
             f"--scale of {head!r} is for cells in {per}, and they are in {unit}: give one for "
             f"{unit}, or say --unit {head}={per}."
         ) from None
-    return unit or per, reading_unit, float(number) * factor
+    return unit or per, reading_unit, float(amount_text) * factor
 
 
 def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> float | str:
@@ -199,14 +199,14 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
             f"or 1%, {EXACT} or {FREE}, and {answer!r} came."
         )
     assert column.quantity is not None
-    number, unit = amount.groups()
+    amount_text, unit = amount.groups()
     if unit == "%":
-        to_si = conversion_of(column.quantity, column.read_in)
-        deviation = float(number) / 100.0 * largest / to_si
+        to_si = factor_to_si(column.quantity, column.read_in)
+        deviation = float(amount_text) / 100.0 * largest / to_si
         # two digits in the unit that the user reads
         return float(f"{deviation:.2g}") * to_si
     try:
-        return float(number) * conversion_of(column.quantity, unit or column.read_in)
+        return float(amount_text) * factor_to_si(column.quantity, unit or column.read_in)
     except ValueError as cause:
         raise CampaignFileError(f"--zero of {column.head!r}: {cause}.") from None
 
@@ -229,8 +229,8 @@ def gain_deviation(head: str, answer: str) -> float | str:
             f"--gain of {head!r} must be a standard deviation such as 2%, {EXACT} or {FREE}, "
             f"and {answer!r} came."
         )
-    number, percent = amount.groups()
-    return float(number) / 100.0 if percent else float(number)
+    amount_text, percent = amount.groups()
+    return float(amount_text) / 100.0 if percent else float(amount_text)
 
 
 def degrees_celsius(answer: str) -> float:
@@ -297,10 +297,10 @@ def release_in_si(answer: str) -> dict[str, Any]:
     """
     amount = re.fullmatch(rf"\s*({_NUMBER})\s*(\S+)\s*", answer, re.ASCII)
     if amount is not None:
-        number, unit = amount.groups()
+        amount_text, unit = amount.groups()
         for quantity in (Quantity.DISPLACEMENT, Quantity.SIGNAL):
             if quantity in quantities_of(unit):
-                displacement = float(number) * conversion_of(quantity, unit)
+                displacement = float(amount_text) * factor_to_si(quantity, unit)
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
     raise CampaignFileError(
         f"--release must be a length or a voltage such as 15.5mm, and {answer!r} came."
@@ -310,7 +310,9 @@ def release_in_si(answer: str) -> dict[str, Any]:
 # ---------------------------------------------------------------- messages about columns
 
 
-def units_read(columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]) -> dict[str, str]:
+def units_of_columns(
+    columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]
+) -> dict[str, str]:
     """Return the unit in which each channel, input and force was read, by its name.
 
     If tables have several units for one, it is that of the first table.
@@ -333,7 +335,7 @@ def units_read(columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]) ->
     return units
 
 
-def origin_of(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[str, str]) -> str:
+def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[str, str]) -> str:
     """Return the remark on which file a table came from, and what its columns were taken as.
 
     Parameters

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from discrepancy.campaign.quantity import Quantity
-from discrepancy.campaign.units import conversion, quantities_of
+from discrepancy.campaign.units import conversion_factor, quantities_of
 
 _LONGEST_HEAD = 200
 _HEAD = re.compile(
@@ -16,7 +16,7 @@ _TIME_NAME = re.compile(r"(?:.*\.)?(?:time|x_value)[ _]?\d*", re.IGNORECASE)
 """Names of times that need no unit to be known as such; `X_Value` is LabVIEW's."""
 
 
-def named(text: str, unit: str) -> tuple[str, str]:
+def split_head(text: str, unit: str) -> tuple[str, str]:
     """Return the name and the unit of a column's head such as `Weg [mm]`, `F (kN)` or `t / s`.
 
     Parameters
@@ -46,20 +46,20 @@ def is_unit(text: str) -> bool:
     """Return whether a text is a unit of time, or of a quantity that channels measure."""
     unit = plain_unit(text)
     try:
-        return bool(quantities_of(unit)) or bool(conversion(unit, "s"))
+        return bool(quantities_of(unit)) or bool(conversion_factor(unit, "s"))
     except ValueError:
         return False
 
 
-def load_or_time(unit: str) -> str:
+def load_or_time_role(unit: str) -> str:
     """Return "time" or "force" for a unit of one of them, else an empty text."""
     try:
-        return "time" if conversion(unit, "s") else ""
+        return "time" if conversion_factor(unit, "s") else ""
     except ValueError:
         return "force" if Quantity.FORCE in quantities_of(unit) else ""
 
 
-def times_among(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+def time_heads(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     """Return the heads of the columns of times of a table.
 
     There may be one, or several with a common word in their names, such as `time1` and `time2`. If
@@ -76,17 +76,17 @@ def times_among(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     times = []
     for head, unit in zip(heads, units, strict=True):
         is_named_so = not unit and _TIME_NAME.fullmatch(head)
-        if is_named_so or load_or_time(unit) == "time":
+        if is_named_so or load_or_time_role(unit) == "time":
             times.append(head)
     return tuple(times) if times and shared_words(times) else ()
 
 
-def words(head: str) -> frozenset[str]:
+def words_of_head(head: str) -> frozenset[str]:
     """Return the words and numbers in a head, in lower case: `acc` and `1` for `acc1`."""
     return frozenset(word.casefold() for word in _WORD.findall(head))
 
 
 def shared_words(heads: Sequence[str]) -> frozenset[str]:
     """Return the words, without numbers, that all of several heads have in common."""
-    common = frozenset.intersection(*map(words, heads))
+    common = frozenset.intersection(*map(words_of_head, heads))
     return frozenset(word for word in common if not word.isdigit())

@@ -7,7 +7,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 
-SHARE = 0.25
+HELD_OUT_SHARE = 0.25
 """Fraction of the trials of a kind that is held out."""
 LEAST_TRIALS = 3
 """Fewest trials of a kind from which one may be held out."""
@@ -42,7 +42,7 @@ def choose_held_out(campaign: Campaign) -> Campaign:
     split: dict[str, tuple[Trial, Trial]] = {}
     for kind in TrialKind:
         trials = [trial for trial in campaign.trials if trial.kind is kind]
-        spared = _spared_trials(trials, campaign, held_out)
+        spared = _choose_trials(trials, campaign, held_out)
         held_out |= spared
         if not spared and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
             for trial in trials:
@@ -55,11 +55,11 @@ def choose_held_out(campaign: Campaign) -> Campaign:
             trials_marked += split[trial.name]
         else:
             trials_marked.append(replace(trial, held_out=trial.name in held_out))
-    remark = _remark(trials_marked)
+    remark = _held_out_remark(trials_marked)
     return replace(campaign, trials=tuple(trials_marked), remarks=(*campaign.remarks, remark))
 
 
-def _remark(trials: Sequence[Trial]) -> str:
+def _held_out_remark(trials: Sequence[Trial]) -> str:
     """Return the sentence on which of the trials are held out."""
     names = [trial.name for trial in trials if trial.held_out]
     if names:
@@ -70,7 +70,7 @@ def _remark(trials: Sequence[Trial]) -> str:
     )
 
 
-def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
+def _choose_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
     """Choose the trials of one kind to hold out, and return their names.
 
     At most a quarter are chosen, in the order of `_order_of_candidates`, and only trials whose
@@ -87,7 +87,7 @@ def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[st
     """
     if len(trials) < LEAST_TRIALS:
         return set()
-    count = max(1, round(SHARE * len(trials)))
+    count = max(1, round(HELD_OUT_SHARE * len(trials)))
     spared: set[str] = set()
     for index in _order_of_candidates(trials):
         if len(spared) == count:

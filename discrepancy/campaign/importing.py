@@ -8,8 +8,8 @@ from typing import Any
 from discrepancy.campaign.answers import OF_COLUMNS as OF_COLUMNS
 from discrepancy.campaign.answers import OF_FILES as OF_FILES
 from discrepancy.campaign.answers import Answers, Questionnaire, check_subjects
-from discrepancy.campaign.clock_columns import own_clocks
-from discrepancy.campaign.clocks import OneClock, on_one_clock
+from discrepancy.campaign.clock_columns import find_clocks
+from discrepancy.campaign.clocks import MergedTable, merge_clocks
 from discrepancy.campaign.column_roles import ColumnReader, OutputQuantity
 from discrepancy.campaign.columns import (
     INPUT,
@@ -18,12 +18,12 @@ from discrepancy.campaign.columns import (
     LaboratoryColumn,
     degrees_celsius,
     missing_answers,
-    origin_of,
+    origin_remark,
     release_in_si,
     sampling_interval,
-    units_read,
+    units_of_columns,
 )
-from discrepancy.campaign.reading import TABLE_ERRORS, assemble
+from discrepancy.campaign.reading import TABLE_ERRORS, assemble_campaign
 from discrepancy.campaign.records import Campaign, Hold, Start, TrialKind
 from discrepancy.campaign.schema import FORMAT, parse_campaign
 from discrepancy.campaign.sensor_deviations import SensorDeviations
@@ -71,7 +71,7 @@ class LaboratoryImport:
         self.answers = answers
         self._quantity_of = quantity_of
         self._questionnaire = Questionnaire(answers)
-        self._clocks: dict[str, OneClock] = {}
+        self._clocks: dict[str, MergedTable] = {}
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
             raise CampaignFileError(
@@ -80,29 +80,29 @@ class LaboratoryImport:
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
         check_subjects(answers, [*heads], names)
 
-        self.kinds = {name: self._kind(name) for name in names}
+        self.kinds = {name: self._kind_of_file(name) for name in names}
         self._noise_file = self._only_noise_file()
-        self.decimals = {sheet.name: self._decimal(sheet) for sheet in sheets}
+        self.decimals = {sheet.name: self._decimal_mark(sheet) for sheet in sheets}
         reader = ColumnReader(self._questionnaire, self.kinds, quantity_of)
         self.columns: list[LaboratoryColumn] = []
         for sheet in sheets:
             for head, unit in zip(sheet.heads, sheet.units, strict=True):
-                self.columns.append(reader.column(sheet, head, unit))
+                self.columns.append(reader.read_column(sheet, head, unit))
         self.releases = {
-            name: self._release(name)
+            name: self._release_table(name)
             for name, kind in self.kinds.items()
             if kind == TrialKind.RINGDOWN
         }
-        self.intervals = {sheet.name: self._interval(sheet) for sheet in sheets}
+        self.intervals = {sheet.name: self._sampling_interval(sheet) for sheet in sheets}
         self._deviations = SensorDeviations(
             self._questionnaire, self.columns, self.kinds, self.decimals
         )
         self.holds = {
-            column.head: self._hold(column)
+            column.head: self._hold_of_load(column)
             for column in self.columns
             if self._is_sampled_load(column)
         }
-        self.begins = {name: self._begin(name) for name in names}
+        self.begins = {name: self._begin_of_trial(name) for name in names}
         self.held_out = {name: self._is_held_out(name) for name in names}
         self.reference_temperature = self._reference_temperature()
 
@@ -138,7 +138,7 @@ class LaboratoryImport:
 
     # ---------------------------------------------------------------- files
 
-    def _kind(self, file: str) -> str:
+    def _kind_of_file(self, file: str) -> str:
         """Return the kind of a file: that of its trial, or `NOISE`."""
         return self._questionnaire.ask("kind", file, listing(KINDS, "or"), KINDS)
 
@@ -151,18 +151,18 @@ class LaboratoryImport:
             )
         return files[0] if files else None
 
-    def _decimal(self, sheet: Sheet) -> str:
+    def _decimal_mark(self, sheet: Sheet) -> str:
         """Return the decimal mark of a file; ask if its numbers can be read in two ways."""
         if sheet.decimal:
             return sheet.decimal
         expected = f". or ,: {sheet.unclear} can be read as both"
         return self._questionnaire.ask("decimal", sheet.name, expected, (".", ","))
 
-    def _interval(self, sheet: Sheet) -> float | None:
+    def _sampling_interval(self, sheet: Sheet) -> float | None:
         """Return the sampling interval [s] of a table without times; None if it needs none."""
         columns = [column for column in self.columns if column.sheet is sheet]
         if any(column.role == "time" for column in columns):
-            if self._questionnaire.stated("interval", sheet.name) is not None:
+            if self._questionnaire.stated_answer("interval", sheet.name) is not None:
                 raise CampaignFileError(
                     f"{sheet.name} has a column of times, and --interval came for it: leave one of "
                     "them out."
@@ -176,11 +176,11 @@ class LaboratoryImport:
         answer = self._questionnaire.ask("interval", sheet.name, expected)
         return sampling_interval(answer) if answer else None
 
-    def _begin(self, file: str) -> str | None:
+    def _begin_of_trial(self, file: str) -> str | None:
         """Return how a forced or driven trial begins; None if nobody stated it."""
         kind = self.kinds[file]
         if kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
-            if self._questionnaire.stated("begins", file) is not None and kind:
+            if self._questionnaire.stated_answer("begins", file) is not None and kind:
                 raise CampaignFileError(
                     f"--begins is for forced and driven trials, and {file} is {kind}."
                 )
@@ -201,7 +201,7 @@ class LaboratoryImport:
         is_noise = self.kinds[file] == NOISE
         is_a_choice = len(trials) > 1 or bool(self.answers.get("held-out", {}))
         if is_noise or not is_a_choice:
-            if self._questionnaire.stated("held-out", file) is not None:
+            if self._questionnaire.stated_answer("held-out", file) is not None:
                 raise CampaignFileError(
                     f"--held-out is for trials, and {file} holds samples at rest."
                 )
@@ -210,7 +210,7 @@ class LaboratoryImport:
         answer = self._questionnaire.ask_or_assume("no", "held-out", file, expected, ("yes", "no"))
         return answer == "yes"
 
-    def _release(self, file: str) -> dict[str, Any]:
+    def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; one of 1 m while the question is open."""
         expected = "how far the point was held that was let go, such as 15.5mm"
         answer = self._questionnaire.ask("release", file, expected)
@@ -234,9 +234,9 @@ class LaboratoryImport:
         if self.kinds[column.sheet.name] == TrialKind.FORCED:
             return column.role == "force"
         is_input = INPUT in column.role and column.quantity is not None
-        return is_input and not (column.quantity is not None and column.quantity.moving)
+        return is_input and not (column.quantity is not None and column.quantity.motion_chain)
 
-    def _hold(self, column: LaboratoryColumn) -> str | None:
+    def _hold_of_load(self, column: LaboratoryColumn) -> str | None:
         """Return the course of a load between its samples; None if nobody stated it."""
         choices = [*map(str, Hold)]
         expected = f"what it does between its samples, {listing(choices, 'or')}"
@@ -265,7 +265,7 @@ class LaboratoryImport:
             "channel": self._column_tables(are_inputs=False),
             "input": self._column_tables(are_inputs=True),
             "trial": [self._trial_table(file) for file in trial_files],
-            "remarks": [self._origin(sheet) for sheet in self.sheets],
+            "remarks": [self._origin_remark(sheet) for sheet in self.sheets],
         }
         if self.assumed:
             content["remarks"].append(self.assumed)
@@ -277,7 +277,7 @@ class LaboratoryImport:
         origin = hash_record([sheet.digest for sheet in self.sheets])
         section = parse_campaign(content, listing(tables))
         # remarks of the reader are left out, because reading the written campaign makes them again
-        return replace(assemble(section, tables, origin), remarks=section.remarks)
+        return replace(assemble_campaign(section, tables, origin), remarks=section.remarks)
 
     def _column_tables(self, *, are_inputs: bool) -> list[dict[str, Any]]:
         """Return the tables `[[channel]]`, or `[[input]]`, of the campaign's file.
@@ -319,7 +319,7 @@ class LaboratoryImport:
 
         If files have several units for one, it is that of the first file.
         """
-        return units_read(self.columns, self.kinds)
+        return units_of_columns(self.columns, self.kinds)
 
     def _trial_table(self, file: str) -> dict[str, Any]:
         """Return the table `[[trial]]` of a file."""
@@ -341,7 +341,7 @@ class LaboratoryImport:
         title = _NOT_TITLE.sub("", file)
         return {"name": title, "kind": self.kinds[file], "file": file, **stated}
 
-    def clock_of(self, sheet: Sheet) -> OneClock | None:
+    def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
         """Return a table with several columns of times on one clock.
 
         None if the table has one column of times, or questions are open.
@@ -349,15 +349,15 @@ class LaboratoryImport:
         Raises
         ------
         CampaignFileError, CampaignDataError
-            For the causes of `own_clocks` and `on_one_clock`.
+            For the causes of `find_clocks` and `merge_clocks`.
         """
         columns = [column for column in self.columns if column.sheet is sheet]
         number_of_times = [column.role for column in columns].count("time")
         if self.questions or number_of_times < 2:
             return None
         if sheet.name not in self._clocks:
-            self._clocks[sheet.name] = on_one_clock(
-                own_clocks(columns),
+            self._clocks[sheet.name] = merge_clocks(
+                find_clocks(columns),
                 self.kinds[sheet.name],
                 self.decimals[sheet.name],
                 self.holds,
@@ -369,7 +369,7 @@ class LaboratoryImport:
         """Sentences on the tables whose columns of times were merged."""
         sentences = []
         for sheet in self.sheets:
-            clock = self.clock_of(sheet)
+            clock = self.merge_clocks_of(sheet)
             if clock is not None:
                 sentences.append(f"{sheet.name}: {clock.sentence}.")
         return sentences
@@ -385,7 +385,7 @@ class LaboratoryImport:
         used = [
             column for column in self.columns if column.sheet is sheet and column.to_si is not None
         ]
-        clock = self.clock_of(sheet)
+        clock = self.merge_clocks_of(sheet)
         titles = [column.title for column in used if clock is None or column.role != "time"]
         for title in titles:
             if titles.count(title) > 1:
@@ -399,14 +399,14 @@ class LaboratoryImport:
         if interval is not None:
             columns["time"] = tuple(f"{row * interval:.15g}" for row in range(len(sheet.lines)))
         for column in used:
-            columns[column.title] = column.in_si(self.decimals[sheet.name])
+            columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 
-    def _origin(self, sheet: Sheet) -> str:
+    def _origin_remark(self, sheet: Sheet) -> str:
         """Return the remark on the file of a table, its columns, and its clocks."""
         used = [
             column for column in self.columns if column.sheet is sheet and column.role != LEFT_OUT
         ]
-        origin = origin_of(sheet, used, self.answers.get("scale", {}))
-        clock = self.clock_of(sheet)
+        origin = origin_remark(sheet, used, self.answers.get("scale", {}))
+        clock = self.merge_clocks_of(sheet)
         return origin if clock is None else f"{origin} {clock.sentence}."

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatlabFunction, MatlabOpaque
 
-from discrepancy.campaign.heads import times_among
+from discrepancy.campaign.heads import time_heads
 from discrepancy.errors import CampaignFileError
 from reporting.words import counted, listing, one_line
 
@@ -178,7 +178,7 @@ def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, 
     """
     lengths = Counter(len(column) for column in columns.values())
     main_length = max(lengths, key=lambda length: (length * lengths[length], length))
-    times = times_among([*columns], [""] * len(columns))
+    times = time_heads([*columns], [""] * len(columns))
     accepted = {len(columns[name]) for name in times}
     if len(accepted) > 1:
         accepted.add(main_length)

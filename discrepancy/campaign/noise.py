@@ -86,7 +86,7 @@ class NoiseModel:
         (..., N) ndarray
             The filtered records.
         """
-        if not self.applies(interval):
+        if not self.can_whiten(interval):
             return columns
         filter_taps = np.r_[1.0, -self.autoregression]
         white = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
@@ -117,7 +117,7 @@ class NoiseModel:
             weights.append(np.sqrt(variance_ratio) * np.r_[-coefficients[::-1], 1.0])
         return tuple(reversed(weights))
 
-    def applies(self, interval: float | None) -> bool:
+    def can_whiten(self, interval: float | None) -> bool:
         """Return whether the autoregression can filter records of a sampling interval.
 
         An autoregression holds only at the interval of the record that it was fitted to.
@@ -134,7 +134,7 @@ class NoiseModel:
     def stays_coloured(self, trial: Trial) -> bool:
         """Return whether a trial has coloured noise that cannot be whitened at its interval."""
         is_coloured = self.autoregression.size > 0
-        return trial.is_dynamic and is_coloured and not self.applies(trial.whitened_at)
+        return trial.is_dynamic and is_coloured and not self.can_whiten(trial.whitening_interval)
 
 
 def record_at_rest(channel: Channel) -> FloatArray | None:
@@ -158,11 +158,12 @@ def whiteness_is_tested(channel: Channel) -> bool:
     series = record_at_rest(channel)
     if series is None:
         return True
-    p_values = (fisher_g(series)[1], ljung_box(series)[1], cumulative_periodogram(series)[1])
+    tests = (fisher_g(series), ljung_box(series), cumulative_periodogram(series))
+    p_values = [test.p_value for test in tests]
     return min(p_values) >= NOISE_RECORD_LEVEL
 
 
-def aliased(frequency: float, interval: float) -> float:
+def aliased_frequency(frequency: float, interval: float) -> float:
     """Return the alias of a frequency [Hz] at a sampling interval [s]: 50 Hz is 10 Hz at 1/60 s."""
     rate = 1.0 / interval
     return abs(frequency - rate * round(frequency / rate))
@@ -201,7 +202,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
             degrees_of_freedom=record.degrees_of_freedom,
             interval=interval,
         )
-    residual, lines = without_lines(samples - samples.mean(), interval)
+    residual, lines = remove_lines(samples - samples.mean(), interval)
     # the mean has one degree of freedom; a line has three: cosine, sine and frequency
     freedom = len(residual) - 1.0 - 3.0 * len(lines)
     deviation = float(np.sqrt(residual @ residual / freedom))
@@ -212,9 +213,9 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
         interval=interval,
         lines=lines,
     )
-    if ljung_box(residual)[1] > WHITE_LEVEL:  # the second value is the p-value of whiteness
+    if ljung_box(residual).p_value > WHITE_LEVEL:
         return white
-    coefficients, innovation_variance = autoregression(residual)
+    coefficients, innovation_variance = fit_autoregression(residual)
     return replace(
         white,
         standard_deviation=np.sqrt(innovation_variance),
@@ -223,10 +224,10 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
     )
 
 
-def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
+def remove_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
     """Remove spectral lines at mains frequencies from a noise record.
 
-    A line is removed only if it is significant; see `line_near`.
+    A line is removed only if it is significant; see `strongest_line_near`.
 
     Parameters
     ----------
@@ -247,14 +248,16 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
     for frequency in MAINS:
         # the mains frequency wanders by up to this much, and a long record resolves it
         half_width = MAINS_DEVIATION * frequency
-        line = line_near(residual, interval, aliased(frequency, interval), half_width)
+        line = strongest_line_near(
+            residual, interval, aliased_frequency(frequency, interval), half_width
+        )
         if line is not None:
             frequencies.append(frequency)
             residual = residual - line
     return residual, tuple(frequencies)
 
 
-def line_near(
+def strongest_line_near(
     samples: FloatArray, interval: float, frequency: float, half_width: float
 ) -> FloatArray | None:
     """Return the strongest spectral line near a frequency, or None if it is not significant.
@@ -333,7 +336,7 @@ def _strongest_line(samples: FloatArray, interval: float, low: float, high: floa
     return np.asarray(waves @ amplitudes)
 
 
-def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
+def fit_autoregression(series: FloatArray) -> tuple[FloatArray, float]:
     """Fit an autoregression to a series, with the order of the least BIC.
 
     The coefficients solve the Yule-Walker equations of each order. BIC is the Bayesian information

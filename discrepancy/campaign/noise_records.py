@@ -145,14 +145,14 @@ def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[Repeate
         yield RepeatedReadings(group, np.array(values), np.array(used))
 
 
-def _is_repeat(first: Trial, second: Trial) -> bool:
+def _is_repeat(trial: Trial, other_trial: Trial) -> bool:
     """Return whether two trials repeat each other: same labels, loads, inputs and health."""
-    if any(getattr(first, label) != getattr(second, label) for label in _LABELS):
+    if any(getattr(trial, label) != getattr(other_trial, label) for label in _LABELS):
         return False
-    if len(first.time) != len(second.time):
+    if len(trial.time) != len(other_trial.time):
         return False
-    first_histories = _acting_histories(first)
-    second_histories = _acting_histories(second)
+    first_histories = _acting_histories(trial)
+    second_histories = _acting_histories(other_trial)
     if first_histories.keys() != second_histories.keys():
         return False
     for name, history in first_histories.items():

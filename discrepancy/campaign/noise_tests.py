@@ -6,6 +6,7 @@ Noise records, gates, location and proof all use these tests.
 from collections.abc import Sequence
 from functools import cache
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -17,7 +18,7 @@ SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
 LAGS = 20
 """Largest number of autocorrelations in the Ljung-Box test."""
-LOOKED_AT = 0.25
+LARGEST_LAG_SHARE = 0.25
 """Largest lag of an autocorrelation, as a fraction of the record."""
 LEAST_DRAWS = 8_000
 """Fewest series from which the distribution of the Ljung-Box statistic is taken."""
@@ -74,7 +75,22 @@ def pooled_variance_p_value(
     return float(stats.norm.sf(weights @ scores / np.sqrt(weights @ weights)))
 
 
-def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float, float]:
+class SeriesTest(NamedTuple):
+    """The outcome of a test whether a series is white.
+
+    Attributes
+    ----------
+    statistic : float
+        The statistic of the test.
+    p_value : float
+        Probability of a larger statistic if the series is white.
+    """
+
+    statistic: float
+    p_value: float
+
+
+def ljung_box(series: FloatArray, used: BoolArray | None = None) -> SeriesTest:
     """Test whether a series of residuals is white by the statistic of Ljung and Box.
 
     With the autocorrelations rho_k, Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20, n / 5) lags
@@ -90,13 +106,6 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float,
     used : (N,) ndarray of bool, optional
         False for samples that are left out. Then n is the number of used samples, and n - k is
         replaced by the number of pairs of used samples at lag k, which keeps the mean of Q exact.
-
-    Returns
-    -------
-    statistic : float
-        Q.
-    p_value : float
-        Probability of a larger Q if the series is white.
     """
     if used is None:
         count = series.size
@@ -106,7 +115,7 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float,
         values = np.where(used, series, 0.0)
     lags = min(LAGS, count // 5)
     if lags < 1 or not np.any(values):
-        return 0.0, 1.0
+        return SeriesTest(0.0, 1.0)
     if used is None:
         pairs = count - np.arange(1.0, lags + 1)
     else:
@@ -117,7 +126,7 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float,
     rate = 2.0 / skewness
     shape = rate**2
     p_value = gammaincc(shape, rate * ((statistic - mean) / deviation + shape / rate))
-    return statistic, float(p_value)
+    return SeriesTest(statistic, float(p_value))
 
 
 def lag_products(rows: FloatArray, lags: int) -> FloatArray:
@@ -159,7 +168,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
         Variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
-    lags = max(int(LOOKED_AT * longest), 2)
+    lags = max(int(LARGEST_LAG_SHARE * longest), 2)
     products = np.zeros(lags + 1)
     pair_counts = np.zeros(lags + 1)
     for record in series:
@@ -172,7 +181,9 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     return rho, pair_counts[1:] / pair_counts[0] ** 2
 
 
-def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
+def statistical_inefficiency(
+    rho: FloatArray, white_variance: FloatArray, ratio: float = 1.0
+) -> float:
     """Return the number of samples over the effective number of independent ones.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
@@ -181,7 +192,7 @@ def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> floa
 
     Parameters
     ----------
-    rho, chance : (K,) ndarray
+    rho, white_variance : (K,) ndarray
         Autocorrelation and its variance for white noise, from `autocorrelation`.
     ratio : float
         Factor on the autocorrelation `rho`, if the correlation of the samples in question is
@@ -193,7 +204,7 @@ def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> floa
         The factor, at least 1.
     """
     squares = float(np.sum(rho**2))
-    squares_by_chance = float(np.sum(chance))
+    squares_by_chance = float(np.sum(white_variance))
     squares_by_chance *= (1.0 + 2.0 * squares) / (1.0 + 2.0 * squares_by_chance)
     return max(1.0 + 2.0 * ratio**2 * (squares - squares_by_chance), 1.0)
 
@@ -251,56 +262,58 @@ def periodogram(series: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.fft.rfft(series)[1 : (count - 1) // 2 + 1]) ** 2 / count)
 
 
-def cumulative_periodogram(series: FloatArray) -> tuple[float, float]:
+def cumulative_periodogram(series: FloatArray) -> SeriesTest:
     """Test whether a series (n,) is white by its cumulative periodogram.
 
     For Gaussian white noise the cumulative sums of the M ordinates, divided by the total, are
     distributed as the order statistics of M - 1 uniform variables. Kolmogorov's distribution of
     their largest departure from a straight line thus holds exactly (Bartlett 1955; Durbin 1969,
     Biometrika 56, 1-15).
-
-    Returns
-    -------
-    statistic : float
-        Largest departure.
-    p_value : float
-        Probability of a larger one for white noise.
     """
     ordinates = periodogram(series)
     total = float(ordinates.sum())
     if total == 0.0 or ordinates.size < 3:
-        return 0.0, 1.0
+        return SeriesTest(0.0, 1.0)
     fractions = np.cumsum(ordinates)[:-1] / total
     test = stats.kstest(np.clip(fractions, 0.0, 1.0), "uniform")
-    return float(test.statistic), float(test.pvalue)
+    return SeriesTest(float(test.statistic), float(test.pvalue))
 
 
-def fisher_g(series: FloatArray) -> tuple[float, float, int]:
+class LineTest(NamedTuple):
+    """The outcome of a test for a spectral line.
+
+    Attributes
+    ----------
+    statistic : float
+        Fisher's g: the largest ordinate of the periodogram over the sum of all.
+    p_value : float
+        Probability of a larger g for white noise.
+    frequency_index : int
+        Index j of the largest ordinate; the frequency is j / n per sample.
+    """
+
+    statistic: float
+    p_value: float
+    frequency_index: int
+
+
+def fisher_g(series: FloatArray) -> LineTest:
     """Test a series (n,) for a spectral line by Fisher's g (1929, Proc. R. Soc. A 125, 54-59).
 
     Of the sum for the p-value only the first term t = M (1 - g)^(M - 1) is used, for M ordinates,
     as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
-
-    Returns
-    -------
-    g : float
-        Largest ordinate of the periodogram over the sum of all.
-    p_value : float
-        Probability of a larger g for white noise.
-    index : int
-        Index j of the largest ordinate; the frequency is j / n per sample.
     """
     ordinates = periodogram(series)
     total = float(ordinates.sum())
     if total == 0.0:
-        return 0.0, 1.0, 0
+        return LineTest(0.0, 1.0, 0)
     largest = int(np.argmax(ordinates))
     g = float(ordinates[largest]) / total
     first_term = ordinates.size * (1.0 - g) ** (ordinates.size - 1)
-    return g, float(-np.expm1(-first_term)), largest + 1
+    return LineTest(g, float(-np.expm1(-first_term)), largest + 1)
 
 
-def combine(p_values: Sequence[float]) -> float:
+def combine_p_values(p_values: Sequence[float]) -> float:
     """Combine independent p-values into one: twice the lesser of Fisher's and Bonferroni's.
 
     Fisher's sum -2 sum log p detects many small departures, and Bonferroni's least p-value a single
@@ -314,7 +327,7 @@ def combine(p_values: Sequence[float]) -> float:
     return float(min(1.0, 2.0 * min(fisher, bonferroni)))
 
 
-def holm(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
+def holm_rejections(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
     """Return which null hypotheses Holm's rule rejects (Holm 1979, Scand. J. Statist. 6, 65-70).
 
     A p-value of nan stands for a test that was not made, and is never rejected.

@@ -152,7 +152,7 @@ class Event:
     ------
     ValueError
         If the name cannot be used in expressions, `trial` and `trials` are both stated, or the end
-        is not after the begin.
+        is not after the start.
     """
 
     name: Name
@@ -184,7 +184,7 @@ class Event:
 
     @property
     def moments(self) -> dict[str, float]:
-        """Times of its begin and, if it is stated, of its end [s], by the names in expressions."""
+        """Times of its start and, if it is stated, of its end [s], by the names in expressions."""
         moments = {self.name: self.time}
         if self.until is not None:
             moments[f"{self.name}_until"] = self.until

@@ -26,7 +26,7 @@ class Quantity(StrEnum):
     CHARGE = "charge"
 
     @property
-    def moving(self) -> "tuple[Quantity, ...]":
+    def motion_chain(self) -> "tuple[Quantity, ...]":
         """A quantity of motion with its time derivatives, from displacement to acceleration.
 
         Empty for a quantity that is not one of motion.
@@ -40,9 +40,9 @@ class Quantity(StrEnum):
 
     def derivatives_of(self, output: "Quantity") -> int:
         """Return how often a model's output is differentiated in time to give this quantity."""
-        return max(self.order - output.order, 0) if output in self.moving else 0
+        return max(self.order - output.order, 0) if output in self.motion_chain else 0
 
-    def shows(self, output: "Quantity") -> bool:
+    def can_measure(self, output: "Quantity") -> bool:
         """Return whether a channel of this quantity can measure an output of another quantity."""
         return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
 

@@ -19,7 +19,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
+from discrepancy.campaign.sampling import check_sampling, is_nearly_even, spacing_sentence
 from discrepancy.campaign.trial_reading import numbers_in_si, read_trial
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.files import hash_file, hash_record
@@ -74,7 +74,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     tables = {name: _read_table(folder, name) for name in sorted(table_names)}
     names = sorted({CAMPAIGN_FILE, *table_names})
     data_hash = hash_record({name: hash_file(folder / name) for name in names})
-    return assemble(section, tables, data_hash)
+    return assemble_campaign(section, tables, data_hash)
 
 
 def _check_inside(name: str) -> None:
@@ -87,7 +87,7 @@ def _check_inside(name: str) -> None:
         )
 
 
-def assemble(
+def assemble_campaign(
     section: schema.CampaignSection, tables: Mapping[str, TextTable], data_hash: str
 ) -> Campaign:
     """Return the campaign of a description and its tables.
@@ -119,8 +119,8 @@ def assemble(
                 f"{channel.table_column!r}; the columns of {table.name} are "
                 f"{', '.join(table.columns)}."
             )
-    channels = _channels(section, tables, trials, remarks)
-    remarks += remarks_on(channels, trials)
+    channels = _read_channels(section, tables, trials, remarks)
+    remarks += trial_remarks(channels, trials)
     new_remarks = [remark for remark in remarks if remark not in section.remarks]
     priors = {name: (prior.mean, prior.deviation) for name, prior in section.parameters.items()}
     return Campaign(
@@ -132,7 +132,7 @@ def assemble(
         data_hash=data_hash,
         loggers=section.loggers,
         accept=section.accept,
-        events=tuple(placed_events(section.event, trials, CAMPAIGN_FILE)),
+        events=tuple(complete_events(section.event, trials, CAMPAIGN_FILE)),
         remarks=(*section.remarks, *new_remarks),
     )
 
@@ -157,7 +157,7 @@ def _remarks_on_unused_columns(
     return remarks
 
 
-def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
+def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
     """Complete events by the names of all trials in which they happened, and check them.
 
     Parameters
@@ -267,7 +267,7 @@ def _read_table(folder: Path, name: str) -> TextTable:
 # ---------------------------------------------------------------- channels
 
 
-def _channels(
+def _read_channels(
     section: schema.CampaignSection,
     tables: Mapping[str, TextTable],
     trials: tuple[Trial, ...],
@@ -326,7 +326,7 @@ def _samples_at_rest(
     if interval is None:
         cells = table.cells("time", user)
         time = check_sampling(table.numbers("time", user), cells, user, table.name)
-        if nearly_even(time):
+        if is_nearly_even(time):
             interval = float(time[-1] - time[0]) / (len(time) - 1)
     records = {}
     for channel in section.channel:
@@ -354,7 +354,7 @@ def _samples_at_rest(
 # ---------------------------------------------------------------- remarks on records in time
 
 
-def remarks_on(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
+def trial_remarks(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
     """Return the remarks on sampling, begins and coloured noise of a campaign's trials."""
     times = {trial.name: trial.time for trial in trials if trial.is_dynamic}
     remarks = []

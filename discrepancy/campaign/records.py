@@ -24,7 +24,7 @@ from discrepancy.campaign.channels import NoiseRecord as NoiseRecord
 from discrepancy.campaign.channels import RecordedInput as RecordedInput
 from discrepancy.campaign.protocol import Accepted, Event, InFiles, Release
 from discrepancy.campaign.quantity import Quantity as Quantity
-from discrepancy.campaign.sampling import nearly_even
+from discrepancy.campaign.sampling import is_nearly_even
 from reporting.toml_file import Name, Number, Positive
 from reporting.words import brief
 
@@ -254,12 +254,12 @@ class Trial(TrialKeys):
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
 
     @cached_property
-    def whitened_at(self) -> float | None:
+    def whitening_interval(self) -> float | None:
         """Sampling interval [s] of a dynamic trial for a filter that makes its noise white.
 
         None for a trial that is not dynamic, or whose samples are too unevenly spaced for a filter.
         """
-        return self.interval if self.is_dynamic and nearly_even(self.time) else None
+        return self.interval if self.is_dynamic and is_nearly_even(self.time) else None
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class Campaign:
     def __repr__(self) -> str:
         return brief(self, name=self.name, trials=len(self.trials), channels=self.channels)
 
-    def accepted(self, channel: str = "", trial: str = "") -> frozenset[str]:
+    def accepted_faults(self, channel: str = "", trial: str = "") -> frozenset[str]:
         """Return the faults of data that the campaign accepts in a channel of a trial.
 
         These are the faults that the keys `accept` of the campaign, the channel and the trial name.
@@ -385,7 +385,7 @@ class Campaign:
         return tuple(trial for trial in self.trials if trial.held_out)
 
     @property
-    def sizes(self) -> dict[str, float]:
+    def largest_magnitudes(self) -> dict[str, float]:
         """Largest loads and times of the campaign, by which parameters of effects are scaled.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],

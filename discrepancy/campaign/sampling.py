@@ -10,23 +10,23 @@ from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
-EVEN = 1e-3
+EVENNESS_TOLERANCE = 1e-3
 """Largest departure of a sample from the even grid, as a fraction of the interval."""
 LEAST_SAMPLES = 8
 """Fewest samples of a dynamic record."""
-_EXACT = 1e-9
+_EXACT_TOLERANCE = 1e-9
 """Departure from an even grid, in intervals, below which times stay as they are."""
 LEAST_LEVELS = 5
 """Fewest values at which neighbouring readings must repeat to show a sensor's quantum."""
-OFF_LATTICE = 0.1
+LATTICE_TOLERANCE = 0.1
 """Largest departure of a value from a lattice, in its steps."""
-ON_LATTICE = 0.8
+LEAST_LATTICE_SHARE = 0.8
 """Least fraction of distances between repeated values that are whole numbers of steps."""
 ROUNDING_GAP = 10.0
 """Least ratio of a true difference to the largest one that rounding leaves."""
 LEAST_ROUNDED = 8
 """Fewest differences that are taken as left by rounding."""
-ALIKE = 0.1
+STEP_TOLERANCE = 0.1
 """Largest relative departure of a step from the mean one for filters of even samples."""
 
 
@@ -45,7 +45,7 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     Returns
     -------
     (N,) ndarray
-        Times [s]; see `as_meant`.
+        Times [s]; see `undo_rounding`.
 
     Raises
     ------
@@ -61,11 +61,11 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     steps = np.diff(time)
     least = int(np.argmin(steps))
     if steps[least] <= 0.0:
-        raise CampaignDataError(time_goes_back(file, user, cells, least))
-    return as_meant(time, cells)
+        raise CampaignDataError(decreasing_times_message(file, user, cells, least))
+    return undo_rounding(time, cells)
 
 
-def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> str:
+def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: int) -> str:
     """Return the message that the times of a record do not increase.
 
     Parameters
@@ -84,14 +84,14 @@ def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> st
     )
 
 
-def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
+def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     """Undo the rounding of printed times: return them evenly spaced if rounding explains the rest.
 
     Times that were printed with few decimals are not evenly spaced even if the samples were. They
     are replaced by the evenly spaced grid of least squares if each may be off by half a unit of the
-    last printed decimal, in addition to the tolerance `EVEN`. The grid passes through zero if the
-    first time is zero. Times that are even to 1e-9 of the interval, and times that rounding does
-    not explain, are returned as they are.
+    last printed decimal, in addition to the tolerance `EVENNESS_TOLERANCE`. The grid passes through
+    zero if the first time is zero. Times that are even to 1e-9 of the interval, and times that
+    rounding does not explain, are returned as they are.
 
     Parameters
     ----------
@@ -109,7 +109,11 @@ def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     # a step between two times is wrong by up to one unit of it: half a unit at each end
     rounding_of_a_step = min(_last_digit(cell) for cell in cells)
     interval = (time[-1] - time[0]) / (len(time) - 1)
-    if not _EXACT < unevenness(time) <= EVEN + rounding_of_a_step / interval:
+    if (
+        not _EXACT_TOLERANCE
+        < unevenness(time)
+        <= EVENNESS_TOLERANCE + rounding_of_a_step / interval
+    ):
         return time
     if time[0] == 0.0:
         index = np.arange(len(time)) - 0.0
@@ -134,10 +138,10 @@ def unevenness(time: FloatArray) -> float:
 
 def is_even(time: FloatArray) -> bool:
     """Return whether times (N,) lie on an even grid to a thousandth of its interval."""
-    return unevenness(time) <= EVEN
+    return unevenness(time) <= EVENNESS_TOLERANCE
 
 
-def nearly_even(time: FloatArray) -> bool:
+def is_nearly_even(time: FloatArray) -> bool:
     """Return whether every step of times (N,) is within a tenth of the mean step.
 
     A filter for evenly spaced samples then still holds.
@@ -145,7 +149,7 @@ def nearly_even(time: FloatArray) -> bool:
     if len(time) < 2:
         return True
     steps = np.diff(time)
-    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0))
+    return bool(np.allclose(steps, steps.mean(), rtol=STEP_TOLERANCE, atol=0.0))
 
 
 def quantum_of(values: FloatArray) -> float:
@@ -189,8 +193,10 @@ def lattice_step(values: FloatArray) -> float | None:
     # a low quantile, because levels that do not repeat leave distances of several steps
     step = float(np.quantile(distances, 0.25))
     off_lattice = np.abs(distances / step - np.round(distances / step))
-    on_lattice = np.mean((off_lattice < OFF_LATTICE) & (distances > (1.0 - OFF_LATTICE) * step))
-    return step if on_lattice >= ON_LATTICE else None
+    on_lattice = np.mean(
+        (off_lattice < LATTICE_TOLERANCE) & (distances > (1.0 - LATTICE_TOLERANCE) * step)
+    )
+    return step if on_lattice >= LEAST_LATTICE_SHARE else None
 
 
 def least_beyond_rounding(differences: FloatArray) -> float:

@@ -12,7 +12,7 @@ import pydantic
 
 from discrepancy.campaign import records
 from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Release
-from discrepancy.campaign.units import conversion, conversion_of
+from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
@@ -54,7 +54,7 @@ class NoiseFileSection(Section):
 def _unit_in_si(recorded: records.InTables) -> float:
     """Return the factor from the unit of a channel or input to SI."""
     try:
-        return conversion_of(recorded.quantity, recorded.unit)
+        return factor_to_si(recorded.quantity, recorded.unit)
     except ValueError as cause:
         raise ValueError(f"the unit of {recorded.name!r}: {cause}") from None
 
@@ -112,7 +112,7 @@ def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
             f"the column {column!r} is reserved: give the input {recorded.name!r} another column"
         )
     hold = recorded.hold
-    if recorded.quantity.moving and not recorded.reference:
+    if recorded.quantity.motion_chain and not recorded.reference:
         if hold not in (None, records.Hold.SMOOTH):
             raise ValueError(
                 f"the input {recorded.name!r} is a motion, which no drive makes in steps or "
@@ -125,7 +125,7 @@ def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
 
 def _checked_force_unit(unit: str) -> str:
     """Return a unit of force; raise ValueError if it is a unit of something else."""
-    conversion_of(records.Quantity.FORCE, unit)
+    factor_to_si(records.Quantity.FORCE, unit)
     return unit
 
 
@@ -136,7 +136,7 @@ def _release_in_si(release: Release) -> Release:
         unit = "m"
     elif release.unit.endswith("V"):
         unit = "V"
-    displacement = conversion(release.unit, unit) * release.displacement
+    displacement = conversion_factor(release.unit, unit) * release.displacement
     return replace(release, displacement=displacement, unit=unit)
 
 
@@ -282,13 +282,13 @@ class CampaignSection(Section):
 
     def _unknown_channels(self) -> Iterator[Fault]:
         """Yield the names in `channels` and `left_out` of trials that are not names of channels."""
-        known = {channel.name for channel in self.channel}
+        channel_names = {channel.name for channel in self.channel}
         for trial in self.trial:
             for name in (*(trial.channels or ()), *trial.left_out):
                 yield (
-                    name not in known,
+                    name not in channel_names,
                     f"the trial {trial.name!r} names the channel {name!r}, "
-                    f"which is not among the channels {', '.join(sorted(known))}",
+                    f"which is not among the channels {', '.join(sorted(channel_names))}",
                 )
 
     def _logger_faults(self) -> Iterator[Fault]:
@@ -306,10 +306,10 @@ class CampaignSection(Section):
                 f"`loggers` names {name!r}, but the channels and inputs are {', '.join(expected)}",
             )
         for name in expected:
-            number = "more than one" if name in logged else "none"
+            logger_count = "more than one" if name in logged else "none"
             yield (
                 logged.count(name) != 1,
-                f"{name!r} must be on one of the `loggers`, and it is on {number}",
+                f"{name!r} must be on one of the `loggers`, and it is on {logger_count}",
             )
         loggers_of_inputs = [names for names in self.loggers.values() if inputs.intersection(names)]
         yield (

@@ -12,7 +12,7 @@ from discrepancy.campaign.columns import (
     gain_deviation,
     zero_deviation,
 )
-from discrepancy.campaign.units import conversion_of
+from discrepancy.campaign.units import factor_to_si
 from reporting.words import listing
 
 ASSUMED_ZERO = "1%"
@@ -86,7 +86,7 @@ class SensorDeviations:
         for column in self.columns:
             if column.head != head or self.kinds[column.sheet.name] == NOISE:
                 continue
-            for cell in column.in_si(self.decimals[column.sheet.name]):
+            for cell in column.cells_in_si(self.decimals[column.sheet.name]):
                 if cell and isfinite(float(cell)):
                     largest = max(largest, abs(float(cell)))
         return largest
@@ -109,7 +109,7 @@ class SensorDeviations:
             is_assumed = self._questionnaire.is_assumed("zero", column.head)
             if column.is_channel and is_assumed and not isinstance(zero, str):
                 assert column.quantity is not None
-                deviation = zero / conversion_of(column.quantity, column.read_in)
+                deviation = zero / factor_to_si(column.quantity, column.read_in)
                 phrases.append(f"the zero of {column.head!r} to {deviation:.2g} {column.read_in}")
         gains = [repr(head) for head in self.gains if self._questionnaire.is_assumed("gain", head)]
         if gains:

@@ -21,7 +21,7 @@ from discrepancy.campaign.cells import (
     plain_number,
     seconds_of_clock_times,
 )
-from discrepancy.campaign.heads import named
+from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.campaign.table_layout import SEPARATORS, Rows, find_table
 from discrepancy.errors import CampaignFileError
@@ -48,7 +48,7 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
-_LOOKED_AT = 500
+_LINES_FOR_SEPARATOR = 500
 """Number of first lines by which the separator is chosen."""
 
 
@@ -163,7 +163,7 @@ def _sheet_of_rows(
     columns: list[tuple[str, ...]] = []
     left_out = ""
     for index, title in enumerate(layout.head):
-        head, unit = named(title or f"column {index + 1}", layout.units[index])
+        head, unit = split_head(title or f"column {index + 1}", layout.units[index])
         cells = cells_of_columns[index]
         if index in seconds_of_columns:
             unit = "s"
@@ -186,7 +186,7 @@ def _sheet_of_rows(
     return Sheet(
         name=name,
         digest=hash_file(file),
-        heads=tuple(_numbered(heads)),
+        heads=tuple(_number_repeated_heads(heads)),
         units=tuple(units),
         columns=tuple(columns),
         lines=lines,
@@ -201,15 +201,15 @@ def _cell(row: Sequence[str], index: int) -> str:
     return row[index] if index < len(row) else ""
 
 
-def _remark_on_texts(title: str, numbers: int, texts: int) -> str:
+def _remark_on_texts(title: str, number_count: int, text_count: int) -> str:
     """Return the remark on a column that is left out for its texts, beside a count of numbers."""
     content = "no numbers"
-    if numbers:
-        content = f"{counted(numbers, 'number')} and {counted(texts, 'text')}"
+    if number_count:
+        content = f"{counted(number_count, 'number')} and {counted(text_count, 'text')}"
     return f"; the column {title!r} holds {content} and is left out"
 
 
-def _numbered(heads: Sequence[str]) -> list[str]:
+def _number_repeated_heads(heads: Sequence[str]) -> list[str]:
     """Make heads unique: the second one of a name gets the number 2, and so on."""
     numbered = []
     for index, head in enumerate(heads):
@@ -250,13 +250,13 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
         The entries are whether a table is found, whether its heads are words, and the number of
         cells with numbers minus that of cells with texts.
         """
-        rows = _split_rows(lines[:_LOOKED_AT], separator, path.name)
+        rows = _split_rows(lines[:_LINES_FOR_SEPARATOR], separator, path.name)
         numbers_minus_texts = 0
         for _, row in rows:
-            numbers = sum(map(is_value, row))
-            texts = sum(map(bool, row)) - numbers
-            if numbers > 1:
-                numbers_minus_texts += numbers - texts
+            number_count = sum(map(is_value, row))
+            texts = sum(map(bool, row)) - number_count
+            if number_count > 1:
+                numbers_minus_texts += number_count - texts
         try:
             layout = find_table(rows, path.name, "")
         except CampaignFileError:

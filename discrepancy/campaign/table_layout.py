@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from discrepancy.campaign.cells import CLOCK, is_value
-from discrepancy.campaign.heads import is_unit, named, plain_unit, times_among
+from discrepancy.campaign.heads import is_unit, plain_unit, split_head, time_heads
 from discrepancy.errors import CampaignFileError
 from reporting.toml_file import short_repr
 from reporting.words import counted, listing
@@ -63,10 +63,10 @@ def _rows_of_longer_clocks(
     names = []
     units_of_names = []
     for title, unit in zip(head, units, strict=False):  # a row of units may be shorter
-        name, own_unit = named(title, unit)
+        name, own_unit = split_head(title, unit)
         names.append(name)
         units_of_names.append(own_unit)
-    times = times_among(names, units_of_names)
+    times = time_heads(names, units_of_names)
     places_of_times = {place for place, name in enumerate(names) if name in times}
     if len(places_of_times) < 2:
         return []
@@ -115,7 +115,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     name : str
         Name of the file, for messages.
     place : str
-        Begin of the place of a row, for messages, before its number.
+        Start of the place of a row, for messages, before its number.
 
     Raises
     ------

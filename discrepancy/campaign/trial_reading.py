@@ -23,12 +23,12 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.sampling import check_sampling
-from discrepancy.campaign.units import conversion, conversion_of
+from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.table_file import TextTable
 from reporting.words import counted, is_or_are
 
-LATE = 1.5
+LATEST_FIRST_SAMPLE = 1.5
 """Latest time of the first sample after a release from rest, in sampling intervals."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
@@ -53,16 +53,16 @@ def read_trial(
         Remarks of the reader; those on this trial are added.
     """
     user = f"the trial {section.name!r}"
-    time, start = _times(section, table, campaign, user)
+    time, start = _read_times(section, table, campaign, user)
     channels = _channels_of_trial(section, table, campaign)
     values = []
     used = []
     for channel in channels:
-        channel_values, channel_used = _readings(channel, section, table, remarks)
+        channel_values, channel_used = _read_channel(channel, section, table, remarks)
         values.append(channel_values)
         used.append(channel_used)
     losses = _stiffness_losses(section, table, user)
-    inputs = _inputs(section, table, campaign, user)
+    inputs = _read_inputs(section, table, campaign, user)
     load_factor = np.zeros(len(table))
     if section.kind is TrialKind.FLIGHT:
         load_factor = table.numbers("load_factor", user)
@@ -72,9 +72,9 @@ def read_trial(
         values=np.stack(values, axis=1),
         used=np.stack(used, axis=1),
         time=time,
-        force=_force(section, table, campaign, inputs),
+        force=_read_force(section, table, campaign, inputs),
         load_factor=load_factor,
-        temperature=_temperature(section, table, campaign, user),
+        temperature=_read_temperature(section, table, campaign, user),
         start=start,
         health=losses.means,
         regions=losses.regions,
@@ -85,7 +85,7 @@ def read_trial(
     )
 
 
-def _inputs(
+def _read_inputs(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> tuple[RecordedInput, ...]:
     """Return the recorded inputs of a driven or static trial."""
@@ -98,7 +98,7 @@ def _inputs(
     )
 
 
-def _force(
+def _read_force(
     section: schema.TrialSection,
     table: TextTable,
     campaign: schema.CampaignSection,
@@ -112,7 +112,7 @@ def _force(
     # a static trial with other inputs needs no force
     has_other_loads = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     if section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not has_other_loads:
-        to_newton = conversion(campaign.force_unit, schema.FORCE_UNIT)
+        to_newton = conversion_factor(campaign.force_unit, schema.FORCE_UNIT)
         return table.numbers("force", f"the trial {section.name!r}") * to_newton
     for recorded in inputs:
         if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):
@@ -128,10 +128,10 @@ def numbers_in_si(
     Empty cells are nan where they are allowed.
     """
     numbers = table.numbers(recorded.table_column, user, empty_allowed=empty_allowed)
-    return numbers * conversion_of(recorded.quantity, recorded.unit)
+    return numbers * factor_to_si(recorded.quantity, recorded.unit)
 
 
-def _times(
+def _read_times(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> tuple[FloatArray, float]:
     """Return the times of a trial's rows (N,) [s], and its start since the campaign's start [s].
@@ -154,7 +154,7 @@ def _times(
 
 def _check_release_time(release: Release, time: FloatArray, file: str, user: str) -> None:
     """Refuse a ring-down whose times (N,) [s] do not begin at the release."""
-    if release.at_rest and time[0] > LATE * (time[1] - time[0]):
+    if release.at_rest and time[0] > LATEST_FIRST_SAMPLE * (time[1] - time[0]):
         raise CampaignDataError(
             f"{file}: the time of {user} begins at {time[0]:g} s, and the first sample of a "
             "release from rest is at the release, at 0: count times from there, or set `at_rest = "
@@ -240,15 +240,15 @@ def _channels_of_trial(
         table.cells(channel.table_column, f"the channel {channel.name!r}")
     if not channels:
         columns = ", ".join(table.columns)
-        wanted = ", ".join(channel.table_column for channel in campaign.channel)
+        named_channels = ", ".join(channel.table_column for channel in campaign.channel)
         raise CampaignFileError(
             f"{table.name} of the trial {section.name!r} holds no channel: its columns are "
-            f"{columns}, and those of the channels {wanted}."
+            f"{columns}, and those of the channels {named_channels}."
         )
     return channels
 
 
-def _readings(
+def _read_channel(
     channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
     """Read a channel's column of a trial.
@@ -288,7 +288,7 @@ def _readings(
     return values, used
 
 
-def _temperature(
+def _read_temperature(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> FloatArray:
     """Return the temperature of a trial (N,) minus the reference temperature [K]; 0 if unknown."""
@@ -301,13 +301,13 @@ def _temperature(
     if not has_column and section.temperature is None:
         return np.zeros(len(table))
     if campaign.reference_temperature is None:
-        raise CampaignFileError(no_reference_temperature(section.name))
+        raise CampaignFileError(no_reference_temperature_message(section.name))
     if has_column:
         return table.numbers("temperature", user) - campaign.reference_temperature
     return np.full(len(table), section.temperature) - campaign.reference_temperature
 
 
-def no_reference_temperature(trial: str) -> str:
+def no_reference_temperature_message(trial: str) -> str:
     """Return the message that a trial has a temperature, and the campaign no reference for it."""
     return (
         f"The trial {trial!r} has a temperature, but the campaign has no `reference_temperature`: "

@@ -69,7 +69,7 @@ UNITS = {
 
 
 @cache
-def conversion(unit: str, si: str) -> float:
+def conversion_factor(unit: str, si: str) -> float:
     """Return the factor from a unit to a unit of SI: 0.001 from mm to m.
 
     Units of angle and plain numbers do not convert into each other, and neither do hertz and rad/s.
@@ -99,7 +99,7 @@ def conversion(unit: str, si: str) -> float:
 
 
 @cache
-def conversion_of(quantity: Quantity, unit: str) -> float:
+def factor_to_si(quantity: Quantity, unit: str) -> float:
     """Return the factor from a unit to the SI unit of a quantity.
 
     Raises
@@ -108,14 +108,14 @@ def conversion_of(quantity: Quantity, unit: str) -> float:
         If the quantity is not measured in that unit; the message names its usual units.
     """
     try:
-        return _conversion_of(quantity, unit)
+        return _factor_to_si(quantity, unit)
     except ValueError:
         usual = listing(UNITS[quantity].usual, "or")
         name = quantity.value.replace("_", " ")
         raise ValueError(f"{name} must have a unit such as {usual}, and {unit!r} came") from None
 
 
-def _conversion_of(quantity: Quantity, unit: str) -> float:
+def _factor_to_si(quantity: Quantity, unit: str) -> float:
     """Return the factor from a unit to the SI unit of a quantity.
 
     Raises
@@ -131,8 +131,8 @@ def _conversion_of(quantity: Quantity, unit: str) -> float:
         raise ValueError  # the output of a bridge is not a strain before its gauge factor is known
     if quantity is Quantity.SIGNAL:
         with suppress(ValueError):
-            return conversion(unit, "1")
-    return conversion(unit, UNITS[quantity].si)
+            return conversion_factor(unit, "1")
+    return conversion_factor(unit, UNITS[quantity].si)
 
 
 @cache
@@ -141,6 +141,6 @@ def quantities_of(unit: str) -> tuple[Quantity, ...]:
     quantities = []
     for quantity in Quantity:
         with suppress(ValueError):
-            conversion_of(quantity, unit)
+            factor_to_si(quantity, unit)
             quantities.append(quantity)
     return tuple(quantities)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from discrepancy.campaign import records, schema
-from discrepancy.campaign.reading import CAMPAIGN_FILE, placed_events
-from discrepancy.campaign.trial_reading import no_reference_temperature
+from discrepancy.campaign.reading import CAMPAIGN_FILE, complete_events
+from discrepancy.campaign.trial_reading import no_reference_temperature_message
 from discrepancy.campaign.units import (
     NEVER_CONVERTED,
     UNITS,
-    conversion,
-    conversion_of,
+    conversion_factor,
+    factor_to_si,
     quantities_of,
 )
 from discrepancy.errors import CampaignFileError
@@ -156,20 +156,20 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
     if trial.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED):
-        to_newton = conversion(file_units.force_unit, "N")
+        to_newton = conversion_factor(file_units.force_unit, "N")
         columns["force"] = file_units.in_unit(trial.force, "force", to_newton)
     if trial.kind is records.TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
-            raise CampaignFileError(no_reference_temperature(trial.name))
+            raise CampaignFileError(no_reference_temperature_message(trial.name))
         columns["temperature"] = trial.temperature + campaign.reference_temperature
     columns |= _loss_columns(trial)
     for recorded in trial.inputs:
-        to_si = conversion_of(recorded.quantity, _input_unit(recorded, file_units))
+        to_si = factor_to_si(recorded.quantity, _input_unit(recorded, file_units))
         columns[recorded.name] = file_units.in_unit(recorded.values, recorded.name, to_si)
     for index, name in enumerate(trial.channels):
-        to_si = conversion_of(campaign.channels[name].quantity, file_units.units[name])
+        to_si = factor_to_si(campaign.channels[name].quantity, file_units.units[name])
         values = trial.values[:, index]
         if file_units.left_out_as_empty:
             values = np.where(trial.used[:, index], values, np.nan)
@@ -234,7 +234,7 @@ def _noise_table(campaign: records.Campaign, interval: float, file_units: _FileU
     longest = max(len(samples) for samples in samples_of_channels.values())
     columns: dict[str, records.FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, samples in samples_of_channels.items():
-        to_si = conversion_of(campaign.channels[name].quantity, file_units.units[name])
+        to_si = factor_to_si(campaign.channels[name].quantity, file_units.units[name])
         columns[name] = np.full(longest, np.nan)
         columns[name][: len(samples)] = file_units.in_unit(samples, name, to_si)
     return table_text(columns)
@@ -283,17 +283,19 @@ def _campaign_text(
         noise=noise,
         loggers=dict(campaign.loggers),
         accept=campaign.accept,
-        channel=tuple(_channel(channel, file_units) for channel in campaign.channels.values()),
-        input=tuple(_input(recorded, file_units) for recorded in inputs.values()),
+        channel=tuple(
+            _channel_table(channel, file_units) for channel in campaign.channels.values()
+        ),
+        input=tuple(_input_table(recorded, file_units) for recorded in inputs.values()),
         trial=tuple(trials),
-        event=tuple(placed_events(campaign.events, campaign.trials, source)),
+        event=tuple(complete_events(campaign.events, campaign.trials, source)),
     )
     content = section.model_dump(mode="json", exclude_defaults=True)
     schema.parse_campaign(content, source)
     return toml_text(content)
 
 
-def _channel(channel: records.Channel, file_units: _FileUnits) -> records.Channel:
+def _channel_table(channel: records.Channel, file_units: _FileUnits) -> records.Channel:
     """Return a channel as `campaign.toml` states it, without its samples at rest.
 
     These are written to a table of their own.
@@ -306,11 +308,11 @@ def _channel(channel: records.Channel, file_units: _FileUnits) -> records.Channe
     return replace(channel, unit=file_units.units[channel.name], column="", noise=noise)
 
 
-def _input(recorded: records.RecordedInput, file_units: _FileUnits) -> records.RecordedInput:
+def _input_table(recorded: records.RecordedInput, file_units: _FileUnits) -> records.RecordedInput:
     """Return an input as `campaign.toml` states it, with its deviation in the unit of the file."""
-    is_reference = bool(recorded.quantity.moving) and recorded.hold is not records.Hold.SMOOTH
+    is_reference = bool(recorded.quantity.motion_chain) and recorded.hold is not records.Hold.SMOOTH
     unit = _input_unit(recorded, file_units)
-    deviation = recorded.offset_deviation / conversion_of(recorded.quantity, unit)
+    deviation = recorded.offset_deviation / factor_to_si(recorded.quantity, unit)
     return replace(
         recorded, unit=unit, offset_deviation=deviation, column="", reference=is_reference
     )

@@ -24,11 +24,12 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
     station = "0.5 * length"
 
 Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such
-as "ports"), `preferred` (ports of a wing that stand for its others), `needs` (words of `NEEDS`),
-`spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of `unit` and
-`magnitude`), `levels` of a parameter. Names in arithmetic are the parameters and `SCALES`. Text
-values of a primitive (port, channel, run) are taken as they are; "place" stands for the place,
-"quantity of the place" for what it measures. A primitive with `if` is left out where that is zero.
+as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_needs` (words of
+`NEEDS`), `spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of
+`unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are the parameters and
+`SCALES`. Text values of a primitive (port, channel, run) are taken as they are; "place" stands for
+the place, "quantity of the place" for what it measures. A primitive with `if` is left out where
+that is zero.
 
 Time and events of the campaign (`docs/when.md`)::
 
@@ -62,7 +63,7 @@ from discrepancy.catalogue.effect_in_setting import (
     Target,
 )
 from discrepancy.catalogue.entry import Effect, EffectKeys, Setting
-from discrepancy.catalogue.needs import NEEDS, reason_against
+from discrepancy.catalogue.needs import NEEDS, untestable_reason
 from discrepancy.catalogue.places import PLACES, places_of
 from discrepancy.catalogue.scale_names import SCALES, SHAPES_OF_SCALES, BuildContext
 from discrepancy.errors import CatalogueError
@@ -90,11 +91,12 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
     if not isinstance(tables, list) or not tables:
         raise CatalogueError(f"The file of effects {path} has no table [[effect]].")
     return tuple(
-        _effect(table, f"{path}, effect {number}") for number, table in enumerate(tables, start=1)
+        _parse_effect(table, f"{path}, effect {number}")
+        for number, table in enumerate(tables, start=1)
     )
 
 
-def _effect(table: object, place: str) -> Effect:
+def _parse_effect(table: object, place: str) -> Effect:
     """Return the effect that a table describes.
 
     Parameters
@@ -117,11 +119,11 @@ def _effect(table: object, place: str) -> Effect:
     _check_names(section, names, place)
     _check_places_and_needs(section, place)
     templates = tuple(
-        _primitive_template(row, names, moments, f"{place}, primitives {number}")
+        _parse_primitive(row, names, moments, f"{place}, primitives {number}")
         for number, row in enumerate(section.primitives, start=1)
     )
-    _check_trials_of_courses(section, templates)
-    effect = _EffectOfFile(section, templates)
+    _check_acts_on_dynamic_trials(section, templates)
+    effect = _EffectFunctions(section, templates)
     return Effect(
         build=effect.build,
         places=effect.places,
@@ -132,12 +134,12 @@ def _effect(table: object, place: str) -> Effect:
 
 def _check_names(section: EffectSection, names: frozenset[str], place: str) -> None:
     """Refuse names of parameters and events that mean something else in an expression."""
-    taken = {*SCALES, *RESERVED}
+    used_names = {*SCALES, *RESERVED}
     for name in names:
-        if not name.isidentifier() or name in taken:
+        if not name.isidentifier() or name in used_names:
             raise CatalogueError(f"{place}: a parameter must not be called {name!r}.")
     for name in section.events:
-        if not name.isidentifier() or name in taken | names:
+        if not name.isidentifier() or name in used_names | names:
             raise CatalogueError(f"{place}: an event must not be called {name!r}.")
 
 
@@ -160,29 +162,34 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
             if name in PLACES:
                 raise CatalogueError(
                     f"{place}: 'places' is a list that holds {name!r}, which would be the name of "
-                    "a "
-                    f'single place; for all {name} write places = "{name}", without brackets.'
+                    f'a single place; for all {name} write places = "{name}", without brackets.'
                 )
     if not section.primitives:
         raise CatalogueError(f"{place} has no [[primitives]].")
 
 
-def _check_trials_of_courses(
+def _check_acts_on_dynamic_trials(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
-    """Refuse an effect on static or flight trials that has primitives which depend on time."""
-    timed = [
+    """Refuse an effect that depends on time, but is declared to act on static trials or flights.
+
+    The rows of these trials are not samples of a motion in time. A primitive depends on time if it
+    acts in windows or has a value that is a formula in time.
+    """
+    time_dependent = [
         template
         for template in templates
-        if template.in_windows or PRIMITIVES[template.kind].formula_fields
+        if template.acts_in_windows or PRIMITIVES[template.kind].formula_fields
     ]
-    if not timed:
+    if not time_dependent:
         return
+    kinds_without_time = section.acts_on - DYNAMIC
+    # in the order of the enumeration, so that the message is always the same
     for kind in TrialKind:
-        if kind in section.acts_on - DYNAMIC:
+        if kind in kinds_without_time:
             raise CatalogueError(
-                f"{timed[0].place} asks for the time of trials, but 'acts_on' has {kind.value!r}, "
-                "whose rows are no course in time."
+                f"{time_dependent[0].place} asks for the time of trials, but 'acts_on' has "
+                f"{kind.value!r}, whose rows are no course in time."
             )
 
 
@@ -217,7 +224,7 @@ class _PrimitiveTemplate:
     moments: frozenset[str]
 
     @property
-    def in_windows(self) -> bool:
+    def acts_in_windows(self) -> bool:
         """Whether the primitive acts only in a window of time."""
         return "begin" in self.conditions or "end" in self.conditions
 
@@ -227,66 +234,68 @@ class _PrimitiveTemplate:
         Without events and windows there is one primitive. If the expression `if` is zero, there is
         none.
         """
-        numbers = dict(context.values)
+        values_by_name = dict(context.values)
         for name in self.scales:
-            numbers[name] = SCALES[name](context)
-        if "if" in self.conditions and self.conditions["if"].value(numbers) == 0.0:
+            values_by_name[name] = SCALES[name](context)
+        if "if" in self.conditions and self.conditions["if"].value(values_by_name) == 0.0:
             return
-        if not self.moments and not self.in_windows:
-            yield self._primitive(numbers, context.target)
+        if not self.moments and not self.acts_in_windows:
+            yield self._evaluate_primitive(values_by_name, context.target)
             return
         for trial in context.setting.campaign.trials:
             if not trial.is_dynamic:
                 continue
             occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
             for moments in occurrences:
-                numbers_then = {**numbers, **moments}
-                begin = self._moment("begin", numbers_then)
-                end = self._moment("end", numbers_then)
-                primitive = self._primitive(numbers_then, context.target)
+                values_and_moments = {**values_by_name, **moments}
+                begin = self._evaluate_moment("begin", values_and_moments)
+                end = self._evaluate_moment("end", values_and_moments)
+                primitive = self._evaluate_primitive(values_and_moments, context.target)
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
-    def _moment(self, key: str, numbers: Mapping[str, float]) -> float | None:
-        """Return the begin or the end of its window [s]; None if the window is open on that side.
+    def _evaluate_moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
+        """Return the start or end of the primitive's window [s]; None if it is open on that side.
 
         Parameters
         ----------
         key : str
             "begin" or "end".
-        numbers : mapping of str to float
+        values_by_name : mapping of str to float
             Values of the names in expressions.
         """
         expression = self.conditions.get(key)
-        return None if expression is None else expression.value(numbers)
+        return None if expression is None else expression.value(values_by_name)
 
-    def _primitive(self, numbers: Mapping[str, float], target: Target) -> Primitive:
+    def _evaluate_primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
         """Return the primitive with its expressions evaluated.
 
         Parameters
         ----------
-        numbers : mapping of str to float
+        values_by_name : mapping of str to float
             Values of the names in expressions.
         target : Target
             What the place stands for.
         """
         # texts of a primitive that stand for the place of the effect
         words = {"place": target.name, "quantity of the place": target.quantity}
-        courses = PRIMITIVES[self.kind].formula_fields
+        formulas = PRIMITIVES[self.kind].formula_fields
         row: dict[str, str | float] = {}
         for name, value in self.values.items():
             if isinstance(value, str):
                 row[name] = words.get(value, value)
             elif not isinstance(value, Expression):
                 row[name] = value
-            elif name in courses:  # a formula in time stays a formula
-                used_numbers = {key: numbers[key] for key in value.used_names() if key in numbers}
+            elif name in formulas:  # a formula in time stays a formula
+                used_numbers = {
+                    key: values_by_name[key] for key in value.used_names() if key in values_by_name
+                }
                 row[name] = value.with_numbers(used_numbers)
             else:
-                row[name] = value.value(numbers)
-        return _primitive_of(self.kind, row)
+                row[name] = value.value(values_by_name)
+        return _build_primitive(self.kind, row)
 
 
-def _primitive_template(
+def _parse_primitive(
     row: Mapping[str, str | float],
     parameters: frozenset[str],
     moments: frozenset[str],
@@ -364,11 +373,11 @@ def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> 
             row[key] = value
         else:
             row[key] = "1" if key in PRIMITIVES[kind].formula_fields else 1.0
-    _primitive_of(kind, row)
+    _build_primitive(kind, row)
 
 
 @dataclass(frozen=True)
-class _EffectOfFile:
+class _EffectFunctions:
     """The functions of an `Effect` that a file describes.
 
     Attributes
@@ -396,7 +405,7 @@ class _EffectOfFile:
 
     def unavailable(self, setting: Setting) -> str | None:
         """Return why it cannot be tested, or None."""
-        return reason_against(self._in_setting(setting))
+        return untestable_reason(self._in_setting(setting))
 
     def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         """Return the patch of the effect.
@@ -420,7 +429,7 @@ class _EffectOfFile:
         return ModelPatch(tuple(primitives))
 
 
-def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:
+def _build_primitive(kind: str, row: Mapping[str, str | float]) -> Primitive:
     """Build a primitive from its values; floats become integers for fields that are integers."""
     types = PRIMITIVES[kind].value_types()
     integers: dict[str, int] = {}

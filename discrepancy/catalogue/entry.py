@@ -13,7 +13,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
 
-NINETY = 1.6448536269514722
+NINETY_PERCENT_QUANTILE = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 Number = Annotated[float, Strict()]
 ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
@@ -46,7 +46,7 @@ class Prior:
         low, high = self.low, self.high
         if self.shape == "log_normal":
             low, high = log(low), log(high)
-        return 0.5 * (low + high), 0.5 * (high - low) / NINETY
+        return 0.5 * (low + high), 0.5 * (high - low) / NINETY_PERCENT_QUANTILE
 
     def value(self, u: float) -> float:
         """Return the value at the standard normal variable `u`."""
@@ -57,7 +57,7 @@ class Prior:
             return exp(mean + deviation * u)
         return mean + deviation * u
 
-    def normal(self, value: float) -> float:
+    def standard_normal(self, value: float) -> float:
         """Return the standard normal variable of a value: the inverse of the method `value`."""
         if self.shape == "uniform":
             probability = (value - self.low) / (self.high - self.low)
@@ -67,7 +67,7 @@ class Prior:
             value = log(value)
         return (value - mean) / deviation
 
-    def stepped(self, u: float, step: float) -> float:
+    def step_within_prior(self, u: float, step: float) -> float:
         """Return the standard normal variable after a step of an iteration.
 
         A prediction that is proportional to a log-normal value x is not linear in u, but linear in

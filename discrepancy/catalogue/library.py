@@ -91,25 +91,26 @@ def load_catalogue(
             effects.append(effect_or_file)
         else:
             effects += effects_of_file(effect_or_file)
-    check(effects)
+    check_effects(effects)
     return tuple(effects)
 
 
 def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
     """Return the effect with an identifier; raise `CatalogueError` if there is none."""
-    known = {effect.identifier: effect for effect in effects}
-    if identifier not in known:
+    effects_by_identifier = {effect.identifier: effect for effect in effects}
+    if identifier not in effects_by_identifier:
         raise CatalogueError(
-            f"The catalogue has no effect {identifier!r}; it has {', '.join(known)}."
-            f"{did_you_mean(identifier, known)}"
+            f"The catalogue has no effect {identifier!r}; it has "
+            f"{', '.join(effects_by_identifier)}."
+            f"{did_you_mean(identifier, effects_by_identifier)}"
         )
-    return known[identifier]
+    return effects_by_identifier[identifier]
 
 
-def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     """Return variants of effects that act only during an event, as further hypotheses.
 
-    Such a variant acts in all trials that have the event, also in held-out ones, from the begin of
+    Such a variant acts in all trials that have the event, also in held-out ones, from the start of
     the event to its end. These times are known and not fitted. Effects that cannot act in a window
     of time, or that the model cannot switch on and off, have no variant.
 
@@ -132,7 +133,7 @@ def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]
         return ()
     switchable_effects = [effect for effect in effects if _can_act_in_windows(effect, setting)]
     return tuple(
-        _during_event(effect, name, setting)
+        _variant_in_event(effect, name, setting)
         for name in event_names
         for effect in switchable_effects
     )
@@ -158,7 +159,7 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
     return setting.model.follows_windows or only_sensors
 
 
-def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
+def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
     """Return the variant of an effect that acts only during all events of a name."""
     windows: list[Window] = []
     for event in setting.campaign.events:
@@ -178,12 +179,12 @@ def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
     )
 
 
-def check(effects: Iterable[Effect]) -> None:
+def check_effects(effects: Iterable[Effect]) -> None:
     """Raise `CatalogueError` for the first effect that is not valid, or if identifiers clash."""
     effects = tuple(effects)
     counts = Counter(effect.identifier for effect in effects)
     for effect in effects:
-        for fault in _faults(effect):
+        for fault in _effect_faults(effect):
             raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
     for identifier, count in counts.items():
         if count > 1:
@@ -191,15 +192,15 @@ def check(effects: Iterable[Effect]) -> None:
                 f"The catalogue has {count} effects with the identifier {identifier!r}."
             )
     for effect in effects:
-        for other in effect.confusable:
-            if other not in counts or other == effect.identifier:
+        for confusable in effect.confusable:
+            if confusable not in counts or confusable == effect.identifier:
                 raise CatalogueError(
-                    f"The effect {effect.identifier!r} names {other!r} as confusable, which is no "
-                    "other effect of the catalogue."
+                    f"The effect {effect.identifier!r} names {confusable!r} as confusable, which "
+                    "is no other effect of the catalogue."
                 )
 
 
-def _faults(effect: Effect) -> Iterator[str]:
+def _effect_faults(effect: Effect) -> Iterator[str]:
     """Yield the faults of an effect, each as the end of a sentence that begins with the effect."""
     if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
         yield " must have a name, and an identifier of lower-case letters, digits and underscores."

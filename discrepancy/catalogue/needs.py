@@ -44,10 +44,10 @@ def _no_event(effect: EffectInSetting) -> str | None:
     names_of_trials = [campaign.moment_names(trial.name) for trial in campaign.fitted]
     if not effect.moments or any(effect.moments <= names for names in names_of_trials):
         return None
-    known = sorted({name for names in names_of_trials for name in names})
+    known_events = sorted({name for names in names_of_trials for name in names})
     return (
         f"No trial to fit has {' and '.join(sorted(effect.moments))} as [[event]]; those that are "
-        f"fitted have {', '.join(known) or 'none'}."
+        f"fitted have {', '.join(known_events) or 'none'}."
     )
 
 
@@ -179,7 +179,7 @@ NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
 """Functions that return why a need is not met, or None, by the word in the file."""
 
 
-def reason_against(effect: EffectInSetting) -> str | None:
+def untestable_reason(effect: EffectInSetting) -> str | None:
     """Return why an effect cannot be tested: the first of its needs that is not met.
 
     None if all are.

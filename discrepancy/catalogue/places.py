@@ -5,7 +5,7 @@ from math import isinf
 
 import numpy as np
 
-from discrepancy.campaign.noise import MAINS, aliased
+from discrepancy.campaign.noise import MAINS, aliased_frequency
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.catalogue.effect_in_setting import (
     ALL,
@@ -19,7 +19,7 @@ from discrepancy.catalogue.entry import Setting
 from fe.runtime.patch import EVERY_CHANNEL
 
 
-def _or_all(names: Names) -> Names:
+def _with_place_of_all(names: Names) -> Names:
     """Return places, with the place of all channels before them if there are several."""
     return (EVERY_CHANNEL, *names) if len(names) > 1 else names
 
@@ -53,22 +53,30 @@ def _calibrated_channels(effect: EffectInSetting) -> Names:
     return effect.channels_of(lambda channel: not isinf(channel.gain_deviation))
 
 
-def _timed_gauges(effect: EffectInSetting) -> Names:
-    """Return the strain gauges (without gauges, all channels) that were read at several times."""
-    places = []
-    for name in effect.strain_channels or effect.channels_of():
-        times = [
-            trial.time + (trial.start if trial.is_dynamic else 0.0)
-            for trial in effect.setting.campaign.fitted
-            if name in trial.channels and trial.time.size
-        ]
-        if not times:
-            continue
-        last = max(np.max(trial_times) for trial_times in times)
-        first = min(np.min(trial_times) for trial_times in times)
-        if last > max(first, 0.0):
-            places.append(name)
-    return tuple(places)
+def _gauges_read_repeatedly(effect: EffectInSetting) -> Names:
+    """Return the strain gauges that were read at several times, for effects that grow with time.
+
+    Without strain gauges all channels are considered.
+    """
+    names = effect.strain_channels or effect.channels_of()
+    return tuple(name for name in names if _is_read_repeatedly(effect, name))
+
+
+def _is_read_repeatedly(effect: EffectInSetting, name: str) -> bool:
+    """Return whether fitted trials have readings of a channel at more than one time.
+
+    Times count from the start of the campaign. The time of a static trial does so already, and
+    that of a dynamic trial counts from the trial's own start.
+    """
+    first_time = np.inf
+    last_time = -np.inf
+    for trial in effect.setting.campaign.fitted:
+        if name in trial.channels and trial.time.size:
+            start = trial.start if trial.is_dynamic else 0.0
+            first_time = min(first_time, np.min(trial.time + start))
+            last_time = max(last_time, np.max(trial.time + start))
+    # an effect that grows from time zero is seen only in readings after it
+    return bool(last_time > max(first_time, 0.0))
 
 
 def _zeroed_runs(effect: EffectInSetting) -> Names:
@@ -102,7 +110,7 @@ def mains_lines(setting: Setting) -> Names:
         counts = []
         for trial in trials:
             duration = float(trial.time[-1] - trial.time[0])
-            counts.append(aliased(frequency, trial.interval) * duration)
+            counts.append(aliased_frequency(frequency, trial.interval) * duration)
         return np.array(counts)
 
     groups: list[list[float]] = []
@@ -137,10 +145,10 @@ def _lines_in_channels(effect: EffectInSetting) -> Names:
 PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports": lambda effect: effect.setting.model.ports,
     "channels": EffectInSetting.channels_of,
-    "channels, or all": lambda effect: _or_all(effect.channels_of()),
+    "channels, or all": lambda effect: _with_place_of_all(effect.channels_of()),
     CHANNELS_OR_ALL_OF_A_QUANTITY: _channels_or_all_of_a_quantity,
     "strain channels": lambda effect: effect.strain_channels,
-    "strain channels, or all": lambda effect: _or_all(effect.strain_channels),
+    "strain channels, or all": lambda effect: _with_place_of_all(effect.strain_channels),
     "runs": _runs,
     "ports of forces": EffectInSetting.force_ports,
     "held ports": _held_ports,
@@ -149,7 +157,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
     "calibrated channels": _calibrated_channels,
-    "timed gauges": _timed_gauges,
+    "timed gauges": _gauges_read_repeatedly,
     "zeroed runs": _zeroed_runs,
     "loggers": _loggers,
     "mains lines": _lines_in_channels,

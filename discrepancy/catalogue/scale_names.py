@@ -47,10 +47,10 @@ class BuildContext:
         """Natural scales of the port; raises `CatalogueError` if the model has no such port."""
         ports = self.setting.scales.ports
         if self.target.name not in ports:
-            known = ", ".join(ports) or "none"
+            port_names = ", ".join(ports) or "none"
             raise CatalogueError(
                 f"The model {self.setting.model.name!r} has no port {self.target.name!r}; it has "
-                f"{known}."
+                f"{port_names}."
             )
         return ports[self.target.name]
 
@@ -163,7 +163,7 @@ def _largest_release(context: BuildContext) -> float:
     return max(releases, default=0.0) or 1.0
 
 
-def _station(end: int, context: BuildContext) -> float:
+def _station_of_end(end: int, context: BuildContext) -> float:
     """Return the station of an end of the model [m]: 0 for its root, 1 for its tip."""
     stations = context.setting.model.stations or (0.0, 0.0)
     return stations[end]
@@ -182,8 +182,8 @@ _SCALES_OF_MODEL = (
 SCALES: dict[str, Callable[[BuildContext], float]] = {
     **{name: attrgetter(f"setting.scales.{name}") for name in _SCALES_OF_MODEL},
     "pi": lambda context: pi,
-    "root_station": partial(_station, 0),
-    "tip_station": partial(_station, 1),
+    "root_station": partial(_station_of_end, 0),
+    "tip_station": partial(_station_of_end, 1),
     "largest_reading": _largest_reading,
     "largest_release": _largest_release,
     "sampling_interval": _sampling_interval,

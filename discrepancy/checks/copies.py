@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
-from discrepancy.checks.fault import DataFault, FaultKind, place_of
-from discrepancy.checks.held import roughness
+from discrepancy.checks.fault import DataFault, FaultKind, samples_text
+from discrepancy.checks.held import estimate_roughness
 
-COPIED = 0.01
+COPIED_SHARE = 0.01
 """A channel is a copy if another one leaves less than this fraction of its noise unexplained."""
 LEAST_COPIED = 32
 """Fewest samples in which copies are searched."""
-_LAGS = 2**14
+_MOST_SHIFTED_SAMPLES = 2**14
 """Samples in which the shift between two channels is searched."""
 
 
@@ -23,7 +23,7 @@ class _Copy(NamedTuple):
 
     original: str
     copy: str
-    how: str
+    relation: str
 
 
 def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
@@ -35,14 +35,14 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
     for trial in campaign.trials:
         if not trial.is_dynamic:
             continue
-        for original, copy, how in _copies(trial):
+        for original, copy, how in _copied_pairs(trial):
             trials_of_pairs.setdefault((original, copy), []).append((trial, how))
     for (original, copy), trials in trials_of_pairs.items():
         trial, how = trials[0]
         further_trials = ""
         if len(trials) > 1:
             further_trials = f", and so in {len(trials) - 1} more of its trials"
-        place = place_of(campaign.channels[copy], trial)
+        place = samples_text(campaign.channels[copy], trial)
         sentence = (
             f"The channel {copy!r} is the channel {original!r} {how} in {place}{further_trials}: "
             "two sensors never share their noise, so correct `column` or the table, or leave one "
@@ -51,7 +51,7 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
         yield DataFault(FaultKind.COPIED, sentence, copy, trial.name)
 
 
-def _copies(trial: Trial) -> Iterator[_Copy]:
+def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
     """Yield the pairs of channels of a trial of which one is a copy of the other.
 
     Different sensors have independent noise, copies have the same. Sixth differences separate the
@@ -61,7 +61,7 @@ def _copies(trial: Trial) -> Iterator[_Copy]:
     """
     if len(trial.time) < LEAST_COPIED:
         return
-    noise = _noise_by_differences(trial.values[:_LAGS])
+    noise = _noise_by_differences(trial.values[:_MOST_SHIFTED_SAMPLES])
     power = np.sum(noise**2, axis=0)
     # Sixth differences of white noise have the lag-one correlation -6/7; those of a smooth motion
     # without noise have a correlation near 1.
@@ -80,7 +80,7 @@ def _copies(trial: Trial) -> Iterator[_Copy]:
             if abs(correlation[peak]) >= 0.5 * np.sqrt(power[i] * power[j]):
                 # the second half of the inverse transform holds the negative lags
                 shift = peak if peak < len(noise) else peak - len(correlation)
-                how = _how_copied(
+                how = _describe_copy(
                     trial.values[:, i],
                     trial.values[:, j],
                     trial.used[:, i],
@@ -103,7 +103,7 @@ def _noise_by_differences(values: FloatArray) -> FloatArray:
     return np.where(is_jump, 0.0, differences)
 
 
-def _how_copied(
+def _describe_copy(
     original: FloatArray,
     copy: FloatArray,
     original_used: BoolArray,
@@ -128,17 +128,17 @@ def _how_copied(
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)
-    first = max(-shift, 0)
+    first_sample = max(-shift, 0)
     first_of_copy = max(shift, 0)
-    in_original = slice(first, first + count)
+    in_original = slice(first_sample, first_sample + count)
     in_copy = slice(first_of_copy, first_of_copy + count)
     used = original_used[in_original] & copy_used[in_copy]
     x = original[in_original][used]
     y = copy[in_copy][used]
     if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
         return ""
-    # the robust estimate is zero if most readings repeat; 924 is explained in `roughness`
-    noise = roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
+    # the robust estimate is zero if most readings repeat; 924 is explained in `estimate_roughness`
+    noise = estimate_roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
     if noise == 0.0:
         return ""
     delay = ""
@@ -150,4 +150,4 @@ def _how_copied(
     centred = x - x.mean()
     scale = float(centred @ (y - y.mean()) / (centred @ centred))
     unexplained = float(np.std(y - scale * x))
-    return f"times {scale:.6g}{delay}" if unexplained < COPIED * noise else ""
+    return f"times {scale:.6g}{delay}" if unexplained < COPIED_SHARE * noise else ""

@@ -73,7 +73,7 @@ class DataFault:
         return self.kind not in HARMLESS and not self.accepted
 
 
-def with_acceptance(faults: Iterable[DataFault], campaign: Campaign) -> tuple[DataFault, ...]:
+def mark_accepted(faults: Iterable[DataFault], campaign: Campaign) -> tuple[DataFault, ...]:
     """Return faults of the data, marked as accepted where the campaign's key `accept` says so.
 
     The sentence of an accepted fault says that it is accepted. That of any other fault that can be
@@ -82,29 +82,29 @@ def with_acceptance(faults: Iterable[DataFault], campaign: Campaign) -> tuple[Da
     marked = []
     for fault in faults:
         word = fault.kind.value
-        if word in campaign.accepted(fault.channel, fault.trial):
+        if word in campaign.accepted_faults(fault.channel, fault.trial):
             sentence = f"Accepted by the campaign ({word}): {fault.sentence}"
             marked.append(replace(fault, sentence=sentence, accepted=True))
         elif word in ACCEPTABLE and fault.fatal:
-            sentence = f"{fault.sentence.removesuffix('.')}; {_how_to_accept(fault)}."
+            sentence = f"{fault.sentence.removesuffix('.')}; {_acceptance_clause(fault)}."
             marked.append(replace(fault, sentence=sentence))
         else:
             marked.append(fault)
     return tuple(marked)
 
 
-def _how_to_accept(fault: DataFault) -> str:
+def _acceptance_clause(fault: DataFault) -> str:
     """Return the clause that names the key by which a campaign accepts a fault."""
     tables = []
     if fault.trial:
         tables.append(f"the [[trial]] {fault.trial!r}")
     if fault.channel:
         tables.append(f"the [[channel]] {fault.channel!r}")
-    where = f"in {' or '.join(tables)}" if tables else "at the top of campaign.toml"
-    return f'if the data are right, say accept = ["{fault.kind.value}"] {where}'
+    section = f"in {' or '.join(tables)}" if tables else "at the top of campaign.toml"
+    return f'if the data are right, say accept = ["{fault.kind.value}"] {section}'
 
 
-def place_of(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:
+def samples_text(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:
     """Return column, file, trial and time span of the samples `start` to `stop` of a channel."""
     time = trial.time[start:stop]
     file = f" of {trial.file}" if trial.file else ""

@@ -1,6 +1,6 @@
 """Channels that stand still within a motion: runs of equal readings that no sensor makes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,29 +14,29 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.sampling import lattice_step, least_beyond_rounding, quantum_of
-from discrepancy.checks.fault import DataFault, FaultKind, place_of
+from discrepancy.checks.fault import DataFault, FaultKind, samples_text
 
-LEAST_HELD = 8
+LEAST_RUN_LENGTH = 8
 """Fewest equal readings in a row that are examined."""
-_SURROUNDINGS = 4
+_SURROUNDINGS_LENGTH = 4
 """Length of the surroundings on either side of a run, as a multiple of the run's length."""
-_COMPARABLE = 0.25
+_COMPARABLE_LENGTH = 0.25
 """Least length of a comparable run, as a fraction of the length of the run that is judged.
 
 Comparable runs come from pauses, square waves and coarse digits."""
-_MOST_COMPARABLE = 1.0 / 3.0
+_LARGEST_COMPARABLE_SHARE = 1.0 / 3.0
 """Largest fraction of the surroundings that comparable runs may take."""
-_JUMP = 3.0
+_LEAST_JUMP = 3.0
 """Least jump of a reading from one sample to the next, in quanta; turning points change less."""
-_PACE = 0.25
+_LEAST_RELATIVE_JUMP = 0.25
 """Least jump into or out of a run, as a fraction of the mean change between samples around it.
 
 A structure that slows down gradually changes less."""
-_MOVING = 0.5
+_RANGE_OF_MOVING_RECORD = 0.5
 """Least range of another record during a run, over its usual range, if that record moves."""
-_RESTING = 0.25
+_RANGE_OF_RESTING_RECORD = 0.25
 """Largest value of the same ratio if the other record rests."""
-_NOISE_DIGITS = 2.0
+_NOISE_IN_QUANTA = 2.0
 """Standard deviation of noise, in quanta, above which equal readings in a row are unlikely."""
 _LEAST_UPDATES = 4.0
 """Fewest updates of a sensor that a faulty run must span.
@@ -44,7 +44,7 @@ _LEAST_UPDATES = 4.0
 A logger that is faster than its sensor records each update several times."""
 
 
-def roughness(values: FloatArray) -> float:
+def estimate_roughness(values: FloatArray) -> float:
     """Estimate the standard deviation of the white noise in a record by its sixth differences.
 
     Sixth differences remove motions with more than about eight samples in a period. The estimate is
@@ -61,7 +61,7 @@ def roughness(values: FloatArray) -> float:
     return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))
 
 
-def runs_of(flags: BoolArray) -> IntArray:
+def runs_of_true(flags: BoolArray) -> IntArray:
     """Return the runs of consecutive true entries in an array of flags.
 
     Returns
@@ -74,11 +74,11 @@ def runs_of(flags: BoolArray) -> IntArray:
     return np.stack((edges[::2], edges[1::2]), axis=1)
 
 
-def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
+def stuck_sensor_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
     """Yield a fault for each span of a dynamic trial in which a sensor or its logger was stuck.
 
-    `held_spans` distinguishes such a span of equal readings from a true standstill of the structure
-    and from a coarse digital converter.
+    `stuck_spans` distinguishes such a span of equal readings from a true standstill of the
+    structure and from a coarse digital converter.
     """
     series = [trial.values]
     series += [recorded.values[:, np.newaxis] for recorded in trial.inputs]
@@ -87,7 +87,7 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
     recorded_values = np.concatenate(series, axis=1)
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
-        spans = held_spans(
+        spans = stuck_spans(
             trial.values[:, column],
             trial.used[:, column],
             np.delete(recorded_values, column, axis=1),
@@ -96,8 +96,8 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
         for start, stop in spans:
             sentence = (
                 f"The channel {name!r} holds one value over {stop - start} samples within a "
-                f"motion, in {place_of(channel, trial, start, stop)}: empty these cells, or leave "
-                "the channel out of the trial, and check sensor and logger."
+                f"motion, in {samples_text(channel, trial, start, stop)}: empty these cells, or "
+                "leave the channel out of the trial, and check sensor and logger."
             )
             yield DataFault(FaultKind.FROZEN, sentence, name, trial.name)
 
@@ -111,7 +111,7 @@ class _RunsOfRecord(NamedTuple):
         The record.
     changes : (N + 1,) ndarray
         Absolute change into each sample; the last entry is zero.
-    digit : float
+    quantum : float
         Quantum of the record.
     bounds : (R, 2) ndarray of int
         First sample of each run, and the one after its last.
@@ -121,13 +121,13 @@ class _RunsOfRecord(NamedTuple):
 
     values: FloatArray
     changes: FloatArray
-    digit: float
+    quantum: float
     bounds: IntArray
     lengths: IntArray
 
 
-def held_spans(
-    values: FloatArray, used: BoolArray, others: FloatArray, noise: float = 0.0
+def stuck_spans(
+    values: FloatArray, used: BoolArray, other_records: FloatArray, noise: float = 0.0
 ) -> list[tuple[int, int]]:
     """Return the runs of equal readings that show a failure of a sensor or logger.
 
@@ -149,7 +149,7 @@ def held_spans(
         A record in time.
     used : (N,) ndarray of bool
         False for samples that are left out.
-    others : (N, K) ndarray
+    other_records : (N, K) ndarray
         The records of the K other channels and inputs of the trial.
     noise : float
         Standard deviation of the channel's noise; 0 if it is not known.
@@ -160,28 +160,34 @@ def held_spans(
         First sample of each run, and the one after its last.
     """
     is_equal_to_next = (np.diff(values) == 0.0) & used[1:] & used[:-1]
-    bounds_of_runs = runs_of(is_equal_to_next) + np.array([0, 1])
+    bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
-    long_runs = bounds_of_runs[lengths >= LEAST_HELD].tolist()
+    long_runs = bounds_of_runs[lengths >= LEAST_RUN_LENGTH].tolist()
     distinct = np.unique(values)
     if len(distinct) < 3 or not long_runs:
         return []
     # runs at an extreme value are clipped, which is another fault
     extremes = (distinct[0], distinct[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
-    quantum = _digit_in_time(values)
-    if min(noise, roughness(values)) > _NOISE_DIGITS * quantum:
+    quantum = _quantum_in_time(values)
+    if min(noise, estimate_roughness(values)) > _NOISE_IN_QUANTA * quantum:
         least_length = _LEAST_UPDATES * update_length(values)
         return [(start, stop) for start, stop in inner_runs if stop - start >= least_length]
     changes = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
     runs = _RunsOfRecord(values, changes, quantum, bounds_of_runs, lengths)
-    return [(start, stop) for start, stop in inner_runs if _is_failure(start, stop, runs, others)]
+    return [
+        (start, stop)
+        for start, stop in inner_runs
+        if _is_sensor_failure(start, stop, runs, other_records)
+    ]
 
 
-def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) -> bool:
+def _is_sensor_failure(
+    start: int, stop: int, runs: _RunsOfRecord, other_records: FloatArray
+) -> bool:
     """Return whether a run in a record without much noise is a failure and not a rest.
 
-    `held_spans` states the rules.
+    `stuck_spans` states the rules.
 
     Parameters
     ----------
@@ -189,18 +195,19 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
         First sample of the run, and the one after its last.
     runs : _RunsOfRecord
         The record and all its runs.
-    others : (N, K) ndarray
+    other_records : (N, K) ndarray
         The other records.
     """
     length = stop - start
-    least_jump = _JUMP * runs.digit
+    least_jump = _LEAST_JUMP * runs.quantum
     if max(runs.changes[start], runs.changes[stop]) < least_jump:
+        # the readings slow down before and after the run, as in a true standstill
         return False
 
     # no failure if runs of comparable length show a dead zone, or fill much of the surroundings
-    begin_of_surroundings = max(start - _SURROUNDINGS * length, 0)
-    end_of_surroundings = min(stop + _SURROUNDINGS * length, len(runs.values))
-    is_comparable = runs.lengths >= _COMPARABLE * length
+    begin_of_surroundings = max(start - _SURROUNDINGS_LENGTH * length, 0)
+    end_of_surroundings = min(stop + _SURROUNDINGS_LENGTH * length, len(runs.values))
+    is_comparable = runs.lengths >= _COMPARABLE_LENGTH * length
     is_in_surroundings = (
         is_comparable
         & (runs.bounds[:, 0] >= begin_of_surroundings)
@@ -216,7 +223,8 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
     if (
         len(window_starts) < 2
         or is_dead_zone
-        or comparable_samples > _MOST_COMPARABLE * (end_of_surroundings - begin_of_surroundings)
+        or comparable_samples
+        > _LARGEST_COMPARABLE_SHARE * (end_of_surroundings - begin_of_surroundings)
     ):
         return False
 
@@ -224,23 +232,48 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
     changes_around = np.r_[
         runs.changes[begin_of_surroundings : start + 1], runs.changes[stop:end_of_surroundings]
     ]
-    speed = max(least_jump, _PACE * float(np.mean(changes_around)))
+    speed = max(least_jump, _LEAST_RELATIVE_JUMP * float(np.mean(changes_around)))
     sides_at_speed = np.count_nonzero(runs.changes[[start, stop]] >= speed)
 
-    # do other records move meanwhile, compared with windows of the same length around?
-    ranges = [np.ptp(others[first : first + length], axis=0) for first in window_starts]
-    usual_range = np.median(ranges, axis=0)
-    range_meanwhile = np.ptp(others[start:stop], axis=0)
-    moves = (range_meanwhile > _MOVING * usual_range) & (usual_range > 0.0)
-    another_moves = bool(np.any(moves))
-    another_rests = not another_moves and bool(np.any(range_meanwhile < _RESTING * usual_range))
+    movement = _other_movement(start, stop, window_starts, other_records)
     if sides_at_speed == 2:
-        return not another_rests
+        return not movement.another_rests
     is_only_one = np.count_nonzero(is_comparable) == 1
-    return sides_at_speed == 1 and another_moves and is_only_one
+    return sides_at_speed == 1 and movement.another_moves and is_only_one
 
 
-def _digit_in_time(values: FloatArray) -> float:
+class _OtherMovement(NamedTuple):
+    """Whether another record moves during a run, or whether one rests and none moves."""
+
+    another_moves: bool
+    another_rests: bool
+
+
+def _other_movement(
+    start: int, stop: int, window_starts: Sequence[int], other_records: FloatArray
+) -> _OtherMovement:
+    """Return whether other records move during a run, compared with windows around the run.
+
+    Parameters
+    ----------
+    start, stop : int
+        First sample of the run, and the one after its last.
+    window_starts : sequence of int
+        First samples of the windows, which are as long as the run.
+    other_records : (N, K) ndarray
+        The other records.
+    """
+    length = stop - start
+    ranges = [np.ptp(other_records[first : first + length], axis=0) for first in window_starts]
+    usual_range = np.median(ranges, axis=0)
+    range_in_run = np.ptp(other_records[start:stop], axis=0)
+    moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
+    another_moves = bool(np.any(moves))
+    rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
+    return _OtherMovement(another_moves, not another_moves and bool(np.any(rests)))
+
+
+def _quantum_in_time(values: FloatArray) -> float:
     """Return the quantum of the readings (N,) of a record in time.
 
     Readings that rise steadily may differ by several quanta at every step. Their second differences

@@ -107,7 +107,7 @@ def even_weights(width: int, degree: int) -> FloatArray:
     return np.asarray(weights / weights[width])
 
 
-def weights_at(time: FloatArray) -> Weights:
+def weights_for_times(time: FloatArray) -> Weights:
     """Return the function of weights for records at times (N,); it caches what it has computed."""
     return even_weights if is_even(time) else cache(partial(uneven_weights, time))
 

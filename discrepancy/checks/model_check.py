@@ -10,10 +10,15 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Hold, Trial, TrialKind
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.fault import DataFault, FaultKind, with_acceptance
+from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
 from discrepancy.checks.quality import dead_fault, is_still
-from discrepancy.checks.rest import rest_faults
-from discrepancy.checks.scales import ABOVE_NOISE, data_scales, swap_fault, swapped_channels
+from discrepancy.checks.rest import noise_record_faults
+from discrepancy.checks.scales import (
+    CLEAR_NOISE_DEVIATIONS,
+    data_scales,
+    swap_fault,
+    swapped_channels,
+)
 from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
@@ -25,11 +30,11 @@ from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-MOST_OF_PRIOR = 0.9
+LARGEST_DEVIATION_RATIO = 0.9
 """Fraction of its prior standard deviation above which a parameter is not observable."""
 
 
-def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
+def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, float]:
     """Return how much the records determine each calibrated parameter.
 
     The measure is the posterior standard deviation over the prior one, from the information matrix
@@ -62,13 +67,15 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
     }
 
 
-def unobservable(campaign: Campaign, model: Model) -> Iterator[DataFault]:
+def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     """Yield one fault that names the calibrated parameters that the records do not determine.
 
-    Those keep more than `MOST_OF_PRIOR` of their prior standard deviation.
+    Those keep more than `LARGEST_DEVIATION_RATIO` of their prior standard deviation.
     """
-    ratios = posterior_over_prior(campaign, model)
-    undetermined = {name: ratio for name, ratio in ratios.items() if ratio > MOST_OF_PRIOR}
+    ratios = posterior_to_prior_ratios(campaign, model)
+    undetermined = {
+        name: ratio for name, ratio in ratios.items() if ratio > LARGEST_DEVIATION_RATIO
+    }
     if undetermined:
         names = ", ".join(f"{name!r} ({ratio:.0%})" for name, ratio in undetermined.items())
         noun = "parameters" if len(undetermined) > 1 else "parameter"
@@ -84,7 +91,7 @@ LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
 LEAST_SAMPLES = 4.0
 """Fewest samples in a period of the first mode."""
-MATTERS = 0.3
+LEAST_REPORTED_CHANGE = 0.3
 """Least effect of an input's course between samples that is reported (rms, over the noise)."""
 
 
@@ -118,10 +125,10 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     if model.oscillates:
         frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
         faults += _length_faults(campaign, frequency)
-        faults += rest_faults(campaign, frequency)
+        faults += noise_record_faults(campaign, frequency)
     predictions: dict[str, FloatArray] = {}
     for trial in campaign.trials:
-        conditions = prior_mean(campaign, model, trial)
+        conditions = prior_conditions(campaign, model, trial)
         predictions[trial.name] = observe(model, campaign, trial, ModelPatch(), conditions).values
     faults += _dead_faults(campaign, predictions)
     scales = data_scales(campaign, predictions)
@@ -134,17 +141,17 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     for trial in campaign.trials:
         faults += _hold_faults(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
-        faults += unobservable(campaign, model)
-    faults += [swap_fault(first, second) for first, second in swaps]
-    return with_acceptance(faults, campaign)
+        faults += unobservable_parameter_faults(campaign, model)
+    faults += [swap_fault(first_channel, second_channel) for first_channel, second_channel in swaps]
+    return mark_accepted(faults, campaign)
 
 
-def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
+def prior_conditions(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
     """Return the conditions under which a trial is simulated before any fit.
 
     The parameters have their prior means, the release its nominal displacement, the clock no error.
     """
-    parameters = np.array([mean for mean, _ in model.stated(campaign)])
+    parameters = np.array([mean for mean, _ in model.prior_moments(campaign)])
     initial_modes = np.zeros((0, 2))
     if trial.release is not None:
         initial_modes = np.zeros((trial.release.mode_count, 2))
@@ -158,9 +165,9 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
 
     The key `hold` of a campaign states whether an input is smooth, linear or constant between its
     samples. For inputs without this key, the model's response to straight lines is compared with
-    its response to smooth curves. The fault is reported if the two differ by more than `MATTERS`
-    times the noise (rms) in any channel with a noise record. It limits the conclusions, but does
-    not make the data wrong.
+    its response to smooth curves. The fault is reported if the two differ by more than
+    `LEAST_REPORTED_CHANGE` times the noise (rms) in any channel with a noise record. It limits the
+    conclusions, but does not make the data wrong.
 
     Parameters
     ----------
@@ -186,14 +193,14 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     smooth_trial = replace(
         trial, inputs=smooth_inputs, hold=Hold.SMOOTH if force_is_open else trial.hold
     )
-    conditions = prior_mean(campaign, model, trial)
+    conditions = prior_conditions(campaign, model, trial)
     response_to_lines = observe(model, campaign, trial, ModelPatch(), conditions).values
     response_to_curves = observe(model, campaign, smooth_trial, ModelPatch(), conditions).values
     # infinite without a noise record, so that the difference counts as zero
     noise = [trial.noise_deviation(campaign.channels[name]) or np.inf for name in trial.channels]
     differences = np.sqrt(np.mean((response_to_lines - response_to_curves) ** 2, axis=0)) / noise
     largest = differences.max()
-    if largest > MATTERS:
+    if largest > LEAST_REPORTED_CHANGE:
         names = ", ".join(map(repr, open_inputs))
         channel = trial.channels[int(differences.argmax())]
         table = "[[trial]]" if force_is_open else "[[input]]"
@@ -219,7 +226,7 @@ def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
                 f"{model.name} does not have: correct `output`, or leave the channel out."
             )
             yield DataFault(FaultKind.MISSING_OUTPUT, sentence, name)
-        elif not channel.quantity.shows(quantity):
+        elif not channel.quantity.can_measure(quantity):
             sentence = (
                 f"The channel {name!r} measures {channel.quantity.value}, but the output "
                 f"{channel.output!r} of {model.name} is {quantity.value}: correct `quantity` or "
@@ -231,7 +238,8 @@ def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     """Yield a fault for each record that is too short, or sampled too slowly, for the first mode.
 
-    A driven trial is long enough if the parameters are observable in it; see `unobservable`.
+    A driven trial is long enough if the parameters are observable in it; see
+    `unobservable_parameter_faults`.
 
     Parameters
     ----------
@@ -285,9 +293,9 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
 def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> Iterator[DataFault]:
     """Yield a fault for each channel with constant readings in a static trial that should change.
 
-    By the prediction they would change by more than `ABOVE_NOISE` times the noise or the sensor's
-    quantum. `check_data` reports, without a model, the channels that are constant in a dynamic
-    trial or in all their trials.
+    By the prediction they would change by more than `CLEAR_NOISE_DEVIATIONS` times the noise or the
+    sensor's quantum. `check_data` reports, without a model, the channels that are constant in a
+    dynamic trial or in all their trials.
 
     Parameters
     ----------
@@ -304,7 +312,7 @@ def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> I
             quantum = quantum_of(readings)
             noise = trial.noise_deviation(campaign.channels[name])
             predicted_range = np.ptp(predictions[trial.name][:, column])
-            if quantum and predicted_range > ABOVE_NOISE * max(noise, quantum):
+            if quantum and predicted_range > CLEAR_NOISE_DEVIATIONS * max(noise, quantum):
                 yield dead_fault(trial, name)
 
 

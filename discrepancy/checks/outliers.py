@@ -15,17 +15,17 @@ from discrepancy.checks.local_polynomial import (
     Weights,
     even_weights,
     event_patterns,
-    weights_at,
+    weights_for_times,
 )
 from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, row_outlier
 
 LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
-SIGNIFICANT = 5.0
+OUTLIER_DEVIATIONS = 5.0
 """Least residual of an outlier, in robust standard deviations and in those of the noise."""
-WRONG_END = 8.0
+WRONG_END_DEVIATIONS = 8.0
 """Least deviation of a wrong reading at the ends of a record, in standard deviations."""
-_SHAPES = (
+_WIDTHS_AND_DEGREES = (
     (3, 5),
     (4, 5),
     (6, 5),
@@ -39,15 +39,15 @@ _SHAPES = (
     (18, 13),
 )
 """Half width (samples) and degree of the local polynomials that are tried."""
-_EDGE = 3
+_EDGE_SAMPLES = 3
 """Samples at either end that are not judged, and the least half width."""
-_ENDS = (slice(0, _EDGE), slice(-_EDGE, None))
+_ENDS = (slice(0, _EDGE_SAMPLES), slice(-_EDGE_SAMPLES, None))
 """The first and the last samples of a record."""
 _NEIGHBOURS = [0, 1, 3, 4]
 """Indices of the neighbours of the middle sample among five samples in a row."""
-_NEAR = 25
+_HALF_WINDOW = 25
 """Half width of the window, in samples, whose scatter a residual is compared with."""
-_PASSES = 8
+_MOST_PASSES = 8
 """Most passes in which outliers are found and replaced."""
 
 
@@ -74,7 +74,7 @@ def mark_outliers(campaign: Campaign) -> Campaign:
         count = int(is_outlier.sum())
         total = len(is_outlier)
         too_many = trial.is_dynamic and count > LARGEST_SHARE * total
-        if too_many or "outliers" in campaign.accepted(channel, trial.name):
+        if too_many or "outliers" in campaign.accepted_faults(channel, trial.name):
             continue
         used[trial.name][is_outlier, trial.channels.index(channel)] = False
         outliers = "is an outlier" if count == 1 else "are outliers"
@@ -99,7 +99,9 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
         Which of its readings are outliers.
     """
     # all channels of a trial have its times
-    weights = {trial.name: weights_at(trial.time) for trial in campaign.trials if trial.is_dynamic}
+    weights = {
+        trial.name: weights_for_times(trial.time) for trial in campaign.trials if trial.is_dynamic
+    }
     for name, channel in campaign.channels.items():
         outliers_of_repeats = repeat_outliers(campaign, channel)
         for trial, values, used in campaign.records(name):
@@ -140,7 +142,7 @@ def sample_outliers(
     largest_reading = float(np.max(np.abs(values), initial=0.0))
     if used is None:
         used = np.ones(count, dtype=bool)
-    if count < 4 * _EDGE + 4 or used.sum() < 0.5 * count or largest_reading == 0.0:
+    if count < 4 * _EDGE_SAMPLES + 4 or used.sum() < 0.5 * count or largest_reading == 0.0:
         return np.zeros(count, dtype=bool)
     # scaled, so that squares of readings of any size stay in range
     indices = np.arange(count)
@@ -156,14 +158,14 @@ def sample_outliers(
     rounding = quantum_of(values[used] / largest_reading) * 12.0**-0.5 * weight_norm
 
     # readings within the noise are no outliers
-    noise_limit = SIGNIFICANT * noise / largest_reading
-    suspects, cleaned = _suspects(record, polynomial, rounding, noise_limit)
+    noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
+    suspects, cleaned = _find_suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours
     residual = polynomial.residual(cleaned)
     weight_of_sample = polynomial.weight_of_sample(count)
     deviation = np.abs((record - cleaned) * weight_of_sample + residual)
     is_beyond_noise = deviation > noise_limit
-    is_beyond_scatter = deviation > SIGNIFICANT * _scale(residual, rounding)
+    is_beyond_scatter = deviation > OUTLIER_DEVIATIONS * _comparison_deviation(residual, rounding)
     outliers = used & suspects & is_beyond_noise & is_beyond_scatter
     # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
@@ -175,14 +177,14 @@ def sample_outliers(
 def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
     """Return the local polynomial that predicts the samples of a record (N,) best."""
     polynomials = []
-    for width, degree in _SHAPES:
+    for width, degree in _WIDTHS_AND_DEGREES:
         has_weights = weights is even_weights or degree == LOW_DEGREE
         if has_weights and 4 * width + 4 <= len(record):
             polynomials.append(LocalPolynomial(weights, width, degree))
-    return min(polynomials, key=lambda polynomial: _scatter(polynomial.residual(record)))
+    return min(polynomials, key=lambda polynomial: _robust_scatter(polynomial.residual(record)))
 
 
-def _suspects(
+def _find_suspects(
     record: FloatArray, polynomial: LocalPolynomial, rounding: float, noise_limit: float
 ) -> tuple[BoolArray, FloatArray]:
     """Find the samples that may be outliers, and replace them by their predictions.
@@ -212,22 +214,22 @@ def _suspects(
     suspects = np.zeros(count, dtype=bool)
     events = np.zeros(count, dtype=bool)
     cleaned = record.copy()
-    edge = _EDGE if polynomial.degree == LOW_DEGREE else polynomial.width
-    for _ in range(_PASSES):
+    edge = _EDGE_SAMPLES if polynomial.degree == LOW_DEGREE else polynomial.width
+    for _ in range(_MOST_PASSES):
         residual = polynomial.residual(cleaned)
-        ratio = np.abs(residual) / _scale(residual, rounding)
+        ratio = np.abs(residual) / _comparison_deviation(residual, rounding)
         ratio[:edge] = 0.0
         ratio[-edge:] = 0.0
         neighbourhood = 2 * polynomial.width + 1
         is_worst = ratio == maximum_filter1d(ratio, neighbourhood, mode="constant")
         is_beyond_noise = np.abs(residual) > noise_limit
-        is_significant = (ratio > SIGNIFICANT) & is_beyond_noise & is_worst
-        new = np.flatnonzero(is_significant & ~suspects & ~events)
-        if not new.size:
+        is_significant = (ratio > OUTLIER_DEVIATIONS) & is_beyond_noise & is_worst
+        new_indices = np.flatnonzero(is_significant & ~suspects & ~events)
+        if not new_indices.size:
             break
-        at_event = np.array([_is_event(residual, int(index), polynomial) for index in new])
-        events[new[at_event]] = True
-        new_suspects = new[~at_event]
+        at_event = np.array([_is_event(residual, int(index), polynomial) for index in new_indices])
+        events[new_indices[at_event]] = True
+        new_suspects = new_indices[~at_event]
         suspects[new_suspects] = True
         # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
@@ -235,7 +237,9 @@ def _suspects(
     return suspects, cleaned
 
 
-def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0) -> BoolArray:
+def wrong_end_readings(
+    residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0
+) -> BoolArray:
     """Return which of the first and last three samples of records are single wrong readings.
 
     `sample_outliers` does not judge these samples, because they lack neighbours on one side. The
@@ -262,7 +266,7 @@ def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float 
     noise = np.broadcast_to(noise, residual.shape[1:])
     for column in range(residual.shape[1]):
         rows = np.flatnonzero(used[:, column])
-        if len(rows) >= 8 * _EDGE:
+        if len(rows) >= 8 * _EDGE_SAMPLES:
             is_wrong = _wrong_ends_of_channel(residual[rows, column], float(noise[column]))
             wrong[rows, column] = is_wrong
     for end in _ENDS:
@@ -276,7 +280,8 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     """Return which samples (N,) at the ends of one record are single wrong readings.
 
     A sample is wrong if its residual is more than twice as large as that of its two neighbours on
-    either side, and differs from their median by more than `WRONG_END` standard deviations.
+    either side, and differs from their median by more than `WRONG_END_DEVIATIONS` standard
+    deviations.
 
     Parameters
     ----------
@@ -290,12 +295,12 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     deviation = residual - np.nanmedian(neighbours, axis=1)
     exceeds_neighbours = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
     # the scatter near each end, where the motion may be fastest
-    deviations_near_ends = (deviation[: 4 * _NEAR], deviation[-4 * _NEAR :])
+    deviations_near_ends = (deviation[: 4 * _HALF_WINDOW], deviation[-4 * _HALF_WINDOW :])
     wrong = np.zeros(len(residual), dtype=bool)
     for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
         scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
         scale = max(scatter, noise, 1e-300)
-        is_wrong = exceeds_neighbours[end] & (np.abs(deviation[end]) > WRONG_END * scale)
+        is_wrong = exceeds_neighbours[end] & (np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale)
         if is_wrong.sum() == 1:
             wrong[end] = is_wrong
     return wrong
@@ -329,21 +334,23 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
     return int(np.argmax(explained)) > 0
 
 
-def _scatter(residual: FloatArray) -> float:
+def _robust_scatter(residual: FloatArray) -> float:
     """Return the robust standard deviation of residuals (N,), without the unjudged edges."""
-    return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE:-_EDGE])))
+    return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])))
 
 
-def _scale(residual: FloatArray, least: float) -> FloatArray:
+def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
     """Return the robust standard deviation (N,) with which each residual (N,) is compared.
 
     It is that of the whole record or that of the samples around it, whichever is larger, and at
     least `least`.
     """
-    scatter_of_record = max(_scatter(residual), least, 1e-300)
-    inner_magnitudes = np.abs(residual[_EDGE:-_EDGE])
-    if len(inner_magnitudes) <= 2 * _NEAR:
+    scatter_of_record = max(_robust_scatter(residual), least, 1e-300)
+    inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])
+    if len(inner_magnitudes) <= 2 * _HALF_WINDOW:
         return np.full(len(residual), scatter_of_record)
-    windows = sliding_window_view(np.pad(inner_magnitudes, _NEAR, mode="reflect"), 2 * _NEAR + 1)
-    median_of_surroundings = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
+    windows = sliding_window_view(
+        np.pad(inner_magnitudes, _HALF_WINDOW, mode="reflect"), 2 * _HALF_WINDOW + 1
+    )
+    median_of_surroundings = np.pad(np.median(windows, axis=1), _EDGE_SAMPLES, mode="edge")
     return np.maximum(scatter_of_record, NORMAL_OVER_MAD * median_of_surroundings)

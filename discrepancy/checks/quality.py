@@ -15,12 +15,17 @@ from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.copies import copy_faults
-from discrepancy.checks.fault import DataFault, FaultKind, with_acceptance
-from discrepancy.checks.held import held_faults, roughness, runs_of, update_length
+from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
+from discrepancy.checks.held import (
+    estimate_roughness,
+    runs_of_true,
+    stuck_sensor_faults,
+    update_length,
+)
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
-from discrepancy.checks.rest import rest_faults
+from discrepancy.checks.rest import noise_record_faults
 
-CLIPPED_RUN = 3
+LEAST_CLIPPED_RUN = 3
 """Fewest samples in a row at an extreme value that make a record clipped."""
 _LEVEL = 1e-3
 """Level of the F test between a noise record and repeats."""
@@ -45,11 +50,11 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
         for column, name in enumerate(trial.channels):
             faults += _clipped_faults(trial, name, trial.values[:, column], trial.used[:, column])
         if trial.is_dynamic:
-            faults += held_faults(campaign, trial)
+            faults += stuck_sensor_faults(campaign, trial)
     faults += copy_faults(campaign)
-    faults += rest_faults(campaign)
+    faults += noise_record_faults(campaign)
     faults += _outlier_faults(campaign)
-    return with_acceptance(faults, campaign)
+    return mark_accepted(faults, campaign)
 
 
 def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
@@ -88,7 +93,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     least_roughness = _least_roughness(campaign, channel.name)
     recorded_roughness = stated
     if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
-        recorded_roughness = roughness(record.samples)
+        recorded_roughness = estimate_roughness(record.samples)
     if 0.0 < least_roughness < recorded_roughness / _NOISE_FACTOR:
         contradiction = f"neighbouring samples scatter by {least_roughness:.3g}"
 
@@ -119,7 +124,7 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
     least = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
-            least = min(least, roughness(values) / trial.noise_factor)
+            least = min(least, estimate_roughness(values) / trial.noise_factor)
     return least
 
 
@@ -149,7 +154,7 @@ def is_still(trial: Trial, name: str) -> bool:
     """Return whether a channel shows one value throughout a trial that excites the structure."""
     column = trial.channels.index(name)
     used = trial.used[:, column]
-    if used.sum() < CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
+    if used.sum() < LEAST_CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
         return False
     return trial.is_dynamic or bool(np.ptp(trial.load[used]) > 0.0)
 
@@ -159,7 +164,7 @@ def _clipped_faults(
 ) -> Iterator[DataFault]:
     """Yield a fault for each side at which a channel's readings (N,) in a trial are clipped."""
     readings = values[used]
-    if len(readings) < CLIPPED_RUN:
+    if len(readings) < LEAST_CLIPPED_RUN:
         return
     load = None
     if not trial.is_dynamic:
@@ -197,9 +202,9 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
         Loads of readings at rest; without them the readings are samples in time.
     """
     digit = quantum_of(values)
-    least_length = CLIPPED_RUN * (update_length(values) if load is None else 1.0)
+    least_length = LEAST_CLIPPED_RUN * (update_length(values) if load is None else 1.0)
     longest = 0
-    for start, stop in runs_of(values == extreme).tolist():
+    for start, stop in runs_of_true(values == extreme).tolist():
         if stop - start < max(least_length, longest + 1):
             continue
         if load is None:
@@ -227,13 +232,13 @@ def _is_clipped_over_load(
     digit : float
         Quantum of the readings.
     """
-    others = np.delete(np.arange(len(values)), np.s_[start:stop])
+    other_rows = np.delete(np.arange(len(values)), np.s_[start:stop])
     loads_of_run = np.unique(load[start:stop])
-    if loads_of_run.size < CLIPPED_RUN or np.unique(load[others]).size < 2:
+    if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[other_rows]).size < 2:
         return False
-    line = np.polynomial.Polynomial.fit(load[others], values[others], 1)
+    line = np.polynomial.Polynomial.fit(load[other_rows], values[other_rows], 1)
     beyond = float(np.max(np.abs(line(load[start:stop]) - values[start])))
-    scatter = float(np.std(values[others] - line(load[others])))
+    scatter = float(np.std(values[other_rows] - line(load[other_rows])))
     return beyond > 1.5 * digit + 6.0 * scatter
 
 
@@ -258,5 +263,5 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     places = neighbours - 0.5 * (start + stop - 1)
     _, _, weights_at_middle = np.linalg.pinv(np.vander(places, 3))
     beyond = abs(weights_at_middle @ values[neighbours] - values[start])
-    error = 3.0 * digit + 6.0 * roughness(values)
+    error = 3.0 * digit + 6.0 * estimate_roughness(values)
     return bool(beyond > 0.5 * np.abs(weights_at_middle).sum() * error)

@@ -5,28 +5,28 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from discrepancy.campaign.noise import MAINS, line_near, without_lines
-from discrepancy.campaign.noise_tests import autocorrelation, times_fewer
+from discrepancy.campaign.noise import MAINS, remove_lines, strongest_line_near
+from discrepancy.campaign.noise_tests import autocorrelation, statistical_inefficiency
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord
 from discrepancy.checks.fault import DataFault, FaultKind
 
-SHORTEST = 128
+SHORTEST_RECORD = 128
 """Fewest samples of a noise record that is judged."""
-LARGEST_RATIO = 2.0
+LARGEST_SCATTER_RATIO = 2.0
 """Largest scatter of the loudest quarter of a noise record over that of the quietest."""
-LARGEST_DRIFT = 0.6
+LARGEST_DRIFT_SHARE = 0.6
 """Largest fraction of the variance of a noise record that a cubic in time may take."""
-LARGEST_LINE = 0.05
+LARGEST_LINE_SHARE = 0.05
 """Largest fraction of the variance that a line at the model's frequency may take."""
 LEAST_PERIODS = 8.0
 """Fewest periods in a noise record in which a line is searched."""
-NEAR = 0.1
+RELATIVE_HALF_BAND = 0.1
 """Half width of the band around the model's frequency in which a line is searched, relative."""
 _LEVEL = 1e-5
 """Level of the F test between quarters of a noise record."""
 
 
-def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
+def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
     """Yield a fault for each channel whose noise record contains more than stationary noise.
 
     Such a record overestimates the noise, which limits what can be concluded.
@@ -36,12 +36,12 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
     campaign : Campaign
         The campaign.
     frequency : float, optional
-        Frequency of a mode [Hz] at which a vibration is searched; see `moves`.
+        Frequency of a mode [Hz] at which a vibration is searched; see `disturbance_phrase`.
     """
     for name, channel in campaign.channels.items():
         if channel.noise is None:
             continue
-        motion = moves(channel.noise, frequency)
+        motion = disturbance_phrase(channel.noise, frequency)
         if motion is not None:
             file = f" of {channel.noise.file}" if channel.noise.file else ""
             sentence = (
@@ -52,13 +52,13 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
             yield DataFault(FaultKind.MOVES_AT_REST, sentence, name)
 
 
-def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
+def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> str | None:
     """Return what a noise record contains besides stationary noise.
 
     Without a frequency two contents are searched. One is a drift: a cubic in time that has more
-    than `LARGEST_DRIFT` of the variance. The other is an unsteady scatter: two quarters of the
-    record whose standard deviations differ by at least a factor of two, and significantly by an F
-    test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
+    than `LARGEST_DRIFT_SHARE` of the variance. The other is an unsteady scatter: two quarters of
+    the record whose standard deviations differ by at least a factor of two, and significantly by an
+    F test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
     frequency that has more than 5 % of the variance. Lines at mains frequencies do not count.
 
     Parameters
@@ -73,20 +73,20 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
     str or None
         Verb phrase for a message, such as "drifts by ..."; None if there is only stationary noise.
     """
-    if record.samples is None or record.interval is None or len(record.samples) < SHORTEST:
+    if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
-    residual, _ = without_lines(record.samples - record.samples.mean(), record.interval)
+    residual, _ = remove_lines(record.samples - record.samples.mean(), record.interval)
     if frequency is not None:
-        return _vibration(residual, record.interval, frequency)
+        return _vibration_phrase(residual, record.interval, frequency)
     time = np.linspace(-1.0, 1.0, len(residual))
     trend = np.polynomial.Chebyshev.fit(time, residual, 3)(time)
     fraction = float(trend @ trend) / float(residual @ residual)
-    if fraction > LARGEST_DRIFT:
+    if fraction > LARGEST_DRIFT_SHARE:
         return f"drifts by {np.ptp(trend):.3g} (SI) over its length, {fraction:.0%} of its variance"
-    return _unsteady_scatter(residual - trend, record.interval)
+    return _unsteady_scatter_phrase(residual - trend, record.interval)
 
 
-def _vibration(residual: FloatArray, interval: float, frequency: float) -> str | None:
+def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -> str | None:
     """Return the phrase about a vibration at a mode's frequency in a noise record; None without it.
 
     Parameters
@@ -99,18 +99,18 @@ def _vibration(residual: FloatArray, interval: float, frequency: float) -> str |
         Frequency of the mode [Hz].
     """
     is_short = frequency * interval * len(residual) < LEAST_PERIODS
-    if is_short or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
+    if is_short or any(abs(frequency / mains - 1.0) < RELATIVE_HALF_BAND for mains in MAINS):
         return None
-    line = line_near(residual, interval, frequency, NEAR * frequency)
+    line = strongest_line_near(residual, interval, frequency, RELATIVE_HALF_BAND * frequency)
     if line is None:
         return None
     fraction = float(line @ line) / float(residual @ residual)
-    if fraction <= LARGEST_LINE:
+    if fraction <= LARGEST_LINE_SHARE:
         return None
     return f"holds a line near the model's {frequency:.3g} Hz with {fraction:.0%} of its variance"
 
 
-def _unsteady_scatter(residual: FloatArray, interval: float) -> str | None:
+def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | None:
     """Return the phrase about the quarter of a noise record that scatters most; None if all agree.
 
     Parameters
@@ -128,10 +128,13 @@ def _unsteady_scatter(residual: FloatArray, interval: float) -> str | None:
     ratio = np.inf
     if scatter[quietest] > 0.0:
         ratio = float(scatter[loudest] / scatter[quietest])
-    degrees_of_freedom = (_freedom(quarters[loudest]), _freedom(quarters[quietest]))
+    degrees_of_freedom = (
+        _effective_sample_count(quarters[loudest]),
+        _effective_sample_count(quarters[quietest]),
+    )
     # Bonferroni: the largest ratio among 12 ordered pairs of quarters
     p_value = 12.0 * f_distribution.sf(ratio**2, *degrees_of_freedom)
-    if ratio < LARGEST_RATIO or p_value > _LEVEL:
+    if ratio < LARGEST_SCATTER_RATIO or p_value > _LEVEL:
         return None
     first_sample = sum(map(len, quarters[:loudest]))
     begin = first_sample * interval
@@ -142,10 +145,10 @@ def _unsteady_scatter(residual: FloatArray, interval: float) -> str | None:
     )
 
 
-def _freedom(series: FloatArray) -> float:
+def _effective_sample_count(series: FloatArray) -> float:
     """Return the effective number of independent samples in a series (n,) correlated in time.
 
     It is the degrees of freedom of the variance of the series.
     """
     rho, chance = autocorrelation([series])
-    return len(series) / times_fewer(rho, chance)
+    return len(series) / statistical_inefficiency(rho, chance)

@@ -5,10 +5,16 @@ import numpy as np
 from discrepancy.campaign.noise_records import repeated_readings
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 
-SIGNIFICANT_ROW = 8.0
+OUTLYING_ROW_DEVIATIONS = 8.0
 """Least residual of an outlying row of a static or flight trial, in noise deviations."""
 NORMAL_OVER_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
+LEAST_REPEATS = 3
+"""Least number of repeats: the median of two does not show which of them is wrong."""
+LEAST_ROWS = 8
+"""Least number of rows for a parabola to be judged by: five remain beside its coefficients."""
+LARGEST_SCATTER = 2.0
+"""Largest scatter about a parabola, in noise deviations, for the load to act by a parabola."""
 
 
 def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray]:
@@ -16,8 +22,8 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
 
     Each row is compared with its median over the repeats. If the zero of the channel is not known
     exactly, the zero of each trial is removed first. A row is an outlier if its residual exceeds
-    `SIGNIFICANT_ROW` standard deviations, and if it is the only such row of its trial: a trial with
-    several has another zero or gain.
+    `OUTLYING_ROW_DEVIATIONS` standard deviations, and if it is the only such row of its trial: a
+    trial with several has another zero or gain.
 
     Parameters
     ----------
@@ -35,29 +41,56 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
     if channel.noise is None:
         return outliers
     for repeats in repeated_readings(campaign.trials, channel.name):
-        if len(repeats.trials) < 3:
+        if len(repeats.trials) < LEAST_REPEATS:
             continue
-        readings = repeats.values
-        if channel.offset_deviation > 0.0:
-            from_median = readings - np.median(readings, axis=0)
-            readings = readings - np.median(from_median, axis=1, keepdims=True)
-        residual = readings - np.median(readings, axis=0)
         noise = channel.noise.standard_deviation * repeats.trials[0].noise_factor
-        scale = max(noise, NORMAL_OVER_MAD * float(np.median(np.abs(residual))))
-        is_significant = np.abs(residual) > SIGNIFICANT_ROW * scale
-        significant_rows = is_significant.sum(axis=1, keepdims=True)
-        is_single = (significant_rows == 1) & (is_significant.shape[1] > 1)
-        for trial, is_outlier in zip(repeats.trials, is_significant & is_single, strict=True):
-            outliers[trial.name] = is_outlier
+        has_free_zero = channel.offset_deviation > 0.0
+        is_outlier = _outliers_among_repeats(repeats.values, noise, has_free_zero=has_free_zero)
+        for trial, is_outlier_in_trial in zip(repeats.trials, is_outlier, strict=True):
+            outliers[trial.name] = is_outlier_in_trial
     return outliers
+
+
+def _outliers_among_repeats(
+    readings: FloatArray, noise: float, *, has_free_zero: bool
+) -> BoolArray:
+    """Return which readings of a channel in R trials that repeat each other are outliers.
+
+    Parameters
+    ----------
+    readings : (R, N) ndarray
+        Readings of the N rows of each trial.
+    noise : float
+        Standard deviation of the channel's noise.
+    has_free_zero : bool
+        Whether each trial may have a zero of its own, which is removed first: the median over the
+        rows of what the readings differ from the median over the trials.
+
+    Returns
+    -------
+    (R, N) ndarray of bool
+        True for an outlier.
+    """
+    if has_free_zero:
+        from_median_of_trials = readings - np.median(readings, axis=0)
+        zeros = np.median(from_median_of_trials, axis=1, keepdims=True)
+        readings = readings - zeros
+    residual = readings - np.median(readings, axis=0)
+    scale = max(noise, NORMAL_OVER_MAD * float(np.median(np.abs(residual))))
+    is_significant = np.abs(residual) > OUTLYING_ROW_DEVIATIONS * scale
+    significant_count = is_significant.sum(axis=1, keepdims=True)
+    # in a trial of one row, an outlier and another zero look the same, so nothing is left out
+    row_count = is_significant.shape[1]
+    is_single: BoolArray = (significant_count == 1) & (row_count > 1)
+    return is_significant & is_single
 
 
 def row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Channel) -> BoolArray:
     """Find the single outlier among the rows of a trial by a parabola over the load.
 
     A row is an outlier if the parabola through all other rows misses it by more than
-    `SIGNIFICANT_ROW` standard deviations of the noise, while the other rows scatter about that
-    parabola by less than twice the noise. Of several such rows the one that leaves the least
+    `OUTLYING_ROW_DEVIATIONS` standard deviations of the noise, while the other rows scatter about
+    that parabola by less than twice the noise. Of several such rows the one that leaves the least
     scatter is taken.
 
     Parameters
@@ -79,7 +112,7 @@ def row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Chan
     outlier = np.zeros(len(values), dtype=bool)
     rows = np.flatnonzero(used)
     load = trial.load[rows]
-    if channel.noise is None or len(rows) < 8 or np.ptp(load) == 0.0:
+    if channel.noise is None or len(rows) < LEAST_ROWS or np.ptp(load) == 0.0:
         return outlier
     # residuals of a parabola in the load through all rows, by an orthonormal basis
     powers = np.vander(load / np.max(np.abs(load)), 3)
@@ -94,7 +127,7 @@ def row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Chan
     squares_of_others = residual @ residual - residual**2 / one_minus_leverage
     scatter_of_others = np.sqrt(np.maximum(squares_of_others, 0.0) / degrees)
     noise = trial.noise_deviation(channel)
-    scatter_of_others[left_out_residual <= SIGNIFICANT_ROW * noise] = np.inf
+    scatter_of_others[left_out_residual <= OUTLYING_ROW_DEVIATIONS * noise] = np.inf
     candidate = int(np.argmin(scatter_of_others))
-    outlier[rows[candidate]] = scatter_of_others[candidate] < 2.0 * noise
+    outlier[rows[candidate]] = scatter_of_others[candidate] < LARGEST_SCATTER * noise
     return outlier

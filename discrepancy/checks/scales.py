@@ -8,19 +8,19 @@ from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import Campaign, Channel, FloatArray, Quantity, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.held import roughness
+from discrepancy.checks.held import estimate_roughness
 
-ABOVE_NOISE = 5.0
+CLEAR_NOISE_DEVIATIONS = 5.0
 """Least size of a clear reading, in standard deviations of the noise."""
-_VISIBLE = 0.01
+_LEAST_RELATIVE_AMPLITUDE = 0.01
 """Least predicted amplitude of a channel, as a fraction of the largest of its quantity.
 
 Below it the load has hardly any effect on the channel."""
-_AGREE = 0.9
+_LEAST_AGREEING_SHARE = 0.9
 """Least fraction of the pairs of rows whose slopes must have one sign."""
-_NOTHING = 1e9
+_LARGEST_RATIO = 1e9
 """Ratio of data to prediction above which the prediction is only a rounding error."""
-_FLOOR = 0.02
+_LEAST_RELATIVE_ERROR = 0.02
 """Relative error that any prediction may have, in a comparison of channels."""
 
 
@@ -57,14 +57,17 @@ def data_scales(
             data = trial.values[used, column]
             model = prediction[used, column]
             amplitude = _amplitude(model, trial)
-            if amplitude <= _VISIBLE * largest[channel.quantity] or amplitude == 0.0:
+            if (
+                amplitude <= _LEAST_RELATIVE_AMPLITUDE * largest[channel.quantity]
+                or amplitude == 0.0
+            ):
                 continue
             if trial.is_dynamic:
                 scale = _dynamic_scale(data, model, trial, channel)
             else:
                 noise = trial.noise_deviation(channel)
                 scale = _static_scale(data, model, noise, channel.offset_deviation)
-            if 0.0 < abs(scale) < _NOTHING:
+            if 0.0 < abs(scale) < _LARGEST_RATIO:
                 scales[name, trial.name] = scale
     return scales
 
@@ -112,22 +115,22 @@ def _static_scale(
     """
     # all pairs of at most 400 rows
     rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
-    first, second = np.triu_indices(len(rows), 1)
-    data_steps = data[rows][first] - data[rows][second]
-    model_steps = model[rows][first] - model[rows][second]
+    first_rows, second_rows = np.triu_indices(len(rows), 1)
+    data_steps = data[rows][first_rows] - data[rows][second_rows]
+    model_steps = model[rows][first_rows] - model[rows][second_rows]
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
     is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(model))
     median_reading = float(np.median(data))
     median_prediction = float(np.median(model))
     if not is_clear_step.any():
-        is_visible = abs(median_reading) > ABOVE_NOISE * max(noise, zero_deviation)
+        is_visible = abs(median_reading) > CLEAR_NOISE_DEVIATIONS * max(noise, zero_deviation)
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
     slopes = data_steps[is_clear_step] / model_steps[is_clear_step]
     slope = float(np.median(slopes))
     usual_step = np.median(np.abs(model_steps[is_clear_step]))
-    is_above_noise = max(abs(slope), 1.0) * usual_step > ABOVE_NOISE * noise
-    pairs_agree = np.mean(slopes * slope > 0.0) > _AGREE
+    is_above_noise = max(abs(slope), 1.0) * usual_step > CLEAR_NOISE_DEVIATIONS * noise
+    pairs_agree = np.mean(slopes * slope > 0.0) > _LEAST_AGREEING_SHARE
     has_sign_of_model = median_reading * np.sign(median_prediction) > 2.0 * zero_deviation
     has_another_cause = slope < 0.0 and has_sign_of_model
     return slope if is_above_noise and pairs_agree and not has_another_cause else 0.0
@@ -156,11 +159,11 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, channel: C
     # record stands out of its own scatter, and the prediction out of the stated noise.
     predicted = _amplitude(model, trial)
     measured = abs(scale) * predicted
-    scatter = roughness(data) if len(data) > 6 else 0.0
+    scatter = estimate_roughness(data) if len(data) > 6 else 0.0
     noise = trial.noise_deviation(channel) or scatter
-    is_above_noise = measured > ABOVE_NOISE * noise
+    is_above_noise = measured > CLEAR_NOISE_DEVIATIONS * noise
     noise_may_be_in_another_unit = (
-        measured > ABOVE_NOISE * scatter and predicted > ABOVE_NOISE * noise
+        measured > CLEAR_NOISE_DEVIATIONS * scatter and predicted > CLEAR_NOISE_DEVIATIONS * noise
     )
     return scale if is_above_noise or noise_may_be_in_another_unit else 0.0
 
@@ -215,23 +218,23 @@ def swapped_channels(
             if trial.name in trial_names:
                 misfits = misfits + _misfits(trial, predictions[trial.name], channels)
         _, assigned = linear_sum_assignment(misfits)
-        for first, second in enumerate(assigned):
-            is_exchange = first < second and assigned[second] == first
-            if is_exchange and _exchange_is_better(misfits, first, int(second)):
-                swaps.append((channels[first].name, channels[second].name))
+        for first_index, second_index in enumerate(assigned):
+            is_exchange = first_index < second_index and assigned[second_index] == first_index
+            if is_exchange and _exchange_is_better(misfits, first_index, int(second_index)):
+                swaps.append((channels[first_index].name, channels[second_index].name))
     return swaps
 
 
-def swap_fault(first: str, second: str) -> DataFault:
+def swap_fault(first_channel: str, second_channel: str) -> DataFault:
     """Return the fault of two channels that are swapped."""
     sentence = (
-        f"The channels {first!r} and {second!r} fit the model clearly better exchanged: see which "
-        "wire or column is which, and exchange their `column` or `output`."
+        f"The channels {first_channel!r} and {second_channel!r} fit the model clearly better "
+        "exchanged: see which wire or column is which, and exchange their `column` or `output`."
     )
-    return DataFault(FaultKind.SWAPPED, sentence, first)
+    return DataFault(FaultKind.SWAPPED, sentence, first_channel)
 
 
-def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
+def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int) -> bool:
     """Return whether two channels fit clearly better if they are exchanged.
 
     Each misfit must become less than half, and their sum must fall by more than 30.
@@ -240,11 +243,11 @@ def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
     ----------
     misfits : (C, C) ndarray
         Chi-squared of each channel (row) to the prediction of each channel (column).
-    first, second : int
+    first_index, second_index : int
         Indices of the two channels.
     """
-    pair = [first, second]
-    exchanged = [second, first]
+    pair = [first_index, second_index]
+    exchanged = [second_index, first_index]
     before = misfits[pair, pair]
     after = misfits[pair, exchanged]
     return bool(np.all(after < 0.5 * before) and np.sum(before - after) > 30.0)
@@ -300,13 +303,13 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
         # outweigh the difference between two gauges.
         sign = sign_of_release(data, model, trial)
         residual = np.asarray(sign * np.std(data) - np.std(model))
-        deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))
+        deviation = np.hypot(noise / np.sqrt(len(data)), _LEAST_RELATIVE_ERROR * np.std(model))
     else:
         residual = data - model
         if channel.offset_deviation > 0.0:
             residual = residual - np.median(residual)
-        least = 0.2 * _FLOOR * float(np.max(np.abs(model), initial=0.0))
-        deviation = np.maximum(np.hypot(noise, _FLOOR * np.abs(model)), least)
+        least = 0.2 * _LEAST_RELATIVE_ERROR * float(np.max(np.abs(model), initial=0.0))
+        deviation = np.maximum(np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(model)), least)
     # bounded, so that readings of any size stay comparable
     standardised = np.minimum(np.abs(residual / np.maximum(deviation, 1e-300)), 1e9)
     return float(np.sum(standardised**2))

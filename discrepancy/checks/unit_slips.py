@@ -8,7 +8,7 @@ from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import UNITS, conversion_of
+from discrepancy.campaign.units import UNITS, factor_to_si
 from discrepancy.checks.fault import DataFault, FaultKind
 
 _DRIVES = {
@@ -18,14 +18,14 @@ _DRIVES = {
     TrialKind.FLIGHT: (Quantity.ACCELERATION, "g"),
 }
 """Quantity that drives a trial, and its unit; a load factor may have been recorded in m/s2."""
-SURE_SLIP = 500.0
+CERTAIN_FACTOR = 500.0
 """Slips beyond this factor are certain from one record.
 
 Smaller ones are a doubt until several agree.
 """
-DOUBT = 7.0
+DOUBTFUL_FACTOR = 7.0
 """Slips within this factor may be physical: a doubt if several records agree, else nothing."""
-LEAST = 2.0
+LEAST_FACTOR = 2.0
 """Least factor between two units that is a slip."""
 
 
@@ -47,22 +47,22 @@ class Slip(NamedTuple):
     stated: str
 
     @property
-    def size(self) -> float:
+    def ratio(self) -> float:
         """The factor or its reciprocal, whichever is larger."""
         return max(self.factor, 1.0 / self.factor)
 
     @property
-    def width(self) -> float:
+    def tolerance_factor(self) -> float:
         """Factor by which the ratio may differ from the slip because of physical effects.
 
         A larger slip is distinct from other slips, and allows for a larger factor.
         """
-        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
-            if self.size >= least_size:
+        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBTFUL_FACTOR, 1.35)):
+            if self.ratio >= least_size:
                 return width
         return 1.1
 
-    def distance(self, scale: float) -> float:
+    def log_distance(self, scale: float) -> float:
         """Return |log(scale / factor)|: how far a ratio of data to model is from this slip."""
         return abs(log(abs(scale) / self.factor))
 
@@ -73,8 +73,8 @@ class Slip(NamedTuple):
         return f"({meant} given as {stated}?)"
 
 
-def slip_between(
-    scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
+def find_slip(
+    scale: float, quantity: Quantity, stated: str = "", *, is_input: bool = False
 ) -> Slip | None:
     """Return the two units of a quantity whose confusion best explains a ratio of data to model.
 
@@ -86,7 +86,7 @@ def slip_between(
         The quantity whose units may have been mixed up.
     stated : str
         The unit that the file states. If it is empty, all pairs with one SI unit are tried.
-    drive : bool
+    is_input : bool
         True if the quantity is an input of the model. An input that is too small makes the data
         look too large, so that the ratio is inverted.
 
@@ -95,12 +95,12 @@ def slip_between(
     Slip or None
         The two units; None if no pair explains the ratio.
     """
-    if abs(log(abs(scale))) < log(LEAST / 1.1):
+    if abs(log(abs(scale))) < log(LEAST_FACTOR / 1.1):
         return None
     names = {*UNITS[quantity].usual}
     if stated:
         names.add(stated)
-    units_in_si = {unit: conversion_of(quantity, unit) for unit in sorted(names)}
+    units_in_si = {unit: factor_to_si(quantity, unit) for unit in sorted(names)}
     units_in_si |= UNITS[quantity].foreign
     distances: dict[Slip, float] = {}
     for assumed, assumed_in_si in units_in_si.items():
@@ -108,11 +108,13 @@ def slip_between(
             has_si = 1.0 in (assumed_in_si, meant_in_si)
             if assumed != stated and (stated or not has_si):
                 continue
-            factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
+            factor = meant_in_si / assumed_in_si if is_input else assumed_in_si / meant_in_si
             slip = Slip(factor, meant, assumed)
-            if slip.size > LEAST:
-                distances[slip] = slip.distance(scale)
-    explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
+            if slip.ratio > LEAST_FACTOR:
+                distances[slip] = slip.log_distance(scale)
+    explaining = [
+        slip for slip, distance in distances.items() if distance < log(slip.tolerance_factor)
+    ]
     return min(explaining, key=lambda slip: distances[slip], default=None)
 
 
@@ -143,7 +145,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
             "or of the channels"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence)
-        yield from _graded(fault, common, agreeing=len(input_slips))
+        yield from _grade_slip(fault, common, agreeing=len(input_slips))
         return
     wrong_channels = set()
     for channel, trial_names in trials_of_channels.items():
@@ -189,13 +191,13 @@ def _slips_in_trial(
             "force, load factor, release displacement or inputs"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
-        yield from _graded(fault, common, agreeing=len(keys))
+        yield from _grade_slip(fault, common, agreeing=len(keys))
         return
     for key in keys:
         channel, _ = key
         slip = _slip_of_channel(campaign, channel, [scales[key]])
         # a small factor in one trial may be physical, such as lift that shifts from the outer wing
-        if slip is not None and slip.size >= SURE_SLIP:
+        if slip is not None and slip.ratio >= CERTAIN_FACTOR:
             yield from _channel_faults(campaign, channel, slip, [trial])
 
 
@@ -209,10 +211,10 @@ def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
 def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> Slip | None:
     """Return the slip between a channel's units that explains all its scales; None if none does."""
     channel = campaign.channels[name]
-    slip = slip_between(median(map(abs, scales)), channel.quantity, channel.unit)
+    slip = find_slip(median(map(abs, scales)), channel.quantity, channel.unit)
     if slip is None:
         return None
-    if any(slip.distance(scale) > 2.0 * log(slip.width) for scale in scales):
+    if any(slip.log_distance(scale) > 2.0 * log(slip.tolerance_factor) for scale in scales):
         return None
     return slip
 
@@ -228,7 +230,7 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
         drives.append(_DRIVES[trial.kind])
     drives += [(recorded.quantity, recorded.unit) for recorded in trial.inputs]
     for quantity, unit in drives:
-        slip = slip_between(scale, quantity, unit, drive=True)
+        slip = find_slip(scale, quantity, unit, is_input=True)
         if slip is not None:
             return slip
     return None
@@ -257,19 +259,19 @@ def _channel_faults(
         column = f", column {channel.column!r} of {first.file},"
     number_of_trials = sum(name in trial.channels for trial in campaign.trials)
     is_in_one_of_several = len(trials) == 1 and number_of_trials > 1
-    where = f" in the trial {first.name!r}" if is_in_one_of_several else ""
+    trials_text = f" in the trial {first.name!r}" if is_in_one_of_several else ""
     sentence = (
         f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model "
-        f"says{where} {slip}: correct its `unit`, or convert the column"
+        f"says{trials_text} {slip}: correct its `unit`, or convert the column"
     )
     trial_name = first.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
     # an accelerometer also shows gravity, whose value is known: this counts as a second record
     witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
-    yield from _graded(fault, slip, agreeing=len(trials) + witnesses)
+    yield from _grade_slip(fault, slip, agreeing=len(trials) + witnesses)
 
 
-def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
+def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
     """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
 
     Parameters
@@ -282,7 +284,7 @@ def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFaul
         Number of records that show the same slip.
     """
     sentence = fault.sentence
-    if slip.size >= SURE_SLIP or (slip.size >= DOUBT and agreeing > 1):
+    if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):
         yield replace(fault, sentence=f"{sentence}; no physical effect is that large.")
-    elif slip.size >= DOUBT or agreeing > 1:
+    elif slip.ratio >= DOUBTFUL_FACTOR or agreeing > 1:
         yield replace(fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or mend the model.")

@@ -225,7 +225,7 @@ class EffectLaws:
         """
         trial = self.trials[trial_index]
         forces: dict[int, LawForce] = {}
-        for law in self.column_builder.problem.model.at_ports(patch):
+        for law in self.column_builder.problem.model.forces_at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)

@@ -244,7 +244,7 @@ class StoredPatch:
         """The patches of all effects, in order, as one."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
 
-    def upon(self, earlier: "StoredPatch | None") -> "StoredPatch":
+    def combine_with(self, earlier: "StoredPatch | None") -> "StoredPatch":
         """Return this patch combined with an earlier one that is already in its model.
 
         The result applies to the model without either patch.
@@ -287,12 +287,12 @@ def primitive_intervals(
     VerdictFileError
         If a draw has other primitives than the patch.
     """
-    kinds = _kinds(patch)
+    kinds = _kinds_text(patch)
     for number, draw in enumerate(draws, start=1):
-        if _kinds(draw) != kinds:
+        if _kinds_text(draw) != kinds:
             raise VerdictFileError(
-                f"Draw {number} of the posterior has the primitives {_kinds(draw)}, but the patch "
-                f"has {kinds}."
+                f"Draw {number} of the posterior has the primitives {_kinds_text(draw)}, but the "
+                f"patch has {kinds}."
             )
     intervals = []
     for index, primitive in enumerate(patch):
@@ -314,7 +314,7 @@ def primitive_intervals(
     return tuple(intervals)
 
 
-def _kinds(patch: ModelPatch) -> str:
+def _kinds_text(patch: ModelPatch) -> str:
     """Return the kinds of a patch's primitives, for a message."""
     return ", ".join(primitive.kind for primitive in patch) or "none"
 

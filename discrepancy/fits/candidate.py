@@ -80,7 +80,7 @@ class EffectTerm:
         variables = []
         for parameter in self.parameters:
             if isinstance(parameter, ShapeParameter):
-                variables.append(parameter.prior.normal(parameter.canonical))
+                variables.append(parameter.prior.standard_normal(parameter.canonical))
             else:
                 variables.append(0.0)
         return np.array(variables)
@@ -107,7 +107,7 @@ class EffectTerm:
             physical_value = factor * prior.value(float(scaled_values[number]))
             if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
                 physical_value = max(physical_value, prior.value(lowest))
-            rescaled[number] = np.clip(prior.normal(physical_value), lowest, highest)
+            rescaled[number] = np.clip(prior.standard_normal(physical_value), lowest, highest)
         return rescaled
 
 
@@ -186,7 +186,9 @@ class Candidate:
         variables = []
         moves = zip(self.parameters, scaled_values.tolist(), step.tolist(), strict=True)
         for parameter, u, du in moves:
-            variables.append(parameter.prior.stepped(u, du) if parameter.magnitude else u + du)
+            variables.append(
+                parameter.prior.step_within_prior(u, du) if parameter.magnitude else u + du
+            )
         return np.array(variables)
 
     def patches(self, setting: Setting, scaled_values: FloatArray) -> list[ModelPatch]:

@@ -498,7 +498,9 @@ def fit_free_shape(
     term, values = terms_with_values[term_index]
     if not term.effect.shape:
         return None
-    canonical = [parameter.prior.normal(parameter.canonical) for parameter in term.effect.shape]
+    canonical = [
+        parameter.prior.standard_normal(parameter.canonical) for parameter in term.effect.shape
+    ]
     terms_with_values[term_index] = (replace(term, free_shape=True), np.append(values, canonical))
     terms, effect_values = zip(*terms_with_values, strict=True)
     start = replace(canonical_fit.point, effect=np.concatenate(effect_values))

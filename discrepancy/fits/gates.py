@@ -238,7 +238,7 @@ def whiteness_p_value(records: Sequence[ResidualRecord]) -> float:
     for record in records:
         _, p_value = noise_tests.ljung_box(record.values, record.is_used)
         p_values.append(p_value)
-    return noise_tests.combine(p_values)
+    return noise_tests.combine_p_values(p_values)
 
 
 # ---------------------------------------------------------------- shape and time steps

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_t
 
 from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
-from discrepancy.catalogue.entry import NINETY
+from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.beginnings import (
     refit_from_first_readings,
@@ -82,7 +82,7 @@ def fit_held_out(problem: Problem, fitted: CandidateFit) -> tuple[Problem, Candi
     local_fit = fit(held_out, candidate, start, local_only=True)
     local_fit = refit_from_first_readings(held_out, local_fit, local_only=True)
     # a poor fit may be at a wrong optimum: try again from another release amplitude
-    if local_fit.chi_square > SEARCH.far * float(held_out.sample_counts.sum()):
+    if local_fit.chi_square > SEARCH.far_chi_square * float(held_out.sample_counts.sum()):
         start = _with_best_release_amplitudes(held_out, candidate, start)
         second_fit = fit(held_out, candidate, start, local_only=True)
         if second_fit.objective < local_fit.objective:
@@ -356,8 +356,8 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     axes = directions * np.sqrt(np.maximum(variances, 0.0))
     energy_rises = []
     for axis in axes.T:
-        energy_rises.append(energy(fitted_effect - NINETY * axis))
-        energy_rises.append(energy(fitted_effect + NINETY * axis))
+        energy_rises.append(energy(fitted_effect - NINETY_PERCENT_QUANTILE * axis))
+        energy_rises.append(energy(fitted_effect + NINETY_PERCENT_QUANTILE * axis))
     if min(energy_rises) > LEAST_MISFIT_RISE:
         return fit
     return replace(fit, draws=importance_draws(energy, fitted_effect, axes))

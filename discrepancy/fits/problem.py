@@ -115,7 +115,7 @@ class Problem:
             )
         self.campaign = campaign
         self.setting = setting
-        self.model = model.remembering()
+        self.model = model.with_response_cache()
         self.channel_names = tuple(campaign.channels)
         self.refinement = 1
         self.noise_models: dict[str, NoiseModel] = {}
@@ -437,7 +437,7 @@ class Problem:
         """
         other = copy(self)
         if model is not None:
-            other.model = model.remembering()
+            other.model = model.with_response_cache()
         other._prepare_trials(trials)
         return other
 

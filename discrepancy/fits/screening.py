@@ -236,7 +236,7 @@ class Screen:
         """
         is_reading = self.inner_product_signs > 0.0
         squared_size = float((change.vector[is_reading] ** 2).sum())
-        factor = sqrt(SEARCH.first_order / squared_size) if squared_size > 0.0 else 1.0
+        factor = sqrt(SEARCH.first_order_change / squared_size) if squared_size > 0.0 else 1.0
         if factor >= 1.0:
             return change, 1.0
         return self.change_by_effect(
@@ -341,9 +341,9 @@ def parameter_grid(
         Whether a magnitude that may be negative is tried at a small value too.
     """
     other_parameter_count = sum(not parameter.magnitude for parameter in term.parameters)
-    levels = SEARCH.levels_of_many
-    if other_parameter_count < len(SEARCH.levels):
-        levels = SEARCH.levels[other_parameter_count]
+    levels = SEARCH.grid_levels_if_many
+    if other_parameter_count < len(SEARCH.grid_levels):
+        levels = SEARCH.grid_levels[other_parameter_count]
     axes: list[tuple[float, ...]] = []
     has_magnitude = False
     for parameter in term.parameters:
@@ -356,13 +356,13 @@ def parameter_grid(
             has_magnitude = True
         elif parameter.name == term.effect.spectral and peaks:
             scaled_peaks = [
-                float(np.clip(parameter.prior.normal(peak), -3.0, 3.0)) for peak in peaks
+                float(np.clip(parameter.prior.standard_normal(peak), -3.0, 3.0)) for peak in peaks
             ]
             axes.append(tuple(scaled_peaks))
         elif parameter.levels:
             axes.append(_prior_quantiles(parameter))
         elif parameter in term.effect.shape:
-            axes.append((parameter.prior.normal(parameter.canonical),))
+            axes.append((parameter.prior.standard_normal(parameter.canonical),))
         else:
             axes.append(levels)
     for values in product(*axes):

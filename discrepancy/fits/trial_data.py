@@ -230,7 +230,7 @@ def shared_unknowns(
     gain_estimates : dict of str to float
         The ratio of readings to model for channels of unknown scale: a first estimate of 1 + gain.
     """
-    priors = [ScaledPrior(*prior, 1.0) for prior in model.stated(campaign)]
+    priors = [ScaledPrior(*prior, 1.0) for prior in model.prior_moments(campaign)]
     used_channels = {name for trial in trials for name in trial.channels}
     gain_channels: list[str] = []
     fixed_gain: dict[str, float] = {}
@@ -299,7 +299,7 @@ def local_unknowns(
         if release.time_zero_deviation > 0.0:
             time_zero_scale = np.full(1, release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
-        sizes = model.initial_sizes(campaign, trial)
+        sizes = model.initial_state_magnitudes(campaign, trial)
         initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
         initial_scale = FREE_STATE_DEVIATION * np.pad(sizes, (0, len(sizes) % 2))
     # constants of inputs
@@ -374,8 +374,10 @@ class TrialData:
         """
         scaled = columns / self.deviation
         for number, noise in enumerate(self.noise_models):
-            if noise.applies(self.trial.whitened_at):
-                scaled[..., number] = noise.whiten(scaled[..., number], self.trial.whitened_at)
+            if noise.can_whiten(self.trial.whitening_interval):
+                scaled[..., number] = noise.whiten(
+                    scaled[..., number], self.trial.whitening_interval
+                )
         return np.asarray(scaled * self.weight)
 
     @classmethod
@@ -403,7 +405,7 @@ class TrialData:
         noise_models = tuple(models_by_channel[name] for name in trial.channels)
         # a coloured noise is whitened if its coefficients hold for the sampling interval of the
         # trial; the whitened samples then have the deviation of its innovations
-        is_whitened = [noise.applies(trial.whitened_at) for noise in noise_models]
+        is_whitened = [noise.can_whiten(trial.whitening_interval) for noise in noise_models]
         sample_deviation = [noise.static_deviation for noise in noise_models]
         innovation_deviation = [noise.standard_deviation for noise in noise_models]
         deviation = trial.noise_factor * np.where(

@@ -223,7 +223,9 @@ class FmuModelDescription(ModelDescription):
     def faults(self) -> Iterator[Fault]:
         """Yield the contradictions of the file."""
         for kind in ("port", "parameter", "output", "input"):
-            yield from self.repeated(kind, [section.name for section in getattr(self, kind)])
+            yield from self.repeated_name_faults(
+                kind, [section.name for section in getattr(self, kind)]
+            )
         for kind in self.effects:
             why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
             yield (

@@ -20,39 +20,39 @@ class FmuExcitation(NamedTuple):
         Parameters and constant inputs of the FMU.
     step : float
         Communication step [s].
-    record : int
+    recorded_steps : int
         Number of steps of the recorded response to each input and each release.
     inputs : tuple of str
         Force inputs on which a recorded force or laws may act.
-    levers : mapping of str to float
-        Factor of the recorded force on each input: one for a force, an arm [m] for a moment.
+    force_factors : mapping of str to float
+        Factor of the recorded force on each input: one for a force, the lever arm [m] for a moment.
     force : RecordedHistory, optional
         The recorded force.
     releases : mapping of str to float
         Parameters that release the FMU, with displacement [m] and velocity [m/s] of the release
         point; or the input that holds it until then, with the displacement.
-    settles : bool
-        Whether the FMU is to come to rest.
+    decays_to_rest : bool
+        Whether the FMU is stepped until its motion has decayed, for its outputs at rest.
     """
 
     state: OperatingPoint
     step: float
-    record: int
+    recorded_steps: int
     inputs: tuple[str, ...] = ()
-    levers: Mapping[str, float] = MappingProxyType({})
+    force_factors: Mapping[str, float] = MappingProxyType({})
     force: RecordedHistory | None = None
     releases: Mapping[str, float] = MappingProxyType({})
-    settles: bool = False
+    decays_to_rest: bool = False
 
     @property
-    def recording(self) -> tuple[OperatingPoint, float, int]:
-        """State, step and number of steps of a recorded answer."""
-        return self.state, self.step, self.record
+    def recording_arguments(self) -> tuple[OperatingPoint, float, int]:
+        """State, step [s] and number of steps: the first arguments of an `FmuRun`."""
+        return self.state, self.step, self.recorded_steps
 
     @property
-    def lever_values(self) -> FloatArray:
-        """Factor of the recorded force for each of the inputs (E,)."""
-        return np.array([self.levers.get(name, 0.0) for name in self.inputs])
+    def force_factor_values(self) -> FloatArray:
+        """Factor (E,) of the recorded force on each of the E inputs; 0 if it does not act there."""
+        return np.array([self.force_factors.get(name, 0.0) for name in self.inputs])
 
     @property
     def first_force(self) -> float:
@@ -60,6 +60,6 @@ class FmuExcitation(NamedTuple):
         return 0.0 if self.force is None else float(self.force.values[0])
 
     @property
-    def kind(self) -> tuple[Hashable, ...]:
-        """Inputs and releases for which an FMU is linear, or is not."""
-        return self.inputs, *self.releases, self.settles
+    def linearity_key(self) -> tuple[Hashable, ...]:
+        """Key under which it is remembered whether the FMU is linear: inputs and releases."""
+        return self.inputs, *self.releases, self.decays_to_rest

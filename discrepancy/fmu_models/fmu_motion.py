@@ -13,7 +13,7 @@ from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.fmu_rest import FmuAtRest
 from discrepancy.fmu_models.port_coupling import PortCoupling
-from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample
+from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample_by_splines
 from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
 from fe.compilation import compiled_kernel
@@ -23,7 +23,7 @@ from fe.runtime.time_steps import LENGTH_TOLERANCE
 from fmu_asset.client.runs import FmuRun
 from fmu_asset.client.state_space import FmuStateSpace
 
-CONVERGED = 1e-4
+CONVERGENCE_TOLERANCE = 1e-4
 """Largest rms change of a motion with laws if steps are halved, relative to the motion."""
 MOST_REFINEMENT = 64
 """Largest number of parts of a step in the search for convergence."""
@@ -44,7 +44,7 @@ class FmuSimulator(FmuAtRest):
         super().__init__(description, folder)
         self._refinements: dict[Hashable, Refinement] = {}
 
-    def motion(
+    def simulate_motion(
         self,
         excitation: FmuExcitation,
         trial: Trial,
@@ -60,7 +60,7 @@ class FmuSimulator(FmuAtRest):
             The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its length and name.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         readout : Readout
             Outputs and times.
@@ -75,9 +75,9 @@ class FmuSimulator(FmuAtRest):
         """
         times = readout.times
         end = max(float(times[-1]), float(trial.time[-1]))
-        ports = self._law_ports(excitation, laws)
-        system = self.system(excitation)
-        if system is not None and not system.has_jumping_speed(ports.columns, ports.force_numbers):
+        ports = self._ports_of_laws(excitation, laws)
+        system = self.linear_system(excitation)
+        if system is not None and not system.has_jumping_speed(ports.columns, ports.force_indices):
             return self._motion_of_system(
                 system, excitation, trial, laws, ports, readout, end, refinement
             )
@@ -85,16 +85,16 @@ class FmuSimulator(FmuAtRest):
             # slightly longer, so that another clock (in a fit) can use the same cached run
             end += trial.interval
         stepped = self._stepped_motion(excitation, trial, end, laws, readout.columns, refinement)
-        return sample(stepped.values, stepped.step, readout, readout.derivatives)
+        return sample_by_splines(stepped.values, stepped.step, readout, readout.derivatives)
 
-    def _law_ports(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
+    def _ports_of_laws(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
         """Return the ports of the laws; positions count from the undisturbed outputs."""
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
-        numbers = [excitation.inputs.index(self.port_inputs[port]) for port in ports]
+        input_indices = [excitation.inputs.index(self.port_inputs[port]) for port in ports]
         return LawPorts(
             np.array(columns, dtype=np.int64),
-            np.array(numbers, dtype=np.int64),
+            np.array(input_indices, dtype=np.int64),
             np.zeros(len(columns)),
         )
 
@@ -121,7 +121,7 @@ class FmuSimulator(FmuAtRest):
             The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for the stamps of its force.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         ports : LawPorts
             Where they act.
@@ -133,21 +133,22 @@ class FmuSimulator(FmuAtRest):
             Steps are this many times smaller.
         """
         undisturbed = self._undisturbed_outputs(excitation)
-        amounts = self._release_amounts_of_system(excitation)
+        release_values = self._release_values_of_system(excitation)
         columns = list(readout.columns)
         is_derivative = np.array(readout.derivatives) > 0
-        # the samples themselves if they are even, else steps: many lengths of steps would take long
+        # Steps end at the samples if these are even. Otherwise steps of one length are made, since
+        # each length of step costs a matrix exponential, and splines lead to the samples.
         times = readout.times
         stamps, sample_rows = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
         is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= LENGTH_TOLERANCE * stamps[-1]
         if not is_even:
             stamps = excitation.step * np.arange(ceil(end / excitation.step - 1e-6) + 1.0)
-        start, memory = self._start_with_laws(system, excitation, laws, ports, amounts)
+        start, memory = self._start_with_laws(system, excitation, laws, ports, release_values)
         # motion and outputs
         loads = []
         if excitation.force is not None:
-            loads.append(Load(excitation.lever_values, excitation.force))
-        at_undisturbed = LawPorts(ports.columns, ports.force_numbers, undisturbed[ports.columns])
+            loads.append(Load(excitation.force_factor_values, excitation.force))
+        at_undisturbed = LawPorts(ports.columns, ports.force_indices, undisturbed[ports.columns])
         states, forces = system_motion(
             system,
             Excitation(trial.time, stamps, loads),
@@ -157,23 +158,20 @@ class FmuSimulator(FmuAtRest):
             refinement,
             memory,
         )
-        rows, direct = system.output_rows(columns, readout.derivatives)
+        rows, direct_rows = system.output_rows(columns, readout.derivatives)
         constant = np.where(is_derivative, 0.0, undisturbed[columns])
-        values = states @ rows.T + forces @ direct.T + constant
+        values = states @ rows.T + forces @ direct_rows.T + constant
         if excitation.releases:
             # the first sample is that of the held FMU: the holding force may act on outputs
             # directly
-            held = [
-                self._answer_to_release(excitation, name)[0] * amount
-                for name, amount in amounts.items()
-            ]
-            held_outputs = (undisturbed + sum(held))[columns]
-            values[0] = np.where(is_derivative, values[0], held_outputs)
+            held_outputs = undisturbed + self._held_outputs(excitation, release_values)
+            values[0] = np.where(is_derivative, values[0], held_outputs[columns])
         if not is_even:
-            return sample(values, excitation.step, readout, [0] * len(columns))
+            return sample_by_splines(values, excitation.step, readout, [0] * len(columns))
         rates = (states @ system.state_matrix.T + forces @ system.input_matrix.T) @ rows.T
-        if direct.any():
-            rates += np.gradient(forces, stamps, axis=0) @ direct.T
+        if direct_rows.any():
+            rates += np.gradient(forces, stamps, axis=0) @ direct_rows.T
+        # the last entry of `sample_rows` is time zero, which was added to the samples
         values = values[sample_rows[:-1]]
         rates = rates[sample_rows[:-1]]
         is_before = times < 0.0
@@ -181,15 +179,26 @@ class FmuSimulator(FmuAtRest):
         values[np.ix_(is_before, is_derivative)] = 0.0
         return SampledOutputs(values, rates)
 
+    def _held_outputs(
+        self, excitation: FmuExcitation, release_values: Mapping[str, float]
+    ) -> FloatArray:
+        """Return the outputs (C,) of a linear FMU before its release, less the undisturbed ones."""
+        return np.asarray(
+            sum(
+                self._response_to_release(excitation, name)[0] * value
+                for name, value in release_values.items()
+            )
+        )
+
     def _start_with_laws(
         self,
         system: FmuStateSpace,
         excitation: FmuExcitation,
         laws: PortLaws,
         ports: LawPorts,
-        amounts: Mapping[str, float],
+        release_values: Mapping[str, float],
     ) -> "StartState":
-        """Return the state at the begin of a trial with laws.
+        """Return the state at the start of a trial with laws.
 
         Under a recorded force it is the equilibrium with the laws under the first force; otherwise
         it is the released state.
@@ -200,24 +209,24 @@ class FmuSimulator(FmuAtRest):
             The linear system.
         excitation : FmuExcitation
             The state, force, releases and inputs of the FMU.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         ports : LawPorts
             The ports at which the laws act.
-        amounts : mapping of str to float
+        release_values : mapping of str to float
             The amounts of the variables that release the FMU.
         """
         if not len(laws) or excitation.force is None:
-            return StartState(self._start_state(system, excitation, amounts), None)
-        first_forces = excitation.first_force * excitation.lever_values
+            return StartState(self._start_state(system, excitation, release_values), None)
+        first_forces = excitation.first_force * excitation.force_factor_values
         gain = system.gain
         outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
         positions_without_laws = outputs[ports.columns]
-        compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
+        compliance = gain[np.ix_(ports.columns, ports.force_indices)]
         solution = static_solution(
             laws, positions_without_laws[None], compliance, kernel=compiled_kernel()
         )
-        law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
+        law_forces = np.bincount(ports.force_indices, solution.forces[0], len(first_forces))
         return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 
     # ------------------------------------------------------------ step by step
@@ -241,7 +250,7 @@ class FmuSimulator(FmuAtRest):
             The trial, for its kind and name.
         end : float
             Time of the last step [s].
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         columns : sequence of int
             Columns of the outputs that are read.
@@ -249,33 +258,42 @@ class FmuSimulator(FmuAtRest):
             Steps are this many times smaller than needed.
         """
         fixed_step = self.description.motion.step
-        amounts = self._release_amounts(excitation)
+        release_values = self._find_release_values(excitation)
         # inputs are held over steps
-        longest = excitation.step if excitation.force is None else 0.5 * excitation.step
+        longest_step = excitation.step if excitation.force is None else 0.5 * excitation.step
 
         def outputs_by(parts: int) -> FloatArray:
-            step = fixed_step or longest / parts
-            finer = excitation._replace(step=step, record=ceil(end / step - 1e-6))
-            run = self._run(finer, amounts)
+            step = fixed_step or longest_step / parts
+            finer = excitation._replace(step=step, recorded_steps=ceil(end / step - 1e-6))
+            run = self._run_of_excitation(finer, release_values)
             if len(laws):
                 # an unstable coupling grows beyond all numbers
                 with np.errstate(all="ignore"):
                     return self._outputs_with_laws(run, laws, trial.name)
-            courses = [values.tobytes() for values in run.offsets.values()]
-            key = (run.operating_point, run.step, run.steps, *run.initial_offsets.items(), *courses)
+            load_bytes = [values.tobytes() for values in run.offsets.values()]
+            key = (
+                run.operating_point,
+                run.step,
+                run.steps,
+                *run.initial_offsets.items(),
+                *load_bytes,
+            )
             return self.cached(key, lambda: self.outputs_of_run(run))
 
         parts = 1
         if len(laws) and fixed_step is None:
             # only the outputs that are read have to converge: others may need far smaller steps
-            watched = sorted({*columns, *self.displacement_columns})
-            kind = (*watched, trial.kind, trial.interval)
-            parts = self._parts_for(
-                laws, kind, longest, lambda parts: outputs_by(parts)[::parts, watched]
+            compared_columns = sorted({*columns, *self.displacement_columns})
+            motion_key = (*compared_columns, trial.kind, trial.interval)
+            parts = self._find_converged_parts(
+                laws,
+                motion_key,
+                longest_step,
+                lambda parts: outputs_by(parts)[::parts, compared_columns],
             )
         parts *= refinement
         outputs = outputs_by(parts)[:, list(columns)]
-        return SteppedOutputs(outputs, fixed_step or longest / parts)
+        return SteppedOutputs(outputs, fixed_step or longest_step / parts)
 
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
         """Return a run that begins in equilibrium with laws under its first loads."""
@@ -286,7 +304,7 @@ class FmuSimulator(FmuAtRest):
 
         def run_under(forces: FloatArray) -> FmuRun:
             loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
-            begin = self.loads_less_laws(loads, laws, forces)
+            begin = self.subtract_law_forces(loads, laws, forces)
             return run._replace(
                 initial_offsets={name: float(values[0]) for name, values in begin.items()}
             )
@@ -294,11 +312,13 @@ class FmuSimulator(FmuAtRest):
         def outputs_under(forces: FloatArray) -> FloatArray:
             return self._outputs_at_begin(run_under(forces))
 
-        _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.operating_point, trial)
+        _, solution = self.find_equilibrium_with_laws(
+            laws, outputs_under, outputs, run.operating_point, trial
+        )
         return SettledRun(run_under(solution.forces), solution.memory)
 
     def _outputs_at_begin(self, run: FmuRun) -> FloatArray:
-        """Return the outputs (1, C) at the begin of a run."""
+        """Return the outputs (1, C) at the start of a run."""
         _, outputs, _ = self.start_run(run)
         return outputs[None]
 
@@ -317,16 +337,16 @@ class FmuSimulator(FmuAtRest):
                 f"jumps with a force, so its port {port!r} needs a velocity output; name it in "
                 "[[port]]."
             )
-        first_step, speed_gain = self._speed_gain(run, inputs, speed_columns)
+        first_step, speed_gain = self._probe_port_speeds(run, inputs, speed_columns)
         coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
         # In each step the ports lose `speed_loss` to the laws, and a force that makes the same
         # change, speed_gain^-1 speed_loss, is held over the step. Accelerations without laws are
         # those of the last step, with the loss to the laws added again.
-        asset, first_outputs, courses = self.start_run(run)
+        asset, first_outputs, loads_by_input = self.start_run(run)
         outputs = [first_outputs]
-        forces = np.column_stack([*courses.values()])
-        port_columns = [list(courses).index(name) for name in inputs]
-        # speeds before the begin, extrapolated from the first step without laws
+        forces = np.column_stack([*loads_by_input.values()])
+        port_columns = [list(loads_by_input).index(name) for name in inputs]
+        # speeds before the start, extrapolated from the first step without laws
         previous_speeds = 2.0 * first_step[0] - first_step[1]
         speed_loss = np.zeros(len(ports))
         for step_forces in forces:
@@ -338,12 +358,12 @@ class FmuSimulator(FmuAtRest):
             step_forces[port_columns] -= np.linalg.solve(speed_gain, speed_loss)
             if not np.isfinite(step_forces).all():
                 return np.full((len(forces) + 1, len(first_outputs)), np.nan)
-            load = dict(zip(courses, step_forces.tolist(), strict=True))
+            load = dict(zip(loads_by_input, step_forces.tolist(), strict=True))
             with self.refusal_context():
                 outputs.append(asset.step(load=load).values)
         return np.array(outputs)
 
-    def _speed_gain(
+    def _probe_port_speeds(
         self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
         """Return the speeds of the ports at both ends of the first step, and their gains.
@@ -359,34 +379,34 @@ class FmuSimulator(FmuAtRest):
         speed_columns : list of int
             Column of each port's speed.
         """
-        first_courses = {name: course[:1] for name, course in run.offsets.items()}
-        one_step = run._replace(steps=1, offsets=first_courses)
+        first_loads = {name: values[:1] for name, values in run.offsets.items()}
+        one_step = run._replace(steps=1, offsets=first_loads)
         undisturbed = self.outputs_of_run(one_step)[:, speed_columns]
         amplitudes = np.array([self.probing_amplitude(name) for name in inputs])
         speed_changes = []
         for name in inputs:
-            force = first_courses.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
-            pushed_run = one_step._replace(offsets={**first_courses, name: force})
+            force = first_loads.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
+            pushed_run = one_step._replace(offsets={**first_loads, name: force})
             speed_changes.append(self.outputs_of_run(pushed_run)[1, speed_columns] - undisturbed[1])
         return undisturbed, np.stack(speed_changes, axis=1) / amplitudes
 
-    def _parts_for(
+    def _find_converged_parts(
         self,
         laws: PortLaws,
-        kind: Hashable,
+        motion_key: Hashable,
         step: float,
         outputs_by: Callable[[int], FloatArray],
     ) -> int:
         """Return the number of parts of a step at which a motion with laws has converged.
 
-        Steps are halved until no output changes by more than `CONVERGED` of its largest motion
-        (rms). The number is kept for laws of the same kind that are at most twice as strong.
+        Steps are halved until no output changes by more than `CONVERGENCE_TOLERANCE` of its largest
+        motion (rms). The number is kept for laws of the same kind that are at most twice as strong.
 
         Parameters
         ----------
-        laws : Laws
+        laws : PortLaws
             Internal forces.
-        kind : hashable
+        motion_key : hashable
             Key of everything else that the number depends on.
         step : float
             The whole step [s].
@@ -401,17 +421,17 @@ class FmuSimulator(FmuAtRest):
         strength = float(np.max(np.abs(laws.parameters[:, 0])))
         # the exponents of a law say how rough it is, and rough laws need short steps
         exponents = np.round(np.clip(laws.parameters[:, 1:3], -9.0, 9.0), 1)
-        key = (kind, laws.ports, laws.law_numbers.tobytes(), exponents.tobytes())
+        key = (motion_key, laws.ports, laws.law_numbers.tobytes(), exponents.tobytes())
         refinement = self._refinements.get(key, Refinement(1, 0.0))
         parts = refinement.parts
         if strength <= 2.0 * refinement.strength:
             return parts
-        fine = outputs_by(parts)
+        fine_outputs = outputs_by(parts)
         while parts <= MOST_REFINEMENT:
-            coarse = fine
-            fine = outputs_by(2 * parts)
-            change = _relative_change(coarse, fine)
-            if change <= CONVERGED:
+            coarse_outputs = fine_outputs
+            fine_outputs = outputs_by(2 * parts)
+            change = _relative_change(coarse_outputs, fine_outputs)
+            if change <= CONVERGENCE_TOLERANCE:
                 self._refinements[key] = Refinement(parts, strength)
                 return parts
             parts *= 2
@@ -431,7 +451,7 @@ class Refinement(NamedTuple):
 
 
 class StartState(NamedTuple):
-    """State (n,) of a linear system at the begin, and the memory of laws loaded before."""
+    """State (n,) of a linear system at the start, and the memory of laws loaded before."""
 
     state: FloatArray
     memory: FloatArray | None

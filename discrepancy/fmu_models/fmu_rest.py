@@ -10,7 +10,11 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
-from discrepancy.fmu_models.identified_fmu import LINEAR, RECORD, IdentifiedFmu
+from discrepancy.fmu_models.identified_fmu import (
+    LINEARITY_TOLERANCE,
+    MOST_RECORDED_STEPS,
+    IdentifiedFmu,
+)
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import StaticSolution, static_solution
 from fe.runtime.port_laws import PortLaws
@@ -22,8 +26,8 @@ STATIC_TOLERANCE = 1e-9
 """The iteration ends if it changes the ports by less than this fraction of their displacement."""
 
 
-class RestWithLaws(NamedTuple):
-    """Outputs (L, C) in equilibrium with laws, and the solution of the laws."""
+class EquilibriumWithLaws(NamedTuple):
+    """Outputs (L, C) of an FMU in equilibrium with laws, and the forces of the laws there."""
 
     outputs: FloatArray
     solution: StaticSolution
@@ -44,7 +48,9 @@ class FmuAtRest(IdentifiedFmu):
         super().__init__(description, folder)
         self._rest_is_linear: dict[tuple[str, ...], bool] = {}
 
-    def rest(self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]) -> FloatArray:
+    def solve_rest(
+        self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]
+    ) -> FloatArray:
         """Return the outputs (L, C) at rest, for L states that differ in their inputs.
 
         An FMU without a static solution is stepped until its motion has decayed (`static.settle`).
@@ -62,16 +68,16 @@ class FmuAtRest(IdentifiedFmu):
         if not static.settle:
             return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
-        amounts = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
+        load_values = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
         # the test for linearity, made at the first row, is the strictest at the largest load
-        largest_first = np.argsort(-np.abs(amounts).sum(axis=1), kind="stable")
+        largest_first = np.argsort(-np.abs(load_values).sum(axis=1), kind="stable")
         outputs = {}
         for row in largest_first.tolist():
-            outputs[row] = self._settled_outputs(states[row], amounts[row], names)
+            outputs[row] = self._settled_outputs(states[row], load_values[row], names)
         return np.array([outputs[row] for row in range(len(states))])
 
     def _settled_outputs(
-        self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
+        self, state: OperatingPoint, load_values: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
         """Return the outputs (C,) of the FMU at rest under constant loads on some inputs.
 
@@ -82,44 +88,50 @@ class FmuAtRest(IdentifiedFmu):
         ----------
         state : OperatingPoint
             Parameters and constant inputs.
-        amounts : (E,) array
+        load_values : (E,) array
             The load that is added to each of E inputs.
         names : tuple of str
             The names of these inputs.
         """
         excitation = FmuExcitation(
-            state, self.description.static.step, RECORD, inputs=names, settles=True
+            state,
+            self.description.static.step,
+            MOST_RECORDED_STEPS,
+            inputs=names,
+            decays_to_rest=True,
         )
-        if self._rest_is_linear.get(names) is False:
-            return self._stepped_rest(state, amounts, names)
-        system = self.system(excitation)
+        if not self._rest_is_linear.get(names, True):
+            return self._step_to_rest(state, load_values, names)
+        system = self.linear_system(excitation)
         if system is None:
-            return self._stepped_rest(state, amounts, names)
-        unloaded_outputs = self._stepped_rest(state, 0.0 * amounts, names)
-        added_outputs = system.gain @ amounts
+            return self._step_to_rest(state, load_values, names)
+        unloaded_outputs = self._step_to_rest(state, 0.0 * load_values, names)
+        added_outputs = system.gain @ load_values
         if names not in self._rest_is_linear:
-            answers = [self._answer_to_force(excitation, name) for name in names]
-            largest_answers = [np.max(np.abs(answer), axis=0) for answer in answers]
-            tolerance = LINEAR * (np.abs(added_outputs) + np.abs(amounts) @ largest_answers)
-            loaded_outputs = self._stepped_rest(state, amounts, names)
+            responses = [self._response_to_force(excitation, name) for name in names]
+            largest_responses = [np.max(np.abs(response), axis=0) for response in responses]
+            tolerance = LINEARITY_TOLERANCE * (
+                np.abs(added_outputs) + np.abs(load_values) @ largest_responses
+            )
+            loaded_outputs = self._step_to_rest(state, load_values, names)
             is_linear = bool(
                 np.all(np.abs(loaded_outputs - unloaded_outputs - added_outputs) <= tolerance)
             )
             self._rest_is_linear[names] = is_linear
         if self._rest_is_linear[names]:
             return np.asarray(unloaded_outputs + added_outputs)
-        return self._stepped_rest(state, amounts, names)
+        return self._step_to_rest(state, load_values, names)
 
-    def _stepped_rest(
-        self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
+    def _step_to_rest(
+        self, state: OperatingPoint, load_values: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
         """Step the FMU itself until it is at rest, and return its outputs (C,)."""
-        loads = dict(zip(names, amounts[:, None], strict=True))
-        key = (state, names, amounts.tobytes())
+        loads = dict(zip(names, load_values[:, None], strict=True))
+        key = (state, names, load_values.tobytes())
         step = self.description.static.step
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
-    def flexibility(self, state: OperatingPoint) -> FloatArray:
+    def port_flexibility(self, state: OperatingPoint) -> FloatArray:
         """Return the flexibility (P, P): displacements of ports (rows) per force (columns)."""
         if not self.ports:
             # without ports nothing is wanted, and the FMU may not accept loads of zero
@@ -129,11 +141,11 @@ class FmuAtRest(IdentifiedFmu):
         loads = dict.fromkeys(self.port_inputs, np.zeros(len(probing_forces) + 1))
         for name, force in zip(self.port_inputs, probing_forces, strict=True):
             loads[name] = loads[name] + np.append(0.0, force)
-        outputs = self.rest([state] * (len(probing_forces) + 1), loads)
+        outputs = self.solve_rest([state] * (len(probing_forces) + 1), loads)
         displacements = outputs[:, self.displacement_columns]
         return np.asarray((displacements[1:] - displacements[0]).T / np.diag(probing_forces))
 
-    def at_rest(
+    def solve_rest_with_laws(
         self,
         states: Sequence[OperatingPoint],
         loads: Mapping[str, FloatArray],
@@ -151,7 +163,7 @@ class FmuAtRest(IdentifiedFmu):
             Parameters and constant inputs of each of the L rows.
         loads : mapping of str to (L,) array
             What is added to inputs in each row.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         trial : str
             Name of the trial, for sentences.
@@ -162,29 +174,31 @@ class FmuAtRest(IdentifiedFmu):
             If the FMU refuses a row, a law has no solution, or the FMU does not confirm it.
         """
         try:
-            outputs = self.rest(states, loads)
+            outputs = self.solve_rest(states, loads)
         except ModelError:
-            self._refuse_first_row(states, loads, trial)
+            self._raise_for_refused_row(states, loads, trial)
             raise
         if not len(laws):
             return outputs
 
         def outputs_under(forces: FloatArray) -> FloatArray:
-            return self.rest(states, self.loads_less_laws(loads, laws, forces))
+            return self.solve_rest(states, self.subtract_law_forces(loads, laws, forces))
 
-        return self.rest_with_laws(laws, outputs_under, outputs, states[0], trial).outputs
+        return self.find_equilibrium_with_laws(
+            laws, outputs_under, outputs, states[0], trial
+        ).outputs
 
-    def _refuse_first_row(
+    def _raise_for_refused_row(
         self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray], trial: str
     ) -> None:
         """Raise `ModelError` for the first row of a trial that the FMU refuses by itself."""
         for row, state in enumerate(states):
             row_loads = {name: values[row : row + 1] for name, values in loads.items()}
-            where = f"The trial {trial!r}, row {row + 1} of its table: "
-            with ModelError.instead_of(ModelError, before=where):
-                self.rest([state], row_loads)
+            row_text = f"The trial {trial!r}, row {row + 1} of its table: "
+            with ModelError.instead_of(ModelError, before=row_text):
+                self.solve_rest([state], row_loads)
 
-    def loads_less_laws(
+    def subtract_law_forces(
         self, loads: Mapping[str, FloatArray], laws: PortLaws, forces: FloatArray
     ) -> dict[str, FloatArray]:
         """Return the loads (L,) on each input minus the forces of the laws at its port.
@@ -193,7 +207,7 @@ class FmuAtRest(IdentifiedFmu):
         ----------
         loads : mapping of str to (L,) array
             Loads by input.
-        laws : Laws
+        laws : PortLaws
             J internal forces.
         forces : (L, J) array
             The force of each law in each row.
@@ -204,22 +218,23 @@ class FmuAtRest(IdentifiedFmu):
             remaining[name] = remaining.get(name, 0.0) - force
         return remaining
 
-    def rest_with_laws(
+    def find_equilibrium_with_laws(
         self,
         laws: PortLaws,
         outputs_under: Callable[[FloatArray], FloatArray],
         outputs: FloatArray,
         state: OperatingPoint,
         trial: str,
-    ) -> RestWithLaws:
-        """Return the equilibrium of the FMU with laws, by alternating between both.
+    ) -> EquilibriumWithLaws:
+        """Return the equilibrium of the FMU with laws, by Newton's method.
 
-        Newton's method with the flexibility of one state: the laws are solved for a linear FMU, the
-        FMU is loaded by their forces, and the linear FMU is moved through the point it reaches.
+        In each iteration the equations of the laws are solved for a linear FMU with the flexibility
+        of one state. The FMU is then loaded by the forces of the laws, and the linear FMU is
+        shifted so that it passes through the positions that the FMU reaches.
 
         Parameters
         ----------
-        laws : Laws
+        laws : PortLaws
             J internal forces.
         outputs_under : callable
             Returns the outputs (L, C) at rest under forces (L, J) of the laws.
@@ -237,7 +252,7 @@ class FmuAtRest(IdentifiedFmu):
         """
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
-        compliance = self.flexibility(state)[np.ix_(ports, ports)]
+        compliance = self.port_flexibility(state)[np.ix_(ports, ports)]
         positions_without_laws = outputs[:, columns]
         for _ in range(STATIC_ITERATIONS):
             solution = static_solution(
@@ -251,7 +266,7 @@ class FmuAtRest(IdentifiedFmu):
             positions_without_laws = updated_positions
             largest_position = np.maximum(np.abs(updated_positions).max(axis=1), 1e-300)
             if np.all(largest_change <= STATIC_TOLERANCE * largest_position):
-                return RestWithLaws(outputs, solution)
+                return EquilibriumWithLaws(outputs, solution)
         names = ", ".join(dict.fromkeys(laws.ports))
         level = int(np.argmax(largest_change)) + 1
         raise ModelError(

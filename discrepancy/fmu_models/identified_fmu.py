@@ -1,4 +1,4 @@
-"""An FMU with ports: its linear system, identified from its answers, and its communication step."""
+"""An FMU with ports: its linear system, identified from responses, and its communication step."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -23,33 +23,45 @@ from fmu_asset.client.state_space import FmuStateSpace, realise_state_space
 from fmu_asset.errors import FmuError
 from reporting.memory import ResultCache
 
-LINEAR = 1e-6
+LINEARITY_TOLERANCE = 1e-6
 """Largest deviation from superposition of a linear FMU, as a share of the motion."""
-PHASE = 0.1
+LARGEST_STEP_PHASE = 0.1
 """Longest communication step without laws, as a phase of the first mode [rad]."""
-LEAST_RECORD, RECORD = 64, 600
-"""Least and largest number of steps of a recorded response to a force or a release."""
-SAFE_TURN = 0.8 * np.pi
+LEAST_RECORDED_STEPS = 64
+"""Least number of steps of a recorded response to a force or a release."""
+MOST_RECORDED_STEPS = 600
+"""Largest number of steps of such a response: enough for many periods of the first modes."""
+LARGEST_MODE_PHASE = 0.8 * np.pi
 """Largest phase of a mode in a step that stays below pi as parameters change [rad]."""
 MOST_PARTS = 16
 """Largest number of parts of a sampling interval at which a linear system is looked for."""
-SAME_MOTION = 1e-2
+ALIASING_TOLERANCE = 1e-2
 """Largest difference, relative to the motion, between the linear system and the FMU at half the
 step. A mode whose phase grows by more than pi in a step is aliased to a slower one, and differs
 more."""
-RELEASE = 1e-3
+PROBING_DISPLACEMENT = 1e-3
 """Displacement from which an FMU without ports is released to find its first mode [m]."""
 
 
-class Pace(NamedTuple):
+class StepChoice(NamedTuple):
     """Angular frequency [rad/s] of the first mode, and the communication step [s]."""
 
     angular_frequency: float
     step: float
 
 
-class PacedSystem(NamedTuple):
-    """The system at a step that shows all modes, if the FMU is linear; parts of an interval."""
+class SampledSystem(NamedTuple):
+    """The linear system at a step that shows all modes.
+
+    Attributes
+    ----------
+    system : FmuStateSpace or None
+        The system; None if the FMU is not linear.
+    excitation : FmuExcitation
+        The excitation, with that step.
+    parts : int
+        Number of steps in a sampling interval.
+    """
 
     system: FmuStateSpace | None
     excitation: FmuExcitation
@@ -68,7 +80,7 @@ class IdentifiedFmu(FmuRuns):
 
     Attributes
     ----------
-    nominal : OperatingPoint
+    nominal_point : OperatingPoint
         State of motions at the means of the parameters; set by the model.
     ports, port_inputs : list of str
         Names of the ports, and inputs of their forces.
@@ -78,22 +90,22 @@ class IdentifiedFmu(FmuRuns):
         Parameter or input that releases the FMU, and the parameter of its velocity.
     """
 
-    nominal = OperatingPoint()
+    nominal_point = OperatingPoint()
 
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         self.description = description
         static = description.static
         with self.refusal_context():
-            self.names = FmuVariables(description, folder)
+            self.variables = FmuVariables(description, folder)
             super().__init__(
-                self.names.path,
-                self.names.binding,
+                self.variables.path,
+                self.variables.binding,
                 description.isolated,
                 static.limit,
                 static.tolerance,
             )
             self._check_parameters()
-        names = self.names
+        names = self.variables
         self.ports = [port.name for port in description.port]
         self.port_inputs = [names.variable(port.force) for port in description.port]
         columns = names.columns
@@ -101,7 +113,7 @@ class IdentifiedFmu(FmuRuns):
         self.velocity_columns = [columns.get(f"port.{port}.velocity", -1) for port in self.ports]
         self.release_variables = self._find_release_variables()
         self._is_linear: dict[tuple[Hashable, ...], bool] = {}
-        self._release_sizes: dict[str, float] = {}
+        self._release_amplitudes: dict[str, float] = {}
         self._systems = ResultCache(MOST_SYSTEMS)
         self._paces = ResultCache()
 
@@ -116,30 +128,33 @@ class IdentifiedFmu(FmuRuns):
             settings.append({f"effect.{effect}.active": 1.0})
         settings += [description.static.parameters, description.motion.parameters]
         for setting in settings:
-            by_key = {self.names.parameter(name): value for name, value in setting.items()}
+            by_key = {self.variables.parameter(name): value for name, value in setting.items()}
             self.asset.check_parameters(by_key)
 
     def _find_release_variables(self) -> list[str]:
-        """Return what lets the FMU go, and what gives it a velocity, as far as it has them."""
+        """Return the variables that begin a ring-down, as far as [release] names them.
+
+        They are the parameters of displacement and velocity, and the input of a holding force.
+        """
         release = self.description.release
         if release is None:
             return []
         parameters = [name for name in (release.displacement, release.velocity) if name is not None]
-        variables = [self.names.parameter(name) for name in parameters]
+        variables = [self.variables.parameter(name) for name in parameters]
         if release.hold is not None:
-            variables.append(self.names.variable(release.hold))
+            variables.append(self.variables.variable(release.hold))
         return variables
 
     def refusal_context(self) -> AbstractContextManager[None]:
         """Return the context that adds the model's name to what the FMU refuses."""
         return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 
-    def excitation(
+    def excitation_of(
         self,
         trial: Trial,
         state: OperatingPoint,
         ports: Sequence[str],
-        levers: Mapping[str, float] | None = None,
+        force_factors: Mapping[str, float] | None = None,
     ) -> FmuExcitation:
         """Return the excitation of a trial, still without its force or release.
 
@@ -151,56 +166,63 @@ class IdentifiedFmu(FmuRuns):
             Parameters and constant inputs.
         ports : sequence of str
             Ports at which laws act.
-        levers : mapping of str to float, optional
+        force_factors : mapping of str to float, optional
             Factor of the recorded force by input.
         """
-        levers = levers or {}
+        force_factors = force_factors or {}
         law_inputs = [self.port_inputs[self.ports.index(name)] for name in ports]
-        inputs = tuple(dict.fromkeys([*levers, *law_inputs]))
-        step = self.nominal_pace(trial).step
-        return FmuExcitation(state, step, record_of(trial), inputs, levers)
+        inputs = tuple(dict.fromkeys([*force_factors, *law_inputs]))
+        step = self.nominal_step_choice(trial).step
+        return FmuExcitation(state, step, recorded_step_count(trial), inputs, force_factors)
 
     # ------------------------------------------------------------ its linear system
 
-    def system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
+    def linear_system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the FMU as a linear system; None if it is not linear.
 
         The system is identified from the responses to single forces and releases. The FMU is linear
         if such a system exists, and predicts the response to all of them together.
         """
-        kind = excitation.kind
-        may_be_linear = self.description.superposition and (
-            excitation.inputs or excitation.releases
-        )
-        if not may_be_linear or self._is_linear.get(kind) is False:
+        has_excitation = bool(excitation.inputs or excitation.releases)
+        if not self.description.superposition or not has_excitation:
             return None
-        key = (kind, *excitation.recording)
-        system: FmuStateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
-        if system is not None and kind not in self._is_linear:
-            self._is_linear[kind] = self._predicts(system, excitation, LINEAR)
-        return system if self._is_linear.get(kind) else None
+        linearity_key = excitation.linearity_key
+        if not self._is_linear.get(linearity_key, True):
+            return None
+        system_key = (linearity_key, *excitation.recording_arguments)
+        system: FmuStateSpace | None = self._systems.get(
+            system_key, lambda: self._identify_system(excitation)
+        )
+        if system is None:
+            return None
+        if linearity_key not in self._is_linear:
+            is_linear = self._predicts_motion(system, excitation, LINEARITY_TOLERANCE)
+            self._is_linear[linearity_key] = is_linear
+        return system if self._is_linear[linearity_key] else None
 
-    def _identify(self, excitation: FmuExcitation) -> FmuStateSpace | None:
+    def _identify_system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the linear system with the FMU's responses to unit forces and releases, if any."""
-        answers = [self._answer_to_force(excitation, name) for name in excitation.inputs]
-        answers += [self._answer_to_release(excitation, name) for name in excitation.releases]
-        records = np.stack(answers, axis=2)[1:]
+        responses = [self._response_to_force(excitation, name) for name in excitation.inputs]
+        responses += [self._response_to_release(excitation, name) for name in excitation.releases]
+        records = np.stack(responses, axis=2)[1:]
         return realise_state_space(records, len(excitation.inputs), excitation.step)
 
-    def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (record + 1, C) after a unit force over the first step.
+    def _response_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
+        """Return the outputs (recorded_steps + 1, C) after a unit force over the first step.
 
         The FMU gets a force of the probing amplitude of its input, and the difference of its
         outputs to those without a force is divided by the amplitude.
         """
         amplitude = self.probing_amplitude(name)
-        impulse = amplitude * np.eye(1, excitation.record).ravel()
-        run = FmuRun(*excitation.recording, offsets={name: impulse})
-        key = (*excitation.recording, name, False)
-        return self.cached(key, lambda: self._motion(excitation, run) / amplitude)
+        impulse = amplitude * np.eye(1, excitation.recorded_steps).ravel()
+        run = FmuRun(*excitation.recording_arguments, offsets={name: impulse})
+        key = (*excitation.recording_arguments, name, False)
+        return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
 
-    def _answer_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (record + 1, C) after a release by one unit, relative to no release.
+    def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
+        """Return the outputs (recorded_steps + 1, C) after a release by one unit.
+
+        They are relative to the outputs without a release.
 
         The FMU is released by a usual amount, which is the same in all later calls, and the outputs
         are divided by it.
@@ -208,26 +230,28 @@ class IdentifiedFmu(FmuRuns):
         usual_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
             usual_amplitude = self.probing_amplitude(name)
-        amplitude = self._release_sizes.setdefault(name, usual_amplitude)
-        run = self._run(excitation._replace(force=None), {name: amplitude})
-        key = (*excitation.recording, name, True)
-        return self.cached(key, lambda: self._motion(excitation, run) / amplitude)
+        amplitude = self._release_amplitudes.setdefault(name, usual_amplitude)
+        run = self._run_of_excitation(excitation._replace(force=None), {name: amplitude})
+        key = (*excitation.recording_arguments, name, True)
+        return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
 
     def _is_input(self, name: str) -> bool:
         """Return whether a name is an input of the FMU, not a parameter."""
-        return name in self.names.binding.load
+        return name in self.variables.binding.load
 
-    def _motion(self, excitation: FmuExcitation, run: FmuRun) -> FloatArray:
+    def _motion_of_run(self, excitation: FmuExcitation, run: FmuRun) -> FloatArray:
         """Return the outputs (steps + 1, C) of a run, less those of the undisturbed FMU."""
         return self.outputs_of_run(run) - self._undisturbed_outputs(excitation)
 
     def _undisturbed_outputs(self, excitation: FmuExcitation) -> FloatArray:
         """Return the outputs (C,) at the start if nothing moves the FMU."""
-        state, step, _ = excitation.recording
+        state, step, _ = excitation.recording_arguments
         run = FmuRun(state, step, 0)
         return self.cached((state, step), lambda: self.start_run(run)[1])
 
-    def _predicts(self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
+    def _predicts_motion(
+        self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float
+    ) -> bool:
         """Return whether a linear system predicts the FMU's response to all inputs at once.
 
         The recorded force and the releases act, and random forces on all inputs.
@@ -241,22 +265,22 @@ class IdentifiedFmu(FmuRuns):
         tolerance : float
             Largest error of an output, relative to its largest motion.
         """
-        release_amounts = self._release_amounts_of_system(excitation)
-        run = self._run(excitation, release_amounts)
+        release_values = self._release_values_of_system(excitation)
+        run = self._run_of_excitation(excitation, release_values)
         generator = np.random.default_rng(0)
         forces = {
             name: self.probing_amplitude(name) * generator.uniform(-1.0, 1.0, run.steps)
             for name in excitation.inputs
         }
         forces |= run.offsets
-        motion = self._motion(excitation, run._replace(offsets=forces))
+        motion = self._motion_of_run(excitation, run._replace(offsets=forces))
         # the same motion by the linear system
         time = excitation.step * np.arange(run.steps + 1.0)
         loads = []
         for direction, values in zip(np.eye(len(forces)), forces.values(), strict=True):
             history = RecordedHistory(time, np.append(values, 0.0), Hold.ZERO_ORDER)
             loads.append(Load(direction, history))
-        start = self._start_state(system, excitation, release_amounts)
+        start = self._start_state(system, excitation, release_values)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
         prediction_error = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
         largest_error = np.max(np.abs(prediction_error)[1:], axis=0)
@@ -264,47 +288,47 @@ class IdentifiedFmu(FmuRuns):
 
     # ------------------------------------------------------------ releases
 
-    def _release_amounts_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
+    def _release_values_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
         """Return the release parameters or holding force that give a linear FMU its displacement.
 
         They are scaled by the displacement of the release point per unit.
         """
-        amounts = dict(excitation.releases)
-        column = self.names.columns.get("release")
-        if self.description.release is None or column is None or not amounts:
-            return amounts
-        name, displacement = next(iter(amounts.items()))
+        release_values = dict(excitation.releases)
+        column = self.variables.columns.get("release")
+        if self.description.release is None or column is None or not release_values:
+            return release_values
+        name, displacement = next(iter(release_values.items()))
         if displacement != 0.0:
-            answer = self._answer_to_release(excitation, name)
-            amounts[name] = displacement / float(answer[0, column])
-        return amounts
+            response = self._response_to_release(excitation, name)
+            release_values[name] = displacement / float(response[0, column])
+        return release_values
 
-    def _release_amounts(self, excitation: FmuExcitation) -> dict[str, float]:
+    def _find_release_values(self, excitation: FmuExcitation) -> dict[str, float]:
         """Return the release parameters or holding force that give any FMU its displacement.
 
-        The amount is found by the secant method, with the FMU at the begin of a run.
+        The amount is found by the secant method, with the FMU at the start of a run.
 
         Raises
         ------
         ModelError
             If no amount gives the displacement.
         """
-        amounts = dict(excitation.releases)
-        column = self.names.columns.get("release")
+        release_values = dict(excitation.releases)
+        column = self.variables.columns.get("release")
         release = self.description.release
-        if release is None or column is None or not amounts:
-            return amounts
-        name, displacement = next(iter(amounts.items()))
+        if release is None or column is None or not release_values:
+            return release_values
+        name, displacement = next(iter(release_values.items()))
         if displacement == 0.0:
-            return amounts
+            return release_values
 
         def missing_displacement(amount: float) -> float:
-            at_begin = excitation._replace(force=None, record=0)
-            run = self._run(at_begin, {name: amount})
+            at_begin = excitation._replace(force=None, recorded_steps=0)
+            run = self._run_of_excitation(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
             outputs = self.cached(key, lambda: self.start_run(run)[1])
-            moved = float((outputs - self._undisturbed_outputs(excitation))[column])
-            return moved - displacement
+            displaced = float((outputs - self._undisturbed_outputs(excitation))[column])
+            return displaced - displacement
 
         guess = self.probing_amplitude(name) if self._is_input(name) else displacement
         solution = root_scalar(missing_displacement, x0=0.0, x1=guess, rtol=1e-10, maxiter=20)
@@ -315,43 +339,49 @@ class IdentifiedFmu(FmuRuns):
                 f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or "
                 "output there."
             )
-        return amounts | {name: amount}
+        return release_values | {name: amount}
 
-    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> FmuRun:
+    def _run_of_excitation(
+        self, excitation: FmuExcitation, release_values: Mapping[str, float]
+    ) -> FmuRun:
         """Return the run of the FMU under an excitation, with the given release amounts."""
-        begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
-        parameters = {name: amount for name, amount in amounts.items() if name not in begin}
+        begin = {name: amount for name, amount in release_values.items() if self._is_input(name)}
+        parameters = {name: amount for name, amount in release_values.items() if name not in begin}
         run = FmuRun(
-            excitation.state.with_parameters(parameters), excitation.step, excitation.record, begin
+            excitation.state.with_parameters(parameters),
+            excitation.step,
+            excitation.recorded_steps,
+            begin,
         )
         if excitation.force is None:
             return run
-        for name, lever in excitation.levers.items():
-            begin[name] = lever * excitation.first_force
+        for name, factor in excitation.force_factors.items():
+            begin[name] = factor * excitation.first_force
         # inputs are held constant over a step: they get the mean force of each step
-        time = excitation.step * np.arange(excitation.record + 1.0)
+        time = excitation.step * np.arange(excitation.recorded_steps + 1.0)
         at_begin, at_end = equivalent_ramps(excitation.force.values_at, time)
-        courses = {
-            name: 0.5 * lever * (at_begin + at_end) for name, lever in excitation.levers.items()
+        loads_by_input = {
+            name: 0.5 * factor * (at_begin + at_end)
+            for name, factor in excitation.force_factors.items()
         }
-        return run._replace(offsets=courses)
+        return run._replace(offsets=loads_by_input)
 
     def _start_state(
-        self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
+        self, system: FmuStateSpace, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FloatArray:
-        """Return the state (n,) at the begin of a trial.
+        """Return the state (n,) at the start of a trial.
 
         It is the released state, plus equilibrium under the recorded force at the first sample.
         """
-        start: FloatArray = system.release_states @ np.array([*amounts.values()])
+        start: FloatArray = system.release_states @ np.array([*release_values.values()])
         first_force = excitation.first_force
         if first_force:
-            return start + system.state_at_rest(first_force * excitation.lever_values)
+            return start + system.state_at_rest(first_force * excitation.force_factor_values)
         return start
 
     # ------------------------------------------------------------ pace
 
-    def pace(self, trial: Trial, state: OperatingPoint) -> Pace:
+    def choose_step(self, trial: Trial, state: OperatingPoint) -> StepChoice:
         """Return the first mode of the FMU and the communication step of a trial.
 
         The first mode is the one with the largest flexibility at the first port; without a port,
@@ -361,11 +391,13 @@ class IdentifiedFmu(FmuRuns):
         interval = trial.interval
         releases = {}
         if self.release_variables and not self.ports:
-            releases = {self.release_variables[0]: RELEASE}
+            releases = {self.release_variables[0]: PROBING_DISPLACEMENT}
         inputs = tuple(dict.fromkeys(self.port_inputs))
         if not inputs and not releases:
-            inputs = tuple(self.names.binding.load)[:1]
-        excitation = FmuExcitation(state, interval, record_of(trial), inputs, releases=releases)
+            inputs = tuple(self.variables.binding.load)[:1]
+        excitation = FmuExcitation(
+            state, interval, recorded_step_count(trial), inputs, releases=releases
+        )
         system, excitation, parts = self._system_that_shows_all_modes(excitation, interval)
         # the first mode
         mode = None
@@ -374,35 +406,37 @@ class IdentifiedFmu(FmuRuns):
         frequency = self.description.scales.angular_frequency
         if not frequency:
             frequency = (
-                self._loudest_frequency(excitation) if mode is None else mode.angular_frequency
+                self._dominant_frequency(excitation) if mode is None else mode.angular_frequency
             )
-        least_parts = max(parts, ceil(frequency * interval / PHASE))
-        return Pace(frequency, self.description.motion.step or interval / least_parts)
+        least_parts = max(parts, ceil(frequency * interval / LARGEST_STEP_PHASE))
+        return StepChoice(frequency, self.description.motion.step or interval / least_parts)
 
     def _system_that_shows_all_modes(
         self, excitation: FmuExcitation, interval: float
-    ) -> PacedSystem:
+    ) -> SampledSystem:
         """Return the system identified at a step that samples all modes without aliasing.
 
-        The step is halved until no mode turns by more than `SAFE_TURN` in it, and the system also
-        predicts the FMU at half the step.
+        The step is halved until no mode turns by more than `LARGEST_MODE_PHASE` in it, and the
+        system also predicts the FMU at half the step.
         """
         fixed_step = self.description.motion.step
         parts = 1
         while True:
             excitation = excitation._replace(step=fixed_step or interval / parts)
-            system = self.system(excitation)
+            system = self.linear_system(excitation)
             if system is None or fixed_step or parts > MOST_PARTS:
                 break
             rates, _ = system.modes
             largest_turn = np.max(np.abs(rates.imag)) * excitation.step
             half_step = excitation._replace(step=0.5 * excitation.step)
-            if largest_turn <= SAFE_TURN and self._predicts(system, half_step, SAME_MOTION):
+            if largest_turn <= LARGEST_MODE_PHASE and self._predicts_motion(
+                system, half_step, ALIASING_TOLERANCE
+            ):
                 break
             parts *= 2
-        return PacedSystem(system, excitation, parts)
+        return SampledSystem(system, excitation, parts)
 
-    def _loudest_frequency(self, excitation: FmuExcitation) -> float:
+    def _dominant_frequency(self, excitation: FmuExcitation) -> float:
         """Return the angular frequency of the largest line in the spectrum of a record [rad/s].
 
         Raises
@@ -411,9 +445,9 @@ class IdentifiedFmu(FmuRuns):
             If the FMU does not move.
         """
         if excitation.releases:
-            motion = self._answer_to_release(excitation, next(iter(excitation.releases)))
+            motion = self._response_to_release(excitation, next(iter(excitation.releases)))
         else:
-            motion = self._answer_to_force(excitation, excitation.inputs[0])
+            motion = self._response_to_force(excitation, excitation.inputs[0])
         last_quarter = motion[-len(motion) // 4 :]
         motion = motion - last_quarter.mean(axis=0)
         frequencies, power = periodogram(
@@ -432,12 +466,14 @@ class IdentifiedFmu(FmuRuns):
         loudest = frequencies[np.argmax(power.max(axis=1))]
         return 2.0 * np.pi * float(max(frequencies[1], loudest))
 
-    def nominal_pace(self, trial: Trial) -> Pace:
+    def nominal_step_choice(self, trial: Trial) -> StepChoice:
         """Return the pace in the nominal state: steps do not change while parameters are fitted."""
-        pace: Pace = self._paces.get(trial.interval, lambda: self.pace(trial, self.nominal))
+        pace: StepChoice = self._paces.get(
+            trial.interval, lambda: self.choose_step(trial, self.nominal_point)
+        )
         return pace
 
 
-def record_of(trial: Trial) -> int:
+def recorded_step_count(trial: Trial) -> int:
     """Return the number of steps that are recorded for a trial."""
-    return min(max(len(trial.time), LEAST_RECORD), RECORD)
+    return min(max(len(trial.time), LEAST_RECORDED_STEPS), MOST_RECORDED_STEPS)

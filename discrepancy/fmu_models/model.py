@@ -13,10 +13,10 @@ from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.fmu_motion import FmuSimulator
 from discrepancy.fmu_models.readout import OutputColumns, Readout, SampledOutputs
 from discrepancy.fmu_models.trials import (
-    bare_trial,
     effect_parameters,
     first_trial,
-    release_amounts,
+    release_values,
+    trial_without_readings,
 )
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.load_change import LoadChange, choose_load_place
@@ -30,10 +30,10 @@ from fmu_asset.client.runs import OperatingPoint
 from fmu_asset.client.state_space import FmuStateSpace
 from reporting.words import comma_list
 
-LATEST = 100.0
+LATEST_BEGIN = 100.0
 """If the first stamp is later than this many lengths of the record, the stamps do not count from
-the begin of the trial."""
-TURN = 0.3
+the start of the trial."""
+PHASE_IN_INTERVAL = 0.3
 """Suitable phase of the first mode in a sampling interval [rad]."""
 
 
@@ -70,8 +70,8 @@ class FmuModel(DescribedModel):
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.fmu = FmuSimulator(description, Path(folder))
-        self.names = self.fmu.names
-        super().__init__(description, self.names.quantities)
+        self.variables = self.fmu.variables
+        super().__init__(description, self.variables.quantities)
         inputs = description.inputs
         self.length = description.scales.length
         self.stations = None if self.length is None else (0.0, self.length)
@@ -80,13 +80,13 @@ class FmuModel(DescribedModel):
         if inputs.load_factor is None:
             self.kinds -= {TrialKind.FLIGHT}
         self._parameter_keys = [
-            self.names.parameter(section.variable) for section in description.parameter
+            self.variables.parameter(section.variable) for section in description.parameter
         ]
         self._force_inputs = {
-            place: self.names.variable(name) for place, name in inputs.force.items()
+            place: self.variables.variable(name) for place, name in inputs.force.items()
         }
         self._held_inputs = {
-            section.name: self.names.variable(section.variable) for section in description.input
+            section.name: self.variables.variable(section.variable) for section in description.input
         }
         self.load_places = tuple(self._force_inputs)
         limits = [
@@ -94,7 +94,9 @@ class FmuModel(DescribedModel):
         ]
         self.largest_force = 0.5 * min(limits, default=np.inf)
         mean = Conditions(self.prior_mean())
-        self.fmu.nominal = self._state(bare_trial(TrialKind.RINGDOWN, 1.0), mean)
+        self.fmu.nominal_point = self._operating_point(
+            trial_without_readings(TrialKind.RINGDOWN, 1.0), mean
+        )
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -139,7 +141,7 @@ class FmuModel(DescribedModel):
                 static_stiffness=stiffness.static,
             )
         file_scales = self.description.scales
-        campaign_sizes = campaign.sizes
+        campaign_sizes = campaign.largest_magnitudes
         return Scales(
             length=file_scales.length or 1.0,
             tip_stiffness=file_scales.tip_stiffness or load_point.static,
@@ -157,7 +159,7 @@ class FmuModel(DescribedModel):
         largest = np.zeros(len(self.ports))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                port_displacements = self._motion(
+                port_displacements = self._sampled_motion(
                     trial, conditions, NO_PATCH, self._port_columns()
                 ).values
             else:
@@ -172,12 +174,16 @@ class FmuModel(DescribedModel):
 
         Otherwise the static stiffness stands for both.
         """
-        static_trial = first_trial(campaign, is_dynamic=False) or bare_trial(TrialKind.STATIC, 1.0)
-        compliance = np.diag(self.fmu.flexibility(self._state(static_trial, conditions)))
+        static_trial = first_trial(campaign, is_dynamic=False)
+        if static_trial is None:
+            static_trial = trial_without_readings(TrialKind.STATIC, 1.0)
+        static_state = self._operating_point(static_trial, conditions)
+        compliance = np.diag(self.fmu.port_flexibility(static_state))
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
-            state = self._state(dynamic_trial, conditions)
-            system = self.fmu.system(self.fmu.excitation(dynamic_trial, state, self.ports))
+            state = self._operating_point(dynamic_trial, conditions)
+            excitation = self.fmu.excitation_of(dynamic_trial, state, self.ports)
+            system = self.fmu.linear_system(excitation)
             if system is not None:
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
@@ -197,16 +203,16 @@ class FmuModel(DescribedModel):
             return frequency
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
-            state = self._state(dynamic_trial, conditions)
-            return self.fmu.pace(dynamic_trial, state).angular_frequency or 1.0
+            state = self._operating_point(dynamic_trial, conditions)
+            return self.fmu.choose_step(dynamic_trial, state).angular_frequency or 1.0
         if campaign.trials:
             return 1.0
         # without a campaign: adapt the sampling interval to the frequency, in three rounds
         interval = 0.01
         for _ in range(3):
-            trial = bare_trial(TrialKind.RINGDOWN, interval)
-            frequency = self.fmu.pace(trial, self.fmu.nominal).angular_frequency
-            interval = TURN / frequency
+            trial = trial_without_readings(TrialKind.RINGDOWN, interval)
+            frequency = self.fmu.choose_step(trial, self.fmu.nominal_point).angular_frequency
+            interval = PHASE_IN_INTERVAL / frequency
         return frequency or 1.0
 
     def _load_point_stiffness(self, stiffnesses: list[PortStiffness]) -> PortStiffness:
@@ -229,7 +235,7 @@ class FmuModel(DescribedModel):
         """
         columns = self._output_columns(outputs)
         if trial.is_dynamic:
-            sampled = self._motion(trial, conditions, patch, columns)
+            sampled = self._sampled_motion(trial, conditions, patch, columns)
             return Response(sampled.values, sampled.rates)
         if any(quantity.order > 0 for _, quantity in outputs):
             raise ModelError(
@@ -243,14 +249,14 @@ class FmuModel(DescribedModel):
         derivatives = [
             quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs
         ]
-        return OutputColumns([self.names.columns[output] for output, _ in outputs], derivatives)
+        return OutputColumns([self.variables.columns[output] for output, _ in outputs], derivatives)
 
     def _port_columns(self) -> OutputColumns:
         """Return the columns of the ports' displacements."""
         columns = self.fmu.displacement_columns
         return OutputColumns(columns, [0] * len(columns))
 
-    def _motion(
+    def _sampled_motion(
         self,
         trial: Trial,
         conditions: Conditions,
@@ -271,19 +277,19 @@ class FmuModel(DescribedModel):
         parts : int
             Factor on the number of samples of the trial.
         """
-        laws = self._laws(patch)
-        times = subdivide(conditions.stamps(trial.time), parts)
+        laws = self._laws_at_ports(patch)
+        times = subdivide(conditions.motion_times(trial.time), parts)
         first_stamp = float(trial.time[0])
         record_length = float(trial.time[-1]) - first_stamp
         # An FMU begins at time zero. If the stamps count from elsewhere (a time of day), they are
         # shifted, since the FMU would have to be simulated from there.
-        begins_near_zero = 0.0 <= first_stamp <= LATEST * record_length
+        begins_near_zero = 0.0 <= first_stamp <= LATEST_BEGIN * record_length
         if trial.kind is not TrialKind.RINGDOWN and not begins_near_zero:
             trial = replace(trial, time=trial.time - first_stamp)
             times = times - first_stamp
-        excitation = self._excitation(trial, conditions, patch, laws)
+        excitation = self._excitation_of_trial(trial, conditions, patch, laws)
         readout = Readout(columns.columns, columns.derivatives, times)
-        return self.fmu.motion(excitation, trial, laws, readout, conditions.refinement)
+        return self.fmu.simulate_motion(excitation, trial, laws, readout, conditions.refinement)
 
     def _outputs_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
@@ -291,8 +297,8 @@ class FmuModel(DescribedModel):
         """Return all outputs (N, C) of a static trial or a flight."""
         loads = self._loads_at_rest(trial, conditions, patch)
         rows = range(len(trial.time))
-        states = [self._state(trial, conditions, patch, row) for row in rows]
-        return self.fmu.at_rest(states, loads, self._laws(patch), trial.name)
+        states = [self._operating_point(trial, conditions, patch, row) for row in rows]
+        return self.fmu.solve_rest_with_laws(states, loads, self._laws_at_ports(patch), trial.name)
 
     def _loads_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
@@ -308,19 +314,21 @@ class FmuModel(DescribedModel):
                     "name it in [[input]]."
                 )
             variable = self._held_inputs[recorded.name]
-            loads[variable] = self.names.input_factors[variable] * (recorded.values + offset)
+            loads[variable] = self.variables.input_factors[variable] * (recorded.values + offset)
         if trial.kind is TrialKind.FLIGHT:
             load_factor = str(self.description.inputs.load_factor)
-            return {self.names.variable(load_factor): trial.load_factor}
+            return {self.variables.variable(load_factor): trial.load_factor}
         if not loads or np.any(trial.force):
             force = self._load_change(patch).apply_to(trial.force, trial.force)
-            for name, lever in self._levers(trial, patch).items():
-                loads[name] = force * lever
+            for name, factor in self._force_factors(trial, patch).items():
+                loads[name] = force * factor
         return loads
 
     # ------------------------------------------------------------ ports
 
-    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    def _ported_system(
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray
+    ) -> PortedSystem:
         """Return the linear system from missing forces to outputs, in the prior mean's coordinates.
 
         Raises
@@ -329,24 +337,24 @@ class FmuModel(DescribedModel):
             If the FMU is not linear, or no system can be identified from its responses to forces at
             the ports.
         """
-        at_mean = self._system_at(trial, self.prior_mean())
-        system = self._system_at(trial, parameters)
+        mean_system = self._system_with_parameters(trial, self.prior_mean())
+        system = self._system_with_parameters(trial, parameters)
         displacement_columns = self.fmu.displacement_columns
         is_usable = (
-            at_mean is not None
+            mean_system is not None
             and system is not None
-            and len(at_mean.input_matrix) == len(system.input_matrix)
+            and len(mean_system.input_matrix) == len(system.input_matrix)
             and not system.has_jumping_speed(
                 np.array(displacement_columns, dtype=np.int64), np.arange(len(displacement_columns))
             )
         )
-        if at_mean is None or system is None or not is_usable:
+        if mean_system is None or system is None or not is_usable:
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how "
                 "its ports move; it is not linear, or they are too few or too rough, or speeds "
                 "jump with forces."
             )
-        system = system.in_coordinates_of(at_mean)
+        system = system.in_coordinates_of(mean_system)
         positions, _ = system.output_rows(displacement_columns, 0)
         speeds, _ = system.output_rows(displacement_columns, 1)
         columns = self._output_columns(outputs)
@@ -361,44 +369,46 @@ class FmuModel(DescribedModel):
             through=direct.T,
         )
 
-    def _system_at(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
+    def _system_with_parameters(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
         """Return the linear system at values of the parameters; None if the FMU is not linear."""
         conditions = Conditions(parameters, health=trial.health[:1])
-        state = self._state(trial, conditions, self.patch)
-        return self.fmu.system(self.fmu.excitation(trial, state, self.ports))
+        state = self._operating_point(trial, conditions, self.patch)
+        return self.fmu.linear_system(self.fmu.excitation_of(trial, state, self.ports))
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         without_laws = self.patch.without(PortForce)
-        return self._motion(trial, conditions, without_laws, self._port_columns(), parts)
+        return self._sampled_motion(trial, conditions, without_laws, self._port_columns(), parts)
 
     # ------------------------------------------------------------ trials in the FMU's terms
 
-    def _laws(self, patch: ModelPatch) -> PortLaws:
+    def _laws_at_ports(self, patch: ModelPatch) -> PortLaws:
         """Return the laws of a patch at the ports."""
         return port_laws(patch.of(PortForce), self.ports)
 
     def _load_change(self, patch: ModelPatch) -> LoadChange:
         """Return the change of loads by those primitives that the FMU does not simulate itself."""
         effects = self.description.effects
-        return LoadChange.of_patch(item for item in patch if item.kind not in effects)
+        return LoadChange.from_patch(
+            primitive for primitive in patch if primitive.kind not in effects
+        )
 
-    def _excitation(
+    def _excitation_of_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: PortLaws
     ) -> FmuExcitation:
         """Return what moves the FMU in a dynamic trial."""
-        state = self._state(trial, conditions, patch)
+        state = self._operating_point(trial, conditions, patch)
         if trial.kind is TrialKind.RINGDOWN:
-            excitation = self.fmu.excitation(trial, state, laws.ports)
-            return excitation._replace(releases=release_amounts(self.fmu, trial, conditions))
-        levers = self._levers(trial, patch)
-        excitation = self.fmu.excitation(trial, state, laws.ports, levers)
+            excitation = self.fmu.excitation_of(trial, state, laws.ports)
+            return excitation._replace(releases=release_values(self.fmu, trial, conditions))
+        force_factors = self._force_factors(trial, patch)
+        excitation = self.fmu.excitation_of(trial, state, laws.ports, force_factors)
         force = self._load_change(patch).apply_to(trial.force, trial.force)
         return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
 
-    def _levers(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
+    def _force_factors(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
         """Return the factor of the recorded force on each input of the FMU.
 
         It is one for the force input of the load place. If a patch moves the load, its bending
@@ -411,16 +421,18 @@ class FmuModel(DescribedModel):
                 f"The FMU model {self.name!r} names no torque in [inputs], so no load moves along "
                 "the chord."
             )
-        where = f"the trial {trial.name!r}"
-        place = choose_load_place([*self._force_inputs], trial.load_place, self.what, where)
-        levers = {self._force_inputs[place]: 1.0}
+        trial_text = f"the trial {trial.name!r}"
+        place = choose_load_place(
+            [*self._force_inputs], trial.load_place, self.quoted_name, trial_text
+        )
+        force_factors = {self._force_inputs[place]: 1.0}
         if inputs.bending_moment is not None and change.along_span:
-            levers[self.names.variable(inputs.bending_moment)] = change.along_span
+            force_factors[self.variables.variable(inputs.bending_moment)] = change.along_span
         if inputs.torque is not None and change.along_chord:
-            levers[self.names.variable(inputs.torque)] = change.along_chord
-        return levers
+            force_factors[self.variables.variable(inputs.torque)] = change.along_chord
+        return force_factors
 
-    def _state(
+    def _operating_point(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
     ) -> OperatingPoint:
         """Return the parameters and constant inputs of the FMU in a row of a trial.
@@ -436,10 +448,10 @@ class FmuModel(DescribedModel):
         row : int
             Row of a trial at rest; a dynamic trial is in the state of its first sample.
         """
-        names = self.names
+        names = self.variables
         # inputs
         sections = self.description.inputs
-        losses = self.losses(trial, conditions.health)
+        losses = self.region_losses(trial, conditions.health)
         row_losses = losses[min(row, len(losses) - 1)]
         inputs: dict[str, float] = {}
         for name, loss in zip(sections.regions.values(), row_losses, strict=True):
@@ -453,5 +465,7 @@ class FmuModel(DescribedModel):
         parameters = {names.parameter(name): value for name, value in table.parameters.items()}
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
-        parameters |= effect_parameters(patch, self.description.effects, parameters, self.what)
+        parameters |= effect_parameters(
+            patch, self.description.effects, parameters, self.quoted_name
+        )
         return OperatingPoint((), tuple(sorted(inputs.items()))).with_parameters(parameters)

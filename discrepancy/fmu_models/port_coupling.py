@@ -24,7 +24,7 @@ class PortCoupling:
 
     Parameters
     ----------
-    laws : Laws
+    laws : PortLaws
         The laws.
     ports : sequence of str
         Names of their ports.
@@ -70,7 +70,7 @@ class PortCoupling:
         # arrays of state and results, which each step overwrites
         self._has_memory = memory is not None
         memory = laws.unloaded_memory() if memory is None else memory
-        self._state = ModalState(np.zeros(count), np.zeros(count), memory)
+        self._operating_point = ModalState(np.zeros(count), np.zeros(count), memory)
         self._results = ModalMotion(
             q=np.zeros((2, count)),
             v=np.zeros((2, count)),
@@ -95,8 +95,8 @@ class PortCoupling:
             The accelerations of the ports without the laws, constant during the step.
         """
         h = self._step
-        self._state.q[:] = positions
-        self._state.v[:] = speeds
+        self._operating_point.q[:] = positions
+        self._operating_point.v[:] = speeds
         self._steps.increment[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
         self._steps.begin_force[:] = accelerations
         self._steps.end_force[:] = accelerations
@@ -108,9 +108,9 @@ class PortCoupling:
             True,
             self._has_memory,
             self._law_arrays,
-            tuple(self._state),
+            tuple(self._operating_point),
             tuple(self._results),
         )
         self._has_memory = True
         speeds_without_laws = speeds + h * accelerations
-        return speeds_without_laws - self._state.v
+        return speeds_without_laws - self._operating_point.v

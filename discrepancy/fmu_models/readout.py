@@ -43,8 +43,8 @@ class Readout:
     times: FloatArray
 
 
-def sample(
-    values: FloatArray, step: float, readout: Readout, still_to_derive: Sequence[int]
+def sample_by_splines(
+    values: FloatArray, step: float, readout: Readout, remaining_derivatives: Sequence[int]
 ) -> SampledOutputs:
     """Return values and rates of outputs at given times, by splines through an even time grid.
 
@@ -56,21 +56,23 @@ def sample(
         Step of the grid [s].
     readout : Readout
         Outputs and times. Before time zero the first value holds, at zero rate.
-    still_to_derive : sequence of int
-        For each column, how many times the values are still to be differentiated.
+    remaining_derivatives : sequence of int
+        How many times each column of `values` is differentiated here. It is zero if the values
+        are the wanted derivatives already.
     """
     grid = step * np.arange(len(values))
     curve = CubicSpline(grid, values)
-    inside = np.clip(readout.times, 0.0, grid[-1])
-    sampled = curve(inside)
-    rates = curve(inside, 1)
-    for column, order in enumerate(still_to_derive):
+    clipped_times = np.clip(readout.times, 0.0, grid[-1])
+    sampled = curve(clipped_times)
+    rates = curve(clipped_times, 1)
+    for column, order in enumerate(remaining_derivatives):
         if order > 0:
             # A second derivative of a spline is inaccurate. A new spline through the first
-            # derivatives is as accurate as the first one.
+            # derivatives is as accurate as the first one. It is differentiated once less.
             derivative = CubicSpline(grid, curve(grid, 1)[:, column])
-            sampled[:, column] = derivative(inside, order - 1)
-            rates[:, column] = derivative(inside, order)
+            sampled[:, column] = derivative(clipped_times, order - 1)
+            rates[:, column] = derivative(clipped_times, order)
+    # before time zero outputs rest, so that their derivatives are zero
     is_before = readout.times < 0.0
     rates[is_before] = 0.0
     sampled[np.ix_(is_before, np.array(readout.derivatives) > 0)] = 0.0

@@ -19,31 +19,31 @@ from fmu_asset.client.state_space import FmuStateSpace
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""
-ROUNDING = 1e-9
+COMPLIANCE_ROUNDING = 1e-9
 """An instantaneous displacement below this fraction of the static one is a rounding error."""
 NO_INDICES: IntArray = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class LawPorts:
-    """Where J laws act on a system.
+    """The outputs and forces of a system that belong to the ports of J laws.
 
     Attributes
     ----------
     columns : (J,) ndarray of int
-        Output of the system that is the displacement of each law's port.
-    force_numbers : (J,) ndarray of int
-        Force of the system at each law's port.
+        Index of the system's output that is the displacement of each law's port.
+    force_indices : (J,) ndarray of int
+        Index of the system's force at each law's port.
     rest_positions : (J,) ndarray
         Position of each law's port at a state of zero and without forces.
     """
 
     columns: IntArray
-    force_numbers: IntArray
+    force_indices: IntArray
     rest_positions: FloatArray
 
 
-NO_PORTS = LawPorts(NO_INDICES, NO_INDICES, np.zeros(0))
+WITHOUT_PORTS = LawPorts(NO_INDICES, NO_INDICES, np.zeros(0))
 
 
 class SystemMotion(NamedTuple):
@@ -58,7 +58,7 @@ def system_motion(
     excitation: Excitation,
     start: FloatArray,
     laws: PortLaws = NO_LAWS,
-    ports: LawPorts = NO_PORTS,
+    ports: LawPorts = WITHOUT_PORTS,
     refinement: int = 1,
     memory: FloatArray | None = None,
 ) -> SystemMotion:
@@ -75,7 +75,7 @@ def system_motion(
         Forces, with directions (E,).
     start : (n,) array
         State at the first time.
-    laws : Laws
+    laws : PortLaws
         J internal forces.
     ports : LawPorts
         Where they act.
@@ -84,8 +84,8 @@ def system_motion(
     memory : array, optional
         Memory of the laws at the first time; by default they were loaded from zero at once.
     """
-    coupled = _with_ports(
-        system, laws.ports, tuple(ports.columns.tolist()), tuple(ports.force_numbers.tolist())
+    coupled = _system_with_ports(
+        system, laws.ports, tuple(ports.columns.tolist()), tuple(ports.force_indices.tolist())
     )
     modal = coupled.modal
     # steps under the forces
@@ -95,14 +95,14 @@ def system_motion(
         excitation.sample_times,
         refinement,
         SMOOTH_PARTS if excitation.is_smooth else 1,
-        excitation.edges,
+        excitation.jump_times,
     )
     begin_force, end_force = equivalent_ramps(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
     )
     direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
     steps = loaded_steps(modal, boundaries, begin_force, end_force, direct_displacement)
-    # position and speed of the ports at the begin, from the state
+    # position and speed of the ports at the start, from the state
     port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions
@@ -115,7 +115,7 @@ def system_motion(
     motion = integrate_motion(modal, laws, steps, initial_motion, compiled_kernel())
     # all forces on the system: the excitation minus those of the laws
     forces = excitation.loads_at(excitation.sample_times, np.eye(system.input_matrix.shape[1]))
-    np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)
+    np.subtract.at(forces.T, ports.force_indices, motion.port_forces.T)
     return SystemMotion(motion.v[:, len(positions) :], forces)
 
 
@@ -138,7 +138,7 @@ class SystemWithPorts(NamedTuple):
 
 
 @lru_cache(maxsize=MOST_SYSTEMS)
-def _with_ports(
+def _system_with_ports(
     system: FmuStateSpace,
     names: tuple[str, ...],
     columns: tuple[int, ...],
@@ -173,7 +173,9 @@ def _with_ports(
         np.zeros(port_count + state_count),
         damping,
         dict(zip(port_names, np.eye(port_count, port_count + state_count), strict=True)),
-        np.where(direct_compliance > ROUNDING * static_compliance, direct_compliance, 0.0),
+        np.where(
+            direct_compliance > COMPLIANCE_ROUNDING * static_compliance, direct_compliance, 0.0
+        ),
         actions=dict(zip(port_names, directions.T[port_forces], strict=True)),
     )
     return SystemWithPorts(directions, modal, first_laws)

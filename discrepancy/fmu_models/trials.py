@@ -60,13 +60,13 @@ def first_trial(campaign: Campaign, *, is_dynamic: bool) -> Trial | None:
     return None
 
 
-def bare_trial(kind: TrialKind, interval: float) -> Trial:
+def trial_without_readings(kind: TrialKind, interval: float) -> Trial:
     """Return a trial without readings, for scales without a campaign."""
     count = 1 if kind is TrialKind.STATIC else 400
     return Trial.plain("", kind, (), interval * np.arange(float(count)))
 
 
-def release_amounts(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
+def release_values(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
     """Return the variables that release an FMU, each with its displacement [m] or velocity [m/s].
 
     Raises
@@ -90,6 +90,6 @@ def release_amounts(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> 
             f"{fmu.description.name!r} can follow only if [release] names parameters of "
             "displacement and velocity."
         )
-    frequency = fmu.nominal_pace(trial).angular_frequency
+    frequency = fmu.nominal_step_choice(trial).angular_frequency
     amplitudes = release.displacement * first_mode * (1.0, frequency)
     return dict(zip(variables, amplitudes.tolist(), strict=True))

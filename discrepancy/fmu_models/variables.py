@@ -72,7 +72,7 @@ class FmuVariables:
         else:
             base = load_binding(file)
         self._variables = _variables_by_name(base)
-        self._parameter_keys = {item.variable: key for key, item in base.parameter.items()}
+        self._parameter_keys = {variable.variable: key for key, variable in base.parameter.items()}
         self._parameter_keys |= {key: key for key in base.parameter}
         # what the model needs
         self.input_factors: dict[str, float] = {}
@@ -80,10 +80,10 @@ class FmuVariables:
         loads = self._bound_inputs()
         parameters = self._bound_parameters(base.parameter)
         observed = self._observed_variables()
-        self.columns = {item.name: column for column, item in enumerate(observed)}
+        self.columns = {variable.name: column for column, variable in enumerate(observed)}
         outputs = VectorBinding(
-            variables=tuple(item.variable for item in observed),
-            unit=tuple(item.unit for item in observed),
+            variables=tuple(variable.variable for variable in observed),
+            unit=tuple(variable.unit for variable in observed),
         )
         header = base.with_header(name=description.name, step_size=step, decimation=1)
         self.binding = Binding(
@@ -137,14 +137,16 @@ class FmuVariables:
         return bound
 
     def _bound_parameters(
-        self, known: Mapping[str, ParameterBinding]
+        self, known_bindings: Mapping[str, ParameterBinding]
     ) -> dict[str, ParameterBinding]:
         """Return the parameters that the binding does not have, or has in another unit.
 
         The value and the range that the binding has in another unit are left out.
         """
         description = self._description
-        units: dict[str | None, str] = {item.variable: item.unit for item in description.parameter}
+        units: dict[str | None, str] = {
+            section.variable: section.unit for section in description.parameter
+        }
         if description.release is not None:
             units[description.release.displacement] = "m"
             units[description.release.velocity] = "m/s"
@@ -153,8 +155,8 @@ class FmuVariables:
             if name is None:
                 continue
             key = self.parameter(name)
-            if key not in known or unit != known[key].unit:
-                variable = known[key].variable if key in known else key
+            if key not in known_bindings or unit != known_bindings[key].unit:
+                variable = known_bindings[key].variable if key in known_bindings else key
                 bound[key] = ParameterBinding(variable=variable, unit=unit)
         return bound
 
@@ -212,7 +214,7 @@ def _variables_by_name(binding: Binding) -> dict[str, str]:
     """Return the variables of the FMU by the names of a binding, with and without their role."""
     variables: dict[str, str] = {}
     for role in ("monitor", "load", "health", "control"):
-        for key, item in getattr(binding, role).items():
-            variables[key] = item.variable
-            variables[f"{role}.{key}"] = item.variable
+        for key, variable in getattr(binding, role).items():
+            variables[key] = variable.variable
+            variables[f"{role}.{key}"] = variable.variable
     return variables

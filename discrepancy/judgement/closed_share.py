@@ -13,7 +13,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Channel, FloatArray
 from discrepancy.campaign.units import UNITS
-from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
 from discrepancy.proof_record import ClosedShare
 from reporting.words import counted
 
@@ -33,7 +33,7 @@ CHANNELS_MENTIONED = 3
 """Number of channels whose errors a sentence mentions: those with the largest error before."""
 
 
-def with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
+def residuals_with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
     """Return residuals with the noise deviation of a reference, to compare two hypotheses.
 
     The noise deviations of the two differ in channels without a noise record: there they are
@@ -148,9 +148,9 @@ def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
 def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
     """Return the rms residual of each channel with a used sample [unit of the channel]."""
     rms: dict[str, float] = {}
-    for name in residuals.measured:
+    for name in residuals.channel_names:
         squares = []
-        for fitted, column, used in of_channel(residuals.trials, name):
+        for fitted, column, used in channel_fits(residuals.trials, name):
             squares.append(fitted.residual[used, column] ** 2)
         all_squares = np.concatenate(squares)
         if all_squares.size:
@@ -161,15 +161,15 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
 # ---------------------------------------------------------------- words
 
 
-def share_text(closed: ClosedShare) -> str:
+def percent_with_interval(closed: ClosedShare) -> str:
     """Return a share in percent with its interval, if it has one, as in "93.1 % (91 to 95)"."""
     interval = ""
     if isfinite(closed.low) and isfinite(closed.high):
-        interval = f" ({_percent(closed.low)} to {_percent(closed.high)})"
-    return f"{_percent(closed.value)} %{interval}"
+        interval = f" ({_percent_text(closed.low)} to {_percent_text(closed.high)})"
+    return f"{_percent_text(closed.value)} %{interval}"
 
 
-def _percent(share: float) -> str:
+def _percent_text(share: float) -> str:
     """Return a share in percent, with more digits if it would be rounded to 100."""
     percent = 100.0 * share
     if 99.95 <= percent < 100.0:
@@ -177,7 +177,7 @@ def _percent(share: float) -> str:
     return f"{percent:.3g}"
 
 
-def trials_text(closed: ClosedShare) -> str:
+def compared_trials_text(closed: ClosedShare) -> str:
     """Return in words the trials that a share refers to."""
     role = "not fitted" if closed.trials == "held-out" else "fitted"
     if closed.trial_count == 1:
@@ -185,7 +185,7 @@ def trials_text(closed: ClosedShare) -> str:
     return f"{counted(closed.trial_count, 'trial')} that were {role}"
 
 
-def errors_text(
+def rms_errors_text(
     channels: Mapping[str, Channel], before: Mapping[str, float], after: Mapping[str, float]
 ) -> str:
     """Return rms errors before and after in the units of their channels, as in "x 3.6 to 0.95 mm".
@@ -198,7 +198,10 @@ def errors_text(
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
     # the largest error over its noise first
-    names = sorted(before, key=lambda name: -before[name] / _noise_of(channels[name], before[name]))
+    names = sorted(
+        before,
+        key=lambda name: -before[name] / _recorded_noise_or_fallback(channels[name], before[name]),
+    )
     parts = []
     for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
@@ -212,13 +215,13 @@ def errors_text(
     return ", ".join(parts)
 
 
-def _noise_of(channel: Channel, fallback: float) -> float:
+def _recorded_noise_or_fallback(channel: Channel, fallback: float) -> float:
     """Return the recorded noise deviation of a channel, or a fallback without a record; never 0."""
     recorded = channel.noise.standard_deviation if channel.noise is not None else 0.0
     return recorded or fallback or 1.0
 
 
-def closed_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) -> str:
+def closed_share_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) -> str:
     """Return the share as a clause, such as "it explains 93 % of the mean square error in ...".
 
     Parameters
@@ -230,12 +233,13 @@ def closed_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) ->
     """
     compared_before, compared_after = compared_trials(before, after, closed)
     rms_before = rms_by_channel(compared_before)
-    errors = errors_text(before.channels, rms_before, rms_by_channel(compared_after))
-    trials = trials_text(closed)
-    if closed.grew:
+    errors = rms_errors_text(before.channels, rms_before, rms_by_channel(compared_after))
+    trials = compared_trials_text(closed)
+    if closed.has_grown:
         return f"it makes the error in {trials} larger (rms of {errors})"
     return (
-        f"it explains {share_text(closed)} of the mean square error in {trials} (rms of {errors})"
+        f"it explains {percent_with_interval(closed)} of the mean square error in {trials} "
+        f"(rms of {errors})"
     )
 
 

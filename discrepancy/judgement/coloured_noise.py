@@ -35,15 +35,13 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
     conclusion = Conclusion.from_probabilities(search, best, probabilities)
     no_effect_gate = check_absolute_fit(problem, no_effect)
     probability_of_none = probabilities.get((), 0.0)
-    is_possible = probability_of_none > 1.0 - SEARCH.sure
-    if is_possible and no_effect_gate.passed is not False and _leaves_recorded_colour(no_effect):
-        return _nothing_under_coloured_noise(
-            conclusion, no_effect, no_effect_gate, probability_of_none
-        )
+    is_possible = probability_of_none > 1.0 - SEARCH.name_probability
+    if is_possible and not no_effect_gate.has_failed and _residuals_have_recorded_colour(no_effect):
+        return _nothing_missing_outcome(conclusion, no_effect, no_effect_gate, probability_of_none)
     if (
         not best.candidate.terms
         or best.candidate.has_free_shape
-        or not _leaves_recorded_colour(best)
+        or not _residuals_have_recorded_colour(best)
     ):
         return None
     probability = comparison.probability(best)
@@ -53,12 +51,14 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
         check_consistency(problem, best),
         check_held_out(held_out_residuals),
     )
-    if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
+    if probability < SEARCH.name_probability or any(gate.has_failed for gate in gates):
         return None
-    return conclusion.named(best, probability, gates, remainder_estimates(problem, best))
+    return conclusion.build_named_outcome(
+        best, probability, gates, remainder_estimates(problem, best)
+    )
 
 
-def _nothing_under_coloured_noise(
+def _nothing_missing_outcome(
     conclusion: Conclusion, no_effect: CandidateFit, gate: Gate, probability_of_none: float
 ) -> VerdictOutcome:
     """Return the verdict that nothing is missing, or that it is too small to be detected.
@@ -75,8 +75,8 @@ def _nothing_under_coloured_noise(
         The probability that no effect is missing.
     """
     remainders = remainder_estimates(conclusion.search.problem, no_effect)
-    if probability_of_none >= SEARCH.unsure:
-        return conclusion.outcome(
+    if probability_of_none >= SEARCH.inconclusive_probability:
+        return conclusion.build_outcome(
             VerdictKind.NOTHING_MISSING,
             "The model explains the data within their noise, which is coloured as its records "
             "admit.",
@@ -86,14 +86,16 @@ def _nothing_under_coloured_noise(
             remainders=remainders,
         )
     possible_effects = []
-    for name, probability in conclusion.inclusion.items():
-        if probability > 1.0 - SEARCH.sure:
+    for name, probability in conclusion.inclusion_probabilities.items():
+        if probability > 1.0 - SEARCH.name_probability:
             possible_effects.append(name)
     possible_effects.sort()
     total_probability = min(
-        probability_of_none + sum(conclusion.inclusion[name] for name in possible_effects), 1.0
+        probability_of_none
+        + sum(conclusion.inclusion_probabilities[name] for name in possible_effects),
+        1.0,
     )
-    return conclusion.outcome(
+    return conclusion.build_outcome(
         VerdictKind.BELOW_LIMIT,
         below_limit_sentence(possible_effects, " that is coloured"),
         total_probability,
@@ -104,7 +106,7 @@ def _nothing_under_coloured_noise(
     )
 
 
-def _leaves_recorded_colour(fit: CandidateFit) -> bool:
+def _residuals_have_recorded_colour(fit: CandidateFit) -> bool:
     """Return whether all residuals of a fit are noise, correlated as in the noise records."""
     process = fit.residual_process
     return process is not None and process.is_all_recorded_colour

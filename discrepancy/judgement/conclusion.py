@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, TrialKind
-from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
+from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
@@ -124,18 +124,18 @@ class Conclusion:
         return cls(search, log_bayes_factor, hypotheses)
 
     @cached_property
-    def inclusion(self) -> dict[str, float]:
+    def inclusion_probabilities(self) -> dict[str, float]:
         """The probability of each effect to be one of the missing effects, by its identifier."""
         inclusion = {}
         for effect in self.search.effects:
             total: float = 0
             for hypothesis, probability in self.hypotheses:
-                if effect.identifier in plain_names(hypothesis.candidate.identifiers):
+                if effect.identifier in names_without_free_shape(hypothesis.candidate.identifiers):
                     total += probability
             inclusion[effect.identifier] = total
         return inclusion
 
-    def outcome(
+    def build_outcome(
         self,
         kind: VerdictKind,
         sentence: str,
@@ -174,13 +174,13 @@ class Conclusion:
             family=family,
             gates=gates,
             hypotheses=tuple(records),
-            inclusion=self.inclusion,
+            inclusion=self.inclusion_probabilities,
             resembles=resembles,
             remainders=remainders,
         )
         return VerdictOutcome(verdict, self.search, self.search.no_effect if fit is None else fit)
 
-    def named(
+    def build_named_outcome(
         self,
         fit: CandidateFit,
         probability: float,
@@ -206,7 +206,7 @@ class Conclusion:
         absolute_fit = gates[0]
         if not absolute_fit.passed:
             sentence += f" {absolute_fit.reason}"
-        return self.outcome(
+        return self.build_outcome(
             VerdictKind.NAMED,
             sentence,
             probability,
@@ -216,7 +216,7 @@ class Conclusion:
             remainders=remainders,
         )
 
-    def family(
+    def build_family_outcome(
         self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
     ) -> VerdictOutcome:
         """Return the verdict that names the family of a law that was fitted with a free shape.
@@ -233,10 +233,12 @@ class Conclusion:
         fit_with_draws = with_draws(self.search.problem, fit)
         effects = named_effects(self.search.problem, fit_with_draws)
         family = ", ".join(sorted({effect.family for effect in effects if effect.shape}))
-        others = ", ".join(effect.name for effect in effects if not effect.shape)
-        beside = f", beside {others}" if others else ""
-        sentence = f"An effect of the family {family} is missing, with a shape of its own{beside}."
-        return self.outcome(
+        other_names = ", ".join(effect.name for effect in effects if not effect.shape)
+        beside_clause = f", beside {other_names}" if other_names else ""
+        sentence = (
+            f"An effect of the family {family} is missing, with a shape of its own{beside_clause}."
+        )
+        return self.build_outcome(
             VerdictKind.FAMILY,
             sentence,
             probability,
@@ -250,7 +252,7 @@ class Conclusion:
 # ---------------------------------------------------------------- records of hypotheses
 
 
-def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
+def names_without_free_shape(names: tuple[str, ...]) -> tuple[str, ...]:
     """Return identifiers of effects without the suffix `FREE_SHAPE`."""
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
@@ -315,7 +317,7 @@ def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatA
         # the most probable value may lie outside of the quantiles, and is included
         return np.minimum(low, value), np.maximum(high, value)
     variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
-    half_width = NINETY * np.sqrt(variances)
+    half_width = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
     return value - half_width, value + half_width
 
 
@@ -401,10 +403,10 @@ def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
     )
 
 
-LEAST_SIZE = 1e-3
+LEAST_INSTRUMENT_ERROR = 1e-3
 """Relative size of a gain, tare or clock error below which it is not named, as any instrument has
 errors of this size."""
-UNSTATED_GAIN = 1e-2
+LEAST_UNSTATED_GAIN = 1e-2
 """The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
 gain is never exact, even if the campaign states no deviation."""
 
@@ -419,7 +421,9 @@ def has_one_driven_channel(problem: Problem) -> bool:
     return is_driven and len(problem.channel_names) == 1
 
 
-def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZE) -> bool:
+def is_negligible_instrument_error(
+    problem: Problem, patch: ModelPatch, *, least_unstated_gain: float = LEAST_INSTRUMENT_ERROR
+) -> bool:
     """Return whether a change consists of errors of instruments that are too small to be named.
 
     Parameters
@@ -428,7 +432,7 @@ def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZ
         The campaign and model, whose scales make the sizes relative.
     patch : ModelPatch
         The change of the model by an effect.
-    unstated : float
+    least_unstated_gain : float
         The least size of a gain of a channel without a stated deviation.
     """
     ratios = []
@@ -436,13 +440,15 @@ def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZ
         size = _instrument_error(problem, primitive)
         if size is None:
             return False
-        has_unstated_gain = isinstance(primitive, SensorGain) and _is_exact(problem, primitive)
-        least = unstated if has_unstated_gain else LEAST_SIZE
+        least = LEAST_INSTRUMENT_ERROR
+        if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
+            least = least_unstated_gain
         ratios.append(size / least)
+    # an empty change is not an error of instruments
     return max(ratios, default=1.0) < 1.0
 
 
-def _is_exact(problem: Problem, gain: SensorGain) -> bool:
+def _has_exact_gain(problem: Problem, gain: SensorGain) -> bool:
     """Return whether a campaign states no uncertainty of the gain of a channel."""
     channel = problem.campaign.channels.get(gain.channel)
     return channel is not None and channel.gain_deviation == 0.0

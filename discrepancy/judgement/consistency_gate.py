@@ -29,10 +29,10 @@ from reporting.words import counted
 CONSISTENCY_LEVEL = 1e-3
 """Level of the whole test, with Bonferroni's correction for its parts: the probability that a true
 hypothesis fails it."""
-IDENTIFIED = 0.5
+DETERMINED_DEVIATION_RATIO = 0.5
 """Ratio of posterior to prior deviation of an effect parameter below which its prior is left out of
 the test."""
-SEPARATE = 1e-6
+LEAST_REMAINING_LENGTH = 1e-6
 """Fraction of the squared length of a direction that must remain after the part that nuisances and
 the effect can compensate is projected out."""
 LEAST_FREEDOM = 20.0
@@ -86,7 +86,7 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
         The outcome. `passed` is None if there is nothing to test: no static trial, no flight and no
         effect of a single channel; or if there are too few readings.
     """
-    tests = score_tests(problem, fit, directions(problem, fit))
+    tests = score_tests(problem, fit, directions_by_test(problem, fit))
     if not tests:
         reason = (
             "No trial under a stated load, or too few readings: what is left cannot be judged by "
@@ -131,7 +131,7 @@ def score_tests(
     """
     # An effect parameter that the data determine is refitted without its prior: the test is about
     # the residuals, and not about how probable the value of the parameter is.
-    is_determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
+    is_determined = np.diag(fit.effect_covariance) < DETERMINED_DEVIATION_RATIO**2
     effect_precision = np.where(is_determined, 0.0, 1.0)
     screen = Screen(problem, fit, record_noise=False, effect_precision=effect_precision)
     tests = []
@@ -182,8 +182,8 @@ def _projected_directions(
     scores = []
     for label, direction in group.items():
         changes = {}
-        for number, change in direction.items():
-            changes[number] = problem.trials[number].standardise(change)
+        for trial_index, change in direction.items():
+            changes[trial_index] = problem.trials[trial_index].standardise(change)
         vector, score, _ = screen.project(changes)
         length = float(np.linalg.norm(vector[sign > 0.0]))
         if length > 0.0:
@@ -204,12 +204,12 @@ class _NoiseFreedom(NamedTuple):
     freedom : float
         The degrees of freedom of noise records and residuals together; infinite if the noise of one
         of the channels is known.
-    share : float
+    remaining_share : float
         The fraction of the degrees of freedom of records and readings that the fit did not absorb.
     """
 
     freedom: float
-    share: float
+    remaining_share: float
 
 
 def _noise_freedom(
@@ -218,14 +218,14 @@ def _noise_freedom(
     """Return the degrees of freedom of the noise of the channels that directions change."""
     channels: set[int] = set()
     for direction in group:
-        for number, change in direction.items():
+        for trial_index, change in direction.items():
             is_changed = np.any(change != 0.0, axis=0)
-            channels.update(problem.trials[number].channel_indices[is_changed].tolist())
-    channel_numbers = sorted(channels)
-    freedom = problem.record_freedom[channel_numbers] + problem.sample_counts[channel_numbers]
+            channels.update(problem.trials[trial_index].channel_indices[is_changed].tolist())
+    channel_indices = sorted(channels)
+    freedom = problem.record_freedom[channel_indices] + problem.sample_counts[channel_indices]
     if np.any(np.isinf(freedom)):
         return _NoiseFreedom(np.inf, 1.0)
-    residual_freedom = float(np.sum(freedom - fit.absorbed_freedom[channel_numbers]))
+    residual_freedom = float(np.sum(freedom - fit.absorbed_freedom[channel_indices]))
     return _NoiseFreedom(residual_freedom, residual_freedom / float(freedom.sum()))
 
 
@@ -247,7 +247,7 @@ def _score_test(
     """
     gradient = projected.gradient
     eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
-    is_separate = eigenvalues > SEPARATE
+    is_separate = eigenvalues > LEAST_REMAINING_LENGTH
     count = int(is_separate.sum())
     gradient_components = (eigenvectors.T @ gradient)[is_separate]
     statistic = float(np.sum(gradient_components**2 / eigenvalues[is_separate]))
@@ -255,7 +255,9 @@ def _score_test(
         return None
     # the strongest direction by itself
     single_information = np.diag(projected.information)
-    single_information = np.where(single_information > SEPARATE, single_information, np.inf)
+    single_information = np.where(
+        single_information > LEAST_REMAINING_LENGTH, single_information, np.inf
+    )
     z_scores = np.abs(gradient) / np.sqrt(single_information)
     strongest = int(np.argmax(z_scores))
     return ScoreTest(
@@ -281,7 +283,7 @@ def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
     """
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, count))
-    scaled_statistic = statistic * noise.share
+    scaled_statistic = statistic * noise.remaining_share
     if scaled_statistic >= noise.freedom:
         return 0.0
     remaining_freedom = noise.freedom - count
@@ -298,22 +300,24 @@ class _DirectionGroups:
     def __init__(self) -> None:
         self.groups: dict[str, dict[str, dict[int, FloatArray]]] = {}
 
-    def add(self, group: str, label: str, number: int, change: FloatArray) -> None:
+    def add_change(self, group: str, label: str, trial_index: int, change: FloatArray) -> None:
         """Add the change of the prediction of a trial to a direction.
 
         Parameters
         ----------
         group, label : str
             The name of the test, and that of the direction in it.
-        number : int
+        trial_index : int
             The index of the trial.
         change : (N, C) array
             The change of its prediction [unit of the channel].
         """
-        self.groups.setdefault(group, {}).setdefault(label, {})[number] = change
+        self.groups.setdefault(group, {}).setdefault(label, {})[trial_index] = change
 
 
-def directions(problem: Problem, fit: CandidateFit) -> Mapping[str, Mapping[str, Direction]]:
+def directions_by_test(
+    problem: Problem, fit: CandidateFit
+) -> Mapping[str, Mapping[str, Direction]]:
     """Return the directions of each test by their names.
 
     There are three kinds of tests. For static loads and for flight, the directions are the size,
@@ -323,22 +327,22 @@ def directions(problem: Problem, fit: CandidateFit) -> Mapping[str, Mapping[str,
     load, and a drift over the campaign.
     """
     groups = _DirectionGroups()
-    own_channels = _own_channels(problem, fit)
+    channels_of_effects = _channels_of_effects(problem, fit)
     last_start = max(abs(data.trial.start) for data in problem.trials) or 1.0
-    for number, data in enumerate(problem.trials):
-        response = _response(problem, fit, number)
+    for trial_index, data in enumerate(problem.trials):
+        response = _predicted_response(problem, fit, trial_index)
         if data.trial.kind in (TrialKind.STATIC, TrialKind.FLIGHT):
-            _add_loads(groups, problem, number, response)
+            _add_load_directions(groups, problem, trial_index, response)
         if data.trial.kind is TrialKind.STATIC:
-            _add_runs(groups, problem, number)
-        for channel in own_channels:
+            _add_run_zeros(groups, problem, trial_index)
+        for channel in channels_of_effects:
             if channel in data.trial.channels:
-                _add_channel(groups, problem, number, channel, response, last_start)
+                _add_channel_directions(groups, problem, trial_index, channel, response, last_start)
     return groups.groups
 
 
-def _add_loads(
-    collected: _DirectionGroups, problem: Problem, number: int, response: FloatArray
+def _add_load_directions(
+    collected: _DirectionGroups, problem: Problem, trial_index: int, response: FloatArray
 ) -> None:
     """Add the size, zero and slope over the span of the response of a trial under load.
 
@@ -348,44 +352,46 @@ def _add_loads(
         The directions.
     problem : Problem
         The campaign and model.
-    number : int
+    trial_index : int
         The index of the trial.
     response : (N, C) array
         Its response to the load.
     """
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     is_static = data.trial.kind is TrialKind.STATIC
     group = "static loads" if is_static else "loads of flight"
-    where = _load_place(data) if is_static else "in flight"
-    collected.add(group, f"the size {where}", number, response)
+    place_text = _load_place_text(data) if is_static else "in flight"
+    collected.add_change(group, f"the size {place_text}", trial_index, response)
     if is_static:
         zero = response[np.argmax(np.abs(data.trial.force))]
-        collected.add(group, f"the zero {where}", number, np.broadcast_to(zero, response.shape))
-    along_span = _along_span(problem, data)
-    if along_span is not None:
-        label = f"the slope over the span {where}"
-        collected.add(group, label, number, response * along_span)
+        collected.add_change(
+            group, f"the zero {place_text}", trial_index, np.broadcast_to(zero, response.shape)
+        )
+    positions = _positions_along_span(problem, data)
+    if positions is not None:
+        label = f"the slope over the span {place_text}"
+        collected.add_change(group, label, trial_index, response * positions)
 
 
-def _add_runs(collected: _DirectionGroups, problem: Problem, number: int) -> None:
+def _add_run_zeros(collected: _DirectionGroups, problem: Problem, trial_index: int) -> None:
     """Add, for each quantity, a zero that all its channels have in common in a static run."""
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     trial = data.trial
     quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
-    where = f"in run {trial.run}" if trial.run else "in the runs without a label"
+    run_text = f"in run {trial.run}" if trial.run else "in the runs without a label"
     for quantity in sorted(set(quantities)):
         is_quantity = np.array([other is quantity for other in quantities])
         zero = is_quantity * _zero_scale(problem, quantity)
-        label = f"the zero of {quantity.value} {where}"
-        collected.add(
-            "zeros of the static runs", label, number, np.broadcast_to(zero, data.weight.shape)
+        label = f"the zero of {quantity.value} {run_text}"
+        collected.add_change(
+            "zeros of the static runs", label, trial_index, np.broadcast_to(zero, data.weight.shape)
         )
 
 
-def _add_channel(
+def _add_channel_directions(
     collected: _DirectionGroups,
     problem: Problem,
-    number: int,
+    trial_index: int,
     channel: str,
     response: FloatArray,
     last_start: float,
@@ -398,7 +404,7 @@ def _add_channel(
         The directions.
     problem : Problem
         The campaign and model.
-    number : int
+    trial_index : int
         The index of the trial.
     channel : str
         The channel of the effect.
@@ -407,23 +413,23 @@ def _add_channel(
     last_start : float
         The start of the last trial [s].
     """
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     kind = data.trial.kind
     is_channel = np.array([name == channel for name in data.trial.channels])
     zero = _zero_scale(problem, problem.campaign.channels[channel].quantity)
-    where = f"in the trials {kind.value}"
+    trials_text = f"in the trials {kind.value}"
     if kind is TrialKind.STATIC:
-        where = _load_place(data)
+        trials_text = _load_place_text(data)
     group = f"channel {channel}"
-    collected.add(group, f"the size {where}", number, response * is_channel)
+    collected.add_change(group, f"the size {trials_text}", trial_index, response * is_channel)
     drift = zero * data.trial.start / last_start * np.ones(response.shape) * is_channel
-    collected.add(group, "the zero over time", number, drift)
+    collected.add_change(group, "the zero over time", trial_index, drift)
 
 
-def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:
+def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -> FloatArray:
     """Return the part of a trial's predicted readings (N, C) that its motion or load causes."""
-    trial = problem.trials[number].trial
-    response = fit.responses[number]
+    trial = problem.trials[trial_index].trial
+    response = fit.responses[trial_index]
     if trial.kind is TrialKind.STATIC:
         # subtract the row of least force: temperature and the offset of a run are no response to it
         response = response - response[np.argmin(np.abs(trial.force))]
@@ -443,14 +449,14 @@ def _zero_scale(problem: Problem, quantity: Quantity) -> float:
     return min(deviations)
 
 
-def _load_place(data: TrialData) -> str:
+def _load_place_text(data: TrialData) -> str:
     """Return the place of a static load in words."""
     place = data.trial.load_place
     name = place if isinstance(place, str) else f"({place[0]:g}, {place[1]:g})"
     return f"under load at {name}"
 
 
-def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
+def _positions_along_span(problem: Problem, data: TrialData) -> FloatArray | None:
     """Return the position of each channel along the span (C,); None with too few stations.
 
     It is the difference of the channel's station from their mean, over their range; 0 for a channel
@@ -467,17 +473,17 @@ def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
     )
 
 
-def _own_channels(problem: Problem, fit: CandidateFit) -> Sequence[str]:
+def _channels_of_effects(problem: Problem, fit: CandidateFit) -> Sequence[str]:
     """Return the channel of each effect of a fit that acts on one channel alone."""
     channels = []
     for term in fit.candidate.terms:
-        channel = _own_channel(problem, term)
+        channel = _only_channel_of_term(problem, term)
         if channel:
             channels.append(channel)
     return channels
 
 
-def _own_channel(problem: Problem, term: EffectTerm) -> str:
+def _only_channel_of_term(problem: Problem, term: EffectTerm) -> str:
     """Return the only sensor channel that a term acts on; empty if it acts on anything else."""
     patch = term.patch(problem.setting, term.start_values() + 1.0)
     if not all(isinstance(primitive, SENSORS) for primitive in patch):

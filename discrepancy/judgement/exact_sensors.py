@@ -16,14 +16,14 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 
-LEAST_DROP = 16.0
+LEAST_EXPECTED_DROP = 16.0
 """Least expected drop of a channel's sum of squares for a free zero or gain to be fitted: that
 of four noise deviations."""
-MOST_FITS = 3
+MOST_SINGLE_CHANNEL_FITS = 3
 """Number of channels whose zero or gain is fitted one by one, the most promising first."""
-LEAST_SHARE = 0.9
+LEAST_REMOVED_SHARE = 0.9
 """Least share of the misfit of all channels that a fitted zero or gain must remove for a remark."""
-WIDE_GAIN = 1.0
+UNKNOWN_GAIN_DEVIATION = 1.0
 """Relative deviation that stands for a gain of which nothing is known."""
 
 
@@ -45,8 +45,8 @@ class _Nuisance(NamedTuple):
     wide_deviation: float
 
 
-_ZERO = _Nuisance("offset_deviation", "zero", inf)
-_GAIN = _Nuisance("gain_deviation", "gain", WIDE_GAIN)
+_ZERO_NUISANCE = _Nuisance("offset_deviation", "zero", inf)
+_GAIN_NUISANCE = _Nuisance("gain_deviation", "gain", UNKNOWN_GAIN_DEVIATION)
 
 
 def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]:
@@ -55,7 +55,7 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
     The drop of the sum of squares by a free zero (or gain) is first estimated with all other
     unknowns fixed. The channels of the largest drops are then fitted with the zero free, one by one
     and at last all together, since other unknowns may compensate it. A channel is reported if its
-    fit removes at least `LEAST_SHARE` of the misfit of all channels.
+    fit removes at least `LEAST_REMOVED_SHARE` of the misfit of all channels.
 
     Parameters
     ----------
@@ -64,24 +64,24 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
     no_effect : CandidateFit
         The fit of the model without any effect.
     """
-    for nuisance in (_ZERO, _GAIN):
+    for nuisance in (_ZERO_NUISANCE, _GAIN_NUISANCE):
         drop_by_channel: dict[str, float] = {}
         for name in problem.channel_names:
-            drop = _promised_drop(problem, no_effect, name, nuisance)
+            drop = _expected_drop(problem, no_effect, name, nuisance)
             if drop > 0.0:
                 drop_by_channel[name] = drop
         promising = sorted(drop_by_channel, key=lambda name: drop_by_channel[name])
-        sets_of_channels = [[name] for name in promising[::-1][:MOST_FITS]]
+        sets_of_channels = [[name] for name in promising[::-1][:MOST_SINGLE_CHANNEL_FITS]]
         if len(promising) > 1:
             sets_of_channels.append(promising)
         for names in sets_of_channels:
-            share = _closed_share(problem, no_effect, names, nuisance)
-            if share >= LEAST_SHARE:
-                return [_remark(name, nuisance, share) for name in names]
+            share = _removed_share(problem, no_effect, names, nuisance)
+            if share >= LEAST_REMOVED_SHARE:
+                return [_exactness_remark(name, nuisance, share) for name in names]
     return []
 
 
-def _remark(name: str, nuisance: _Nuisance, share: float) -> str:
+def _exactness_remark(name: str, nuisance: _Nuisance, share: float) -> str:
     """Return the sentence on a channel whose exact zero or gain explains a share of the misfit."""
     return (
         f"The {nuisance.noun} of the channel {name!r} is exact in the campaign; give "
@@ -90,14 +90,14 @@ def _remark(name: str, nuisance: _Nuisance, share: float) -> str:
     )
 
 
-def _promised_drop(
+def _expected_drop(
     problem: Problem, no_effect: CandidateFit, name: str, nuisance: _Nuisance
 ) -> float:
     """Return the drop of a channel's sum of squares by a free zero or gain, other unknowns fixed.
 
     With the residuals r and their derivative d it is (r.d)^2 / d.d. It is 0 if the drop is below
-    `LEAST_DROP`, if the campaign does not state the zero or gain as exact, or if the channel has no
-    noise record.
+    `LEAST_EXPECTED_DROP`, if the campaign does not state the zero or gain as exact, or if the
+    channel has no noise record.
     """
     channel = problem.campaign.channels[name]
     if channel.noise is None or getattr(channel, nuisance.key) != 0.0:
@@ -107,14 +107,14 @@ def _promised_drop(
     for residual, derivative in _channel_derivatives(problem, no_effect, name, nuisance):
         squared_lengths.append(float(derivative @ derivative))
         slopes.append(float(residual @ derivative))
-    if nuisance is _GAIN:  # all trials have the same gain, while each has its own zero
+    if nuisance is _GAIN_NUISANCE:  # all trials have the same gain, while each has its own zero
         squared_lengths = [sum(squared_lengths)]
         slopes = [sum(slopes)]
     drop = 0.0
     for slope, squared_length in zip(slopes, squared_lengths, strict=True):
         if squared_length > 0.0:
             drop += slope**2 / squared_length
-    return drop if drop > LEAST_DROP else 0.0
+    return drop if drop > LEAST_EXPECTED_DROP else 0.0
 
 
 class _ChannelDerivative(NamedTuple):
@@ -137,22 +137,22 @@ def _channel_derivatives(
 ) -> list[_ChannelDerivative]:
     """Return the residuals and derivatives of a channel for each trial that has the channel."""
     derivatives = []
-    for number, data in enumerate(problem.trials):
+    for trial_index, data in enumerate(problem.trials):
         if name not in data.trial.channels:
             continue
         column = data.trial.channels.index(name)
-        response = problem.response_of_candidate(number, no_effect.point, no_effect.candidate)
-        by_nuisance = np.ones_like(response) if nuisance is _ZERO else response
+        response = problem.response_of_candidate(trial_index, no_effect.point, no_effect.candidate)
+        by_nuisance = np.ones_like(response) if nuisance is _ZERO_NUISANCE else response
         derivatives.append(
             _ChannelDerivative(
-                residual=no_effect.residuals[number][:, column],
+                residual=no_effect.residuals[trial_index][:, column],
                 derivative=data.standardise(by_nuisance)[:, column],
             )
         )
     return derivatives
 
 
-def _closed_share(
+def _removed_share(
     problem: Problem, no_effect: CandidateFit, names: Sequence[str], nuisance: _Nuisance
 ) -> float:
     """Return the share of the misfit that is removed if zeros or gains of channels are fitted.
@@ -162,7 +162,7 @@ def _closed_share(
     """
     channels = dict(problem.campaign.channels)
     for name in names:
-        if nuisance is _ZERO:
+        if nuisance is _ZERO_NUISANCE:
             channels[name] = replace(channels[name], offset_deviation=nuisance.wide_deviation)
         else:
             channels[name] = replace(channels[name], gain_deviation=nuisance.wide_deviation)

@@ -36,7 +36,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
         The search for the missing force.
     """
 
-    least_low_end = SEARCH.least_end
+    least_low_end = SEARCH.least_low_end
 
     def __init__(self, search: Search, force_search: ForceSearch) -> None:
         super().__init__(search)
@@ -50,15 +50,15 @@ class ForceComparison(Comparison[ForceHypothesis]):
         return self.force_search.hypothesis_of_all_ports
 
     @property
-    def ranked(self) -> Sequence[ForceHypothesis]:
+    def ranked_hypotheses(self) -> Sequence[ForceHypothesis]:
         """All hypotheses, the most probable first."""
         return self.search.force_hypotheses
 
-    def _gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
+    def _compute_gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains."""
         return self._force_shares.gap_share(hypothesis, held_out=held_out)
 
-    def fit_followed(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
+    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         None if the candidate cannot be fitted.
@@ -67,17 +67,19 @@ class ForceComparison(Comparison[ForceHypothesis]):
             self.force_search.hypothesis_of_all_ports, candidate, effect
         )
 
-    def with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
+    def fit_with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
         """Return the hypothesis of a single law with its shape free; None if there is none."""
         (term,) = hypothesis.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
-        return next((other for other in self.ranked if other.candidate.key == key), None)
+        return next(
+            (fitted for fitted in self.ranked_hypotheses if fitted.candidate.key == key), None
+        )
 
     def start_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the values of all unknowns of a hypothesis as fitted to the missing force."""
         return self.force_search.point_with_effects(hypothesis)
 
-    def failed_check(self, hypothesis: ForceHypothesis) -> str:
+    def failed_check_reason(self, hypothesis: ForceHypothesis) -> str:
         """Return an empty reason, as there are no further tests with a missing force."""
         return ""
 
@@ -85,7 +87,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
         """Test whether the residuals of the best simulation are noise as in the noise records."""
         return check_absolute_fit(self.problem, self.search.best())
 
-    def _simulation(self, hypothesis: ForceHypothesis) -> CandidateFit:
+    def _compute_simulation(self, hypothesis: ForceHypothesis) -> CandidateFit:
         """Return the simulation with the parameters of a hypothesis, and their covariance.
 
         Only the trials' own unknowns are fitted. It is the fit without effect if the hypothesis
@@ -98,7 +100,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
             return self.search.no_effect
         return replace(simulation, covariance=hypothesis.covariance)
 
-    def remaining_text(self, hypothesis: ForceHypothesis, share: GapShare) -> str:
+    def unexplained_text(self, hypothesis: ForceHypothesis, share: GapShare) -> str:
         """Return in words how much of the missing force a hypothesis does not explain."""
         unit = self._force_unit(hypothesis)
         return (

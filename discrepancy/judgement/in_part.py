@@ -19,30 +19,30 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from reporting.words import capital, listing
 
-from .closed_share import share_text, trials_text
+from .closed_share import compared_trials_text, percent_with_interval
 from .coloured_noise import remainder_estimates, verdict_under_coloured_noise
-from .comparison import Comparison, H, effects_at_places
+from .comparison import Comparison, HypothesisT, effect_place_pairs
 from .conclusion import (
-    UNSTATED_GAIN,
+    LEAST_UNSTATED_GAIN,
     Conclusion,
     VerdictOutcome,
     WeightedHypothesis,
     effects_text,
     has_one_driven_channel,
-    is_small,
+    is_negligible_instrument_error,
     named_effects,
-    plain_names,
+    names_without_free_shape,
     probability_text,
 )
 from .force_comparison import ForceComparison
 from .part_sentences import shape_sentence, unproved_addition_sentence
 from .simulation_comparison import SimulationComparison
 
-LEAST_MENTIONED = 0.1
+LEAST_MENTIONED_SHARE = 0.1
 """Least share of the gap for a hypothesis to be mentioned as the best one if none is named."""
 
 
-def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
+def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutcome:
     """Return the verdict if the residuals of the best simulation are more than the recorded noise.
 
     Parameters
@@ -50,7 +50,7 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
     search : Search
         The candidates as fitted under the recorded noise, and the hypotheses that were fitted to
         the missing force, if there is any.
-    first : Verdict
+    simulation_verdict : Verdict
         The verdict on the simulations.
 
     Returns
@@ -61,14 +61,14 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
     """
     force_search = search.force_search if search.force_hypotheses else None
     if force_search is not None and not _missing_force_vanishes(search):
-        return _verdict_by_comparison(ForceComparison(search, force_search), first)
+        return _verdict_by_comparison(ForceComparison(search, force_search), simulation_verdict)
     compare_under_wide_noise(search)
     comparison = SimulationComparison(search)
     outcome = verdict_under_coloured_noise(comparison)
     if outcome is not None:
         return outcome
-    comparison.add_families()
-    return _verdict_by_comparison(comparison, first)
+    comparison.add_free_shape_families()
+    return _verdict_by_comparison(comparison, simulation_verdict)
 
 
 def _missing_force_vanishes(search: Search) -> bool:
@@ -87,33 +87,39 @@ def _missing_force_vanishes(search: Search) -> bool:
     return max(scores, default=-np.inf) > best_with_force
 
 
-def verdict_by_laws_alone(search: Search, first: Verdict) -> VerdictOutcome | None:
-    """Return the verdict that names laws alone in part, without errors of readings.
+def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:
+    """Return the verdict that names laws in part, and no errors of readings.
 
-    They must explain nearly all of the missing force.
+    Errors of readings are not needed if the laws explain nearly all of the missing force.
 
     Parameters
     ----------
     search : Search
         The search, with hypotheses that were fitted to the missing force.
-    first : Verdict
+    simulation_verdict : Verdict
         The verdict on the simulations.
 
     Returns
     -------
     VerdictOutcome or None
-        None if there are no such laws.
+        None if no law is named, or if laws leave more than a tenth of the missing force unexplained
+        (`SEARCH.nearly_complete_share`).
     """
     assert search.force_search is not None
     comparison = ForceComparison(search, search.force_search)
-    outcome = _verdict_by_comparison(comparison, first)
-    if outcome.verdict.kind is not VerdictKind.NAMED_IN_PART or comparison.standing is None:
+    outcome = _verdict_by_comparison(comparison, simulation_verdict)
+    if (
+        outcome.verdict.kind is not VerdictKind.NAMED_IN_PART
+        or comparison.judged_hypothesis is None
+    ):
         return None
-    share = comparison.decisive_share(comparison.standing)
-    return outcome if share.value > SEARCH.nearly_all else None
+    share = comparison.held_out_or_fitted_share(comparison.judged_hypothesis)
+    return outcome if share.value > SEARCH.nearly_complete_share else None
 
 
-def without_negligible_effect(search: Search, first: Verdict, fit: CandidateFit) -> VerdictOutcome:
+def verdict_without_negligible_effect(
+    search: Search, naming_verdict: Verdict, fit: CandidateFit
+) -> VerdictOutcome:
     """Return the verdict on a named set, without an effect that explains hardly anything.
 
     If the residuals are nearly noise, a slightly wider noise explains them as well as such an
@@ -124,43 +130,43 @@ def without_negligible_effect(search: Search, first: Verdict, fit: CandidateFit)
     ----------
     search : Search
         The candidates as fitted under the recorded noise.
-    first : Verdict
+    naming_verdict : Verdict
         The verdict that names the set.
     fit : CandidateFit
         The fit of the set.
     """
     comparison = SimulationComparison(search)
-    whole_key = set(fit.candidate.key)
+    full_set_key = set(fit.candidate.key)
     notable_key = _key_of_notable_terms(comparison, fit)
-    least_share = comparison.decisive_share(fit).value - SEARCH.sliver
-    is_each_notable = notable_key == whole_key
-    if is_each_notable and not _has_equal_subset(comparison, whole_key, least_share):
-        return VerdictOutcome(first, search, fit)
+    least_share = comparison.held_out_or_fitted_share(fit).value - SEARCH.negligible_share
+    is_each_notable = notable_key == full_set_key
+    if is_each_notable and not _has_equal_subset(comparison, full_set_key, least_share):
+        return VerdictOutcome(naming_verdict, search, fit)
     compare_under_wide_noise(search)
-    whole = search.wide_fits.get(fit.candidate.key, fit)
+    full_set = search.wide_fits.get(fit.candidate.key, fit)
     for subset in sorted(search.wide_fits.values(), key=lambda fit: len(fit.candidate.terms)):
         key = set(subset.candidate.key)
-        if not key or not key < whole_key:
+        if not key or not key < full_set_key:
             continue
-        if comparison.decisive_share(subset).value < least_share:
+        if comparison.held_out_or_fitted_share(subset).value < least_share:
             continue
-        least_score = search.score(whole) - SEARCH.sliver_gain
+        least_score = search.score(full_set) - SEARCH.least_gain_of_negligible_effect
         if key == notable_key or search.score(subset) > least_score:
             probability = comparison.probability(subset)
-            if comparison.objection(subset) or probability < SEARCH.sure:
-                return _unexplained(comparison, first, subset)
-            return _named_in_part(comparison, subset, probability)
+            if comparison.objection_to_naming(subset) or probability < SEARCH.name_probability:
+                return _unexplained_outcome(comparison, naming_verdict, subset)
+            return _named_in_part_outcome(comparison, subset, probability)
     search.wide_fits = {}
-    return VerdictOutcome(first, search, fit)
+    return VerdictOutcome(naming_verdict, search, fit)
 
 
 def _has_equal_subset(
-    comparison: SimulationComparison, whole_key: set[tuple[str, str]], least_share: float
+    comparison: SimulationComparison, full_set_key: set[tuple[str, str]], least_share: float
 ) -> bool:
     """Return whether a subset of a set of effects explains at least some share of the gap."""
     for key, subset in comparison.search.exact_fits.items():
-        is_subset = bool(key) and set(key) < whole_key
-        if is_subset and comparison.decisive_share(subset).value > least_share:
+        is_subset = bool(key) and set(key) < full_set_key
+        if is_subset and comparison.held_out_or_fitted_share(subset).value > least_share:
             return True
     return False
 
@@ -178,7 +184,7 @@ def _key_of_notable_terms(
     patches = fit.candidate.patches(problem.setting, fit.effect)
     notable = set()
     for term, patch in zip(fit.candidate.terms, patches, strict=True):
-        if is_small(problem, patch, unstated=UNSTATED_GAIN):
+        if is_negligible_instrument_error(problem, patch, least_unstated_gain=LEAST_UNSTATED_GAIN):
             continue
         if comparison.acts_on_structure(term) or not one_channel:
             notable.add((term.label, term.place))
@@ -188,59 +194,64 @@ def _key_of_notable_terms(
 # ---------------------------------------------------------------- verdicts of a comparison
 
 
-def _verdict_by_comparison(comparison: Comparison[H], first: Verdict) -> VerdictOutcome:
+def _verdict_by_comparison(
+    comparison: Comparison[HypothesisT], simulation_verdict: Verdict
+) -> VerdictOutcome:
     """Return the verdict that a comparison of hypotheses leads to.
 
     Parameters
     ----------
     comparison : Comparison
         The hypotheses.
-    first : Verdict
+    simulation_verdict : Verdict
         The verdict on the simulations, with the tests that they failed.
     """
-    if not comparison.contenders:
-        return _unexplained(comparison, first)
-    best = comparison.simplest_equivalent(comparison.contenders[0])
-    members = [best, *comparison.competitors(best)]
-    others = len(members) - 1
+    if not comparison.nameable_hypotheses:
+        return _unexplained_outcome(comparison, simulation_verdict)
+    best = comparison.simplest_equivalent_hypothesis(comparison.nameable_hypotheses[0])
+    members = [best, *comparison.competing_hypotheses(best)]
+    other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
-        reason = f"{others} others are as much of it: that tells nothing"
-        return _unexplained(comparison, first, best, reason)
+        reason = f"{other_count} others are as much of it: that tells nothing"
+        return _unexplained_outcome(comparison, simulation_verdict, best, reason)
     if comparison.enlarges_error(best):
-        return _unexplained(comparison, first, best)
+        return _unexplained_outcome(comparison, simulation_verdict, best)
     probability = comparison.probability(*members)
-    if probability < SEARCH.sure:
-        return _unexplained(comparison, first, best)
+    if probability < SEARCH.name_probability:
+        return _unexplained_outcome(comparison, simulation_verdict, best)
     log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
-    if log_bayes_factor < SEARCH.bayes_factor:
+    if log_bayes_factor < SEARCH.least_log_bayes_factor:
         reason = (
             "a missing force without any law explains the readings as well "
-            f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs {SEARCH.bayes_factor:g})"
+            f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs "
+            f"{SEARCH.least_log_bayes_factor:g})"
         )
-        return _unexplained(comparison, first, best, reason)
-    if others == 0:
-        return _named_in_part(comparison, best, probability)
+        return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+    if other_count == 0:
+        return _named_in_part_outcome(comparison, best, probability)
     if all(comparison.passes_absolute_fit(member) for member in members):
-        return _group(comparison, members, probability)
+        return _group_outcome(comparison, members, probability)
     names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
     reason = f"it leaves more than noise, and these data do not tell it from {listing(names, 'or')}"
-    return _unexplained(comparison, first, best, reason)
+    return _unexplained_outcome(comparison, simulation_verdict, best, reason)
 
 
-def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> VerdictOutcome:
+def _named_in_part_outcome(
+    comparison: Comparison[HypothesisT], best: HypothesisT, probability: float
+) -> VerdictOutcome:
     """Return the verdict that names the effects of a hypothesis in part.
 
     Parameters
     ----------
     comparison : Comparison
         The hypotheses.
-    best : H
+    best : HypothesisT
         The hypothesis that is named.
     probability : float
         Its probability.
     """
     effects = named_effects(comparison.problem, best)
-    share = comparison.decisive_share(best)
+    share = comparison.held_out_or_fitted_share(best)
     families = {term.effect.family for term in best.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
     phrases = []
@@ -249,22 +260,22 @@ def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> Ve
         phrases.append(canonical)
     if family:
         phrases.append(f"an effect of the family {family}, with a shape of its own,")
-    _, explains = comparison.closed_share(best)
+    share_clause = comparison.closed_share(best).clause
     sentence = (
         f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
-        f"{explains}."
+        f"{share_clause}."
     )
     if comparison.has_held_out and not share.held_out:
         sentence += " In the trials held out it has hardly any force."
-    sentence += f" It leaves {comparison.remaining_text(best, share)}, which is unexplained."
+    sentence += f" It leaves {comparison.unexplained_text(best, share)}, which is unexplained."
     sentence += shape_sentence(comparison, best)
     sentence += unproved_addition_sentence(comparison, best)
-    return _outcome(
+    return _outcome_of_comparison(
         comparison,
         VerdictKind.NAMED_IN_PART,
         sentence,
         probability,
-        standing=best,
+        judged_hypothesis=best,
         members=[best],
         effects=effects,
         family=family,
@@ -272,8 +283,10 @@ def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> Ve
     )
 
 
-def _group(comparison: Comparison[H], members: Sequence[H], probability: float) -> VerdictOutcome:
-    """Return the verdict that one of several hypotheses is true, which cannot be told apart.
+def _group_outcome(
+    comparison: Comparison[HypothesisT], members: Sequence[HypothesisT], probability: float
+) -> VerdictOutcome:
+    """Return the verdict that one of several hypotheses is true, and the data do not tell which.
 
     The sentence begins with the effects that all of them have in common.
 
@@ -281,27 +294,14 @@ def _group(comparison: Comparison[H], members: Sequence[H], probability: float) 
     ----------
     comparison : Comparison
         The hypotheses.
-    members : sequence of H
+    members : sequence of HypothesisT
         The hypotheses of the group, the best one first.
     probability : float
         The probability that one of them is true.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
-    member_texts = []
-    for member, effects in zip(members, effects_by_member, strict=True):
-        closed, _ = comparison.closed_share(member)
-        share_in_brackets = "" if closed is None else f" ({share_text(closed)})"
-        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
-    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
-    closed, reason = comparison.closed_share(members[0])
-    if closed is None:
-        sentence += f" {capital(reason)}."
-    else:
-        sentence += (
-            " In brackets the share of the mean square error that each explains in "
-            f"{trials_text(closed)}."
-        )
-    common = frozenset.intersection(*(effects_at_places(member) for member in members))
+    sentence = _group_sentence(comparison, members, effects_by_member)
+    common = frozenset.intersection(*(effect_place_pairs(member) for member in members))
     common_effects = []
     for effect in effects_by_member[0]:
         if (effect.identifier, effect.place) in common:
@@ -313,13 +313,14 @@ def _group(comparison: Comparison[H], members: Sequence[H], probability: float) 
         all_effects.extend(effects)
     group = []
     for member in members:
-        group.append(" + ".join(sorted(plain_names(member.candidate.identifiers))))
-    return _outcome(
+        group.append(" + ".join(sorted(names_without_free_shape(member.candidate.identifiers))))
+    return _outcome_of_comparison(
         comparison,
         VerdictKind.GROUP,
         sentence,
+        # rounding may put the sum of the members' probabilities above one
         min(probability, 1.0),
-        standing=members[0],
+        judged_hypothesis=members[0],
         members=members,
         effects=tuple(all_effects),
         group=tuple(group),
@@ -327,79 +328,135 @@ def _group(comparison: Comparison[H], members: Sequence[H], probability: float) 
     )
 
 
-def _unexplained(
-    comparison: Comparison[H], first: Verdict, nearest: H | None = None, reason: str = ""
+def _group_sentence(
+    comparison: Comparison[HypothesisT],
+    members: Sequence[HypothesisT],
+    effects_by_member: Sequence[Sequence[NamedEffect]],
+) -> str:
+    """Return the sentence that lists the members of a group, each with the share it explains."""
+    member_texts = []
+    for member, effects in zip(members, effects_by_member, strict=True):
+        member_share = comparison.closed_share(member).share
+        share_in_brackets = ""
+        if member_share is not None:
+            share_in_brackets = f" ({percent_with_interval(member_share)})"
+        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
+    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
+    best_share = comparison.closed_share(members[0])
+    if best_share.share is None:
+        return f"{sentence} {capital(best_share.clause)}."
+    return (
+        f"{sentence} In brackets the share of the mean square error that each explains in "
+        f"{compared_trials_text(best_share.share)}."
+    )
+
+
+def _unexplained_outcome(
+    comparison: Comparison[HypothesisT],
+    simulation_verdict: Verdict,
+    considered: HypothesisT | None = None,
+    reason: str = "",
 ) -> VerdictOutcome:
-    """Return the verdict that there is an unexplained gap, with the hypothesis that explains most.
+    """Return the verdict that there is an unexplained gap.
+
+    Its sentence mentions the best hypothesis, unless that explains hardly anything of the gap or
+    makes the error larger.
 
     Parameters
     ----------
     comparison : Comparison
         The hypotheses.
-    first : Verdict
+    simulation_verdict : Verdict
         The verdict on the simulations.
-    nearest : H, optional
+    considered : HypothesisT, optional
         The hypothesis that was considered for a name; if left out, the one that explains the
         largest share of the gap is mentioned.
     reason : str
-        The reason why it is not named. If left out, it is that of `Comparison.objection`, or else
-        that its probability is too low.
+        The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
+        or else that its probability is too low.
     """
-    failed_gate_reason = next((gate.reason for gate in first.gates if gate.passed is False), "")
-    gap = f"There is a gap that no effect of the catalogue fits. {failed_gate_reason}".strip()
-    gap = f"{gap} {comparison.gap_sentence()}".strip()
-    mentioned = nearest
-    if mentioned is None:
-        with_effects = [other for other in comparison.ranked if other.candidate.terms]
-        mentioned = max(
-            with_effects, key=lambda other: comparison.decisive_share(other).value, default=None
-        )
-    if mentioned is None or comparison.decisive_share(mentioned).value < LEAST_MENTIONED:
-        mentioned = None
+    gap = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
+    nearest = _hypothesis_explaining_most(comparison) if considered is None else considered
+    judged_hypothesis = None
+    resembles: tuple[str, ...] = ()
+    if nearest is None or not _explains_mentioned_share(comparison, nearest):
         sentence = f"{gap} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(mentioned):
-        sentence = f"{gap} {_larger_error_sentence(comparison, mentioned)}"
-        mentioned = None
+    elif comparison.enlarges_error(nearest):
+        sentence = f"{gap} {_larger_error_sentence(comparison, nearest)}"
     else:
-        reason = reason or comparison.objection(mentioned)
-        if nearest is not None and not reason:
+        reason = reason or comparison.objection_to_naming(nearest)
+        if considered is not None and not reason:
             probability = comparison.probability(nearest)
-            reason = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
-        reason_clause = f"; it is no name, as {reason}" if reason else ""
-        effects = effects_text(named_effects(comparison.problem, mentioned))
-        _, explains = comparison.closed_share(mentioned)
-        sentence = f"{gap} The best hypothesis is {effects}: {explains}{reason_clause}."
-    resembles = () if mentioned is None else plain_names(mentioned.candidate.identifiers)
-    return _outcome(
+            reason = (
+                f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
+            )
+        sentence = f"{gap} {_best_hypothesis_sentence(comparison, nearest, reason)}"
+        judged_hypothesis = nearest
+        resembles = names_without_free_shape(nearest.candidate.identifiers)
+    return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,
         sentence,
-        first.probability,
-        standing=mentioned,
+        simulation_verdict.probability,
+        judged_hypothesis=judged_hypothesis,
         members=[],
         resembles=resembles,
-        gates=first.gates,
+        gates=simulation_verdict.gates,
     )
 
 
-def _larger_error_sentence(comparison: Comparison[H], hypothesis: H) -> str:
+def _gap_text(simulation_verdict: Verdict) -> str:
+    """Return the sentence that there is a gap, with the reason of the first failed test."""
+    reasons = [gate.reason for gate in simulation_verdict.gates if gate.has_failed]
+    first_reason = reasons[0] if reasons else ""
+    return f"There is a gap that no effect of the catalogue fits. {first_reason}".strip()
+
+
+def _explains_mentioned_share(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> bool:
+    """Return whether a hypothesis explains enough of the gap to be mentioned in a sentence."""
+    return comparison.held_out_or_fitted_share(hypothesis).value >= LEAST_MENTIONED_SHARE
+
+
+def _hypothesis_explaining_most(comparison: Comparison[HypothesisT]) -> HypothesisT | None:
+    """Return the hypothesis that explains the largest share of the gap; None without effects."""
+    with_effects = [
+        hypothesis for hypothesis in comparison.ranked_hypotheses if hypothesis.candidate.terms
+    ]
+    return max(
+        with_effects,
+        key=lambda hypothesis: comparison.held_out_or_fitted_share(hypothesis).value,
+        default=None,
+    )
+
+
+def _best_hypothesis_sentence(
+    comparison: Comparison[HypothesisT], hypothesis: HypothesisT, reason: str
+) -> str:
+    """Return the sentence on the best hypothesis, and the reason why it is not named, if any."""
+    effects = effects_text(named_effects(comparison.problem, hypothesis))
+    share_clause = comparison.closed_share(hypothesis).clause
+    reason_clause = f"; it is no name, as {reason}" if reason else ""
+    return f"The best hypothesis is {effects}: {share_clause}{reason_clause}."
+
+
+def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> str:
     """Return the sentence on a hypothesis that is not named because it makes the error larger."""
     effects = effects_text(named_effects(comparison.problem, hypothesis))
     nearest = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
         return f"{nearest} it cannot be simulated: nothing is named."
-    _, enlarges = comparison.closed_share(hypothesis)
-    return f"{nearest} {enlarges}: nothing is named, and nothing to be applied."
+    share_clause = comparison.closed_share(hypothesis).clause
+    return f"{nearest} {share_clause}: nothing is named, and nothing to be applied."
 
 
-def _outcome(
-    comparison: Comparison[H],
+def _outcome_of_comparison(
+    comparison: Comparison[HypothesisT],
     kind: VerdictKind,
     sentence: str,
     probability: float,
     *,
-    standing: H | None,
-    members: Sequence[H],
+    judged_hypothesis: HypothesisT | None,
+    members: Sequence[HypothesisT],
     effects: tuple[NamedEffect, ...] = (),
     group: tuple[str, ...] = (),
     family: str = "",
@@ -414,18 +471,18 @@ def _outcome(
         The hypotheses.
     kind, sentence, probability
         What is concluded, see `Verdict`.
-    standing : H or None
+    judged_hypothesis : HypothesisT or None
         The hypothesis that the verdict is about; None for the model without effect.
-    members : sequence of H
+    members : sequence of HypothesisT
         The hypotheses that are listed first, in their order.
     effects, group, family, gates, resembles
         Further attributes of the `Verdict`.
     """
-    others = []
-    for other in comparison.ranked:
-        if not any(other is member for member in members):
-            others.append(other)
-    listed: list[H] = [*members, *others]
+    remaining = []
+    for ranked in comparison.ranked_hypotheses:
+        if not any(ranked is member for member in members):
+            remaining.append(ranked)
+    listed: list[HypothesisT] = [*members, *remaining]
     scores = np.array([comparison.score(hypothesis) for hypothesis in listed])
     probabilities = np.exp(scores - logsumexp(scores)).tolist()
     weighted: list[WeightedHypothesis] = []
@@ -435,12 +492,12 @@ def _outcome(
     other_weighted = sorted(weighted[first_other:], key=lambda entry: -entry.probability)
     weighted = weighted[:first_other] + other_weighted
     fit = comparison.search.no_effect
-    if standing is not None:
-        fit = comparison.simulation(standing)
-    comparison.standing = standing
-    best = listed[0] if standing is None else standing
+    if judged_hypothesis is not None:
+        fit = comparison.simulation(judged_hypothesis)
+    comparison.judged_hypothesis = judged_hypothesis
+    best = listed[0] if judged_hypothesis is None else judged_hypothesis
     log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
-    return Conclusion(comparison.search, log_bayes_factor, weighted).outcome(
+    return Conclusion(comparison.search, log_bayes_factor, weighted).build_outcome(
         kind,
         sentence,
         probability,

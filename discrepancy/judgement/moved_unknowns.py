@@ -30,25 +30,25 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
         The fit, usually that of the model without effect.
     """
     unknowns = [
-        *_parameters(problem, fit),
-        *_gains(problem, fit),
-        *_zeros_and_constants(problem, fit),
+        *_parameter_values(problem, fit),
+        *_gain_values(problem, fit),
+        *_zero_and_constant_values(problem, fit),
     ]
-    moved = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
-    return tuple(sorted(moved, key=lambda unknown: -abs(unknown.deviations)))
+    moved_far = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
+    return tuple(sorted(moved_far, key=lambda unknown: -abs(unknown.deviations)))
 
 
-def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the stated and fitted values of the calibrated parameters with a prior deviation."""
     shared = problem.shared
     values = shared.parameters(fit.point.shared)
     unknowns = []
-    for number, parameter in enumerate(problem.model.parameters):
-        centre = float(shared.centre[number])
-        scale = float(shared.scale[number])
+    for parameter_index, parameter in enumerate(problem.model.parameters):
+        centre = float(shared.centre[parameter_index])
+        scale = float(shared.scale[parameter_index])
         if scale <= 0.0:
             continue
-        value = float(values[number])
+        value = float(values[parameter_index])
         unknowns.append(
             MovedUnknown(
                 name=parameter.name,
@@ -62,31 +62,33 @@ def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     return unknowns
 
 
-def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted values of the gain errors with a stated deviation; they are stated as 0."""
     shared = problem.shared
     unknowns = []
     for gain_number, channel in enumerate(shared.gain_channels):
         shared_number = shared.parameter_count + gain_number
         if shared.precision[shared_number] > 0.0:
-            u = float(fit.point.shared[shared_number])
+            scaled_value = float(fit.point.shared[shared_number])
             scale = float(shared.scale[shared_number])
-            unknowns.append(_moved_from_zero(f"gain of {channel}", u, scale, "1"))
+            unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", scaled_value, scale, "1"))
     return unknowns
 
 
-def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted zeros of channels and constants of inputs that have a stated deviation."""
     unknowns = []
     for data, local in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
         zeros_end, initial_end, inputs_end, _ = layout.ends_by_kind
-        numbers = [*range(zeros_end), *range(initial_end, inputs_end)]
-        for (name, unit), number in zip(names_and_units, numbers, strict=True):
-            if layout.precision[number] > 0.0:
-                u = float(local[number])
-                unknowns.append(_moved_from_zero(name, u, float(layout.scale[number]), unit))
+        indices = [*range(zeros_end), *range(initial_end, inputs_end)]
+        for (name, unit), index in zip(names_and_units, indices, strict=True):
+            if layout.precision[index] > 0.0:
+                scaled_value = float(local[index])
+                unknowns.append(
+                    _unknown_stated_as_zero(name, scaled_value, float(layout.scale[index]), unit)
+                )
     return unknowns
 
 
@@ -105,14 +107,16 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
     return names_and_units
 
 
-def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnknown:
+def _unknown_stated_as_zero(
+    name: str, scaled_value: float, scale: float, unit: str
+) -> MovedUnknown:
     """Return the record of an unknown whose stated value is zero.
 
     Parameters
     ----------
     name : str
         The name of the unknown.
-    u : float
+    scaled_value : float
         Its scaled value in the fit.
     scale : float
         Its stated standard deviation [unit].
@@ -120,16 +124,21 @@ def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnkno
         Its unit.
     """
     return MovedUnknown(
-        name=name, stated=0.0, deviation=scale, value=scale * u, deviations=u, unit=unit
+        name=name,
+        stated=0.0,
+        deviation=scale,
+        value=scale * scaled_value,
+        deviations=scaled_value,
+        unit=unit,
     )
 
 
-def moved_sentence(moved: Sequence[MovedUnknown]) -> str:
+def moved_sentence(unknowns: Sequence[MovedUnknown]) -> str:
     """Return a sentence on the unknowns that the fit without effect moves; empty if none."""
-    if not moved:
+    if not unknowns:
         return ""
-    parts = [_moved_text(unknown) for unknown in moved[:MOST_MENTIONED]]
-    remaining = len(moved) - MOST_MENTIONED
+    parts = [_moved_text(unknown) for unknown in unknowns[:MOST_MENTIONED]]
+    remaining = len(unknowns) - MOST_MENTIONED
     if remaining > 0:
         parts.append(f"{remaining} more")
     return f"Fitted without an effect, the model moves {listing(parts)}."

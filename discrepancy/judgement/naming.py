@@ -16,18 +16,18 @@ from discrepancy.verdict import Verdict, VerdictKind
 from fe.runtime.patch import SENSORS, LoadGain, SensorGain
 
 from .conclusion import (
-    LEAST_SIZE,
+    LEAST_INSTRUMENT_ERROR,
     VerdictOutcome,
     has_one_driven_channel,
-    is_small,
+    is_negligible_instrument_error,
 )
-from .in_part import verdict_by_laws_alone, verdict_in_part, without_negligible_effect
+from .in_part import verdict_in_part, verdict_naming_laws_only, verdict_without_negligible_effect
 from .moved_unknowns import moved_sentence, moved_unknowns
 from .proof import check_held_out
-from .rules import Case, decide, most_probable_sets
-from .verdict_checks import checked_verdict
+from .rules import VerdictCase, decide_verdict, most_probable_sets
+from .verdict_checks import check_against_trials
 
-INSTRUMENTS = (LoadGain, *SENSORS)
+INSTRUMENT_PRIMITIVES = (LoadGain, *SENSORS)
 """Primitives that describe errors of instruments."""
 
 
@@ -56,14 +56,16 @@ def reach_verdict(
         The verdict, the search with all candidates, and the fit that represents the verdict. Next
         experiments and faults of the data are added to the verdict elsewhere.
     """
-    outcome = checked_verdict(_searched_verdict(problem, effects, on_progress, on_search))
+    outcome = check_against_trials(
+        _verdict_of_two_searches(problem, effects, on_progress, on_search)
+    )
     verdict = outcome.verdict
-    moved = moved_unknowns(problem, outcome.search.no_effect)
-    sentence = f"{verdict.sentence} {moved_sentence(moved)}".strip()
-    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=moved))
+    unknowns = moved_unknowns(problem, outcome.search.no_effect)
+    sentence = f"{verdict.sentence} {moved_sentence(unknowns)}".strip()
+    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=unknowns))
 
 
-def _searched_verdict(
+def _verdict_of_two_searches(
     problem: Problem, effects: Sequence[Effect], on_progress: OnProgress, on_search: OnSearch
 ) -> VerdictOutcome:
     """Return the verdict on a search, and if the missing force gives no name, on a second search.
@@ -71,10 +73,10 @@ def _searched_verdict(
     The second search compares simulations only.
     """
     first_search = search(problem, effects, on_progress, on_search)
-    first = _verdict_on_search(first_search)
-    is_unexplained = first.verdict.kind is VerdictKind.UNEXPLAINED
+    first_outcome = _verdict_on_search(first_search)
+    is_unexplained = first_outcome.verdict.kind is VerdictKind.UNEXPLAINED
     if not first_search.force_hypotheses or not is_unexplained:
-        return first
+        return first_outcome
     on_progress("nothing follows the missing force: comparing whole simulations")
     # the first search may have refined the time steps, so fit again
     no_effect = try_fit(problem, Candidate(), first_search.no_effect.point)
@@ -85,19 +87,19 @@ def _searched_verdict(
     on_search(second_search)
     second_search.search_single_effects()
     second_search.search_sets()
-    second = _verdict_on_search(second_search)
+    second_outcome = _verdict_on_search(second_search)
     second_search.force_hypotheses = first_search.force_hypotheses
-    is_named = second.verdict.kind is VerdictKind.NAMED_IN_PART
-    has_law = any(_acts_on_structure(problem, second.fit))
+    is_named = second_outcome.verdict.kind is VerdictKind.NAMED_IN_PART
+    has_law = any(_effects_acting_on_structure(problem, second_outcome.fit))
     # held-out trials alone are not enough: most of the gap in fitted trials must be closed too
     count = float(problem.sample_counts.sum())
     gap = second_search.no_effect.chi_square - count
-    remaining = second.fit.chi_square - count
-    closes_gap = gap > 0.0 and remaining < (1.0 - SEARCH.least_share) * gap
-    return second if is_named and has_law and closes_gap else first
+    remaining = second_outcome.fit.chi_square - count
+    closes_gap = gap > 0.0 and remaining < (1.0 - SEARCH.least_gap_share) * gap
+    return second_outcome if is_named and has_law and closes_gap else first_outcome
 
 
-def _acts_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:
+def _effects_acting_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:
     """Return for each effect of a fit whether it changes the structure, and not only readings."""
     return [changes_structure(term.effect, problem.setting) for term in fit.candidate.terms]
 
@@ -114,20 +116,20 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
     if may_be_named or verdict.kind is VerdictKind.GROUP:
         gate = check_held_out(residual_set(search.problem, outcome.fit, sensitivities=False))
         sentence = verdict.sentence
-        if gate.passed is False:
+        if gate.has_failed:
             sentence = f"{sentence} {gate.reason}"
             may_be_named = False
         verdict = replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP):
-        overruled = _overruled_by_instruments(search, verdict)
-        if overruled is not None:
-            return VerdictOutcome(overruled, search, search.no_effect)
+        rejection = _verdict_rejecting_instruments(search, verdict)
+        if rejection is not None:
+            return VerdictOutcome(rejection, search, search.no_effect)
     if may_be_named and len(verdict.effects) > 1:
-        laws_alone = _laws_without_reading_errors(search, verdict, outcome.fit)
-        if laws_alone is not None:
-            return laws_alone
-        return without_negligible_effect(search, verdict, outcome.fit)
-    failed = {gate.name for gate in verdict.gates if gate.passed is False}
+        laws_only = _outcome_naming_laws_only(search, verdict, outcome.fit)
+        if laws_only is not None:
+            return laws_only
+        return verdict_without_negligible_effect(search, verdict, outcome.fit)
+    failed = {gate.name for gate in verdict.gates if gate.has_failed}
     has_misfit = bool(failed & {"absolute fit", "held-out trials"})
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     is_open = not may_be_named and (has_misfit or verdict.kind in open_kinds)
@@ -151,10 +153,10 @@ def verdict_by_simulations(search: Search) -> VerdictOutcome:
             break
         search.fit_exactly(search.best_fit_of_set(rough[0]))
         probabilities = search.set_probabilities()
-    return decide(Case(search, probabilities))
+    return decide_verdict(VerdictCase(search, probabilities))
 
 
-def _laws_without_reading_errors(
+def _outcome_naming_laws_only(
     search: Search, verdict: Verdict, fit: CandidateFit
 ) -> VerdictOutcome | None:
     """Return the verdict that names only the laws of a set, without its errors of readings.
@@ -163,14 +165,14 @@ def _laws_without_reading_errors(
     do not explain. None is returned if the set does not contain both kinds of effects, or if laws
     alone cannot be named.
     """
-    acts = _acts_on_structure(search.problem, fit)
+    acts = _effects_acting_on_structure(search.problem, fit)
     names_both = any(acts) and not all(acts)
     if not search.force_hypotheses or not names_both:
         return None
-    return verdict_by_laws_alone(search, verdict)
+    return verdict_naming_laws_only(search, verdict)
 
 
-def _overruled_by_instruments(search: Search, verdict: Verdict) -> Verdict | None:
+def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict | None:
     """Return the verdict that rejects named errors of instruments; None if they may be the cause.
 
     There are two reasons to reject them. The errors may be so small that any instrument has them.
@@ -181,32 +183,53 @@ def _overruled_by_instruments(search: Search, verdict: Verdict) -> Verdict | Non
     problem = search.problem
     without_name = replace(verdict, effects=(), group=())
     causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
-    if all(is_small(problem, effect.patch) for effect in verdict.effects):
+    if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
-            f"The model explains the data but for {causes} below {100.0 * LEAST_SIZE:g} % of what "
-            "it acts on, which is a nuisance of the instruments and no name."
+            f"The model explains the data but for {causes} below "
+            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of what it acts on, which is a nuisance of the "
+            "instruments and no name."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
-    primitives = [primitive for effect in verdict.effects for primitive in effect.patch]
-    has_gain = any(isinstance(primitive, LoadGain | SensorGain) for primitive in primitives)
-    if not has_gain or not all(isinstance(primitive, INSTRUMENTS) for primitive in primitives):
+    if not _are_instrument_errors_with_gain(verdict):
         return None
     residuals = residual_set(problem, search.no_effect, sensitivities=False)
-    if check_held_out(residuals).passed is not True:
+    if not check_held_out(residuals).passed:
         return None
-    strained = []
-    for parameter, u in zip(problem.model.parameters, search.no_effect.point.shared, strict=False):
-        if abs(u) > SEARCH.stand_in_range:
-            strained.append(f"{parameter.name!r} {abs(u):.1f}")
-    far = f" ({', '.join(strained)} stated deviations off)" if strained else ""
     sentence = (
         "The model predicts held-out trials as it is, but with calibrated parameters beside their "
-        f"priors{far}. An error of the instruments ({causes}) would do as well: with one channel "
-        "these data cannot tell them apart."
+        f"priors{_implausible_parameters_clause(search)}. An error of the instruments ({causes}) "
+        "would do as well: with one channel these data cannot tell them apart."
     )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     return replace(
         without_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles
     )
+
+
+def _are_instrument_errors_with_gain(verdict: Verdict) -> bool:
+    """Return whether all effects of a verdict are errors of instruments, one of them of a gain."""
+    has_gain = False
+    for effect in verdict.effects:
+        for primitive in effect.patch:
+            if not isinstance(primitive, INSTRUMENT_PRIMITIVES):
+                return False
+            if isinstance(primitive, LoadGain | SensorGain):
+                has_gain = True
+    return has_gain
+
+
+def _implausible_parameters_clause(search: Search) -> str:
+    """Return the parameters that the fit without effect moves far from their priors, in brackets.
+
+    The clause begins with a blank; it is empty if there are no such parameters.
+    """
+    parameters = search.problem.model.parameters
+    # the scaled unknowns are the parameters, in prior deviations, and then the gains of channels
+    scaled_values = search.no_effect.point.shared[: len(parameters)]
+    texts = []
+    for parameter, scaled_value in zip(parameters, scaled_values, strict=True):
+        if abs(scaled_value) > SEARCH.reported_prior_deviations:
+            texts.append(f"{parameter.name!r} {abs(scaled_value):.1f}")
+    return f" ({', '.join(texts)} stated deviations off)" if texts else ""

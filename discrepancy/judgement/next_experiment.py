@@ -22,20 +22,20 @@ from discrepancy.system.interface import NO_PATCH
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
 
-SAMPLES = 300
+OUTCOME_SAMPLES = 300
 """Simulated outcomes of a trial for each hypothesis."""
 SEED = 20210527
 """Seed of the outcomes."""
 LEAST_INFORMATION = 0.03
 """Information below which an experiment is not proposed [nat]."""
-PROPOSED = 4
+MOST_PROPOSED = 4
 """Largest number of experiments that are proposed."""
 LEAST_PROBABILITY = 1e-3
 """Least probability with which a hypothesis enters the information."""
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
-LEAST_SINGULAR = 1e-6
+LEAST_SINGULAR_VALUE = 1e-6
 """Singular value, relative to the largest, below which a direction in the space of readings is left
 out: all hypotheses predict the same there."""
 
@@ -52,7 +52,7 @@ class Proposal:
         Sentences for the user: what to do, and why.
     cost : float
         The cost relative to one more trial of a kind that was done already.
-    added : ModelPatch
+    added_patch : ModelPatch
         The change of the structure for this trial, such as a mass at the tip.
     """
 
@@ -60,7 +60,7 @@ class Proposal:
     description: str
     reason: str
     cost: float
-    added: ModelPatch = field(default_factory=ModelPatch)
+    added_patch: ModelPatch = field(default_factory=ModelPatch)
 
 
 def next_experiments(
@@ -80,9 +80,9 @@ def next_experiments(
     probabilities = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
     probabilities /= probabilities.sum()
     fits = [fit for fit, _ in open_fits]
-    swings = oscillates(problem, fits[0]) if fits else True
+    is_oscillating = oscillates(problem, fits[0]) if fits else True
     experiments = []
-    for proposal in proposals(problem, swings=swings):
+    for proposal in feasible_proposals(problem, is_oscillating=is_oscillating):
         try:
             information = mutual_information(problem, proposal, fits, probabilities)
         except DiscrepancyError:  # not feasible with this model
@@ -92,7 +92,7 @@ def next_experiments(
                 Experiment(proposal.description, information, proposal.cost, proposal.reason)
             )
     experiments.sort(key=lambda experiment: -experiment.information / experiment.cost)
-    return tuple(experiments[:PROPOSED])
+    return tuple(experiments[:MOST_PROPOSED])
 
 
 # ---------------------------------------------------------------- information
@@ -116,15 +116,19 @@ def mutual_information(
     weights : (H,) array
         The probabilities of the hypotheses, of sum one.
     """
-    model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
+    model = (
+        problem.model.with_patch(proposal.added_patch)
+        if len(proposal.added_patch)
+        else problem.model
+    )
     trial_problem = problem.with_trials((proposal.trial,), model)
     # without a noise record, the rms residual of the most probable hypothesis, which is the first,
     # is taken for the noise deviation; a precision is (recorded / actual deviation)^2
     recorded_over_residual = np.sqrt(problem.noise_precisions(fits[0].squares_by_channel))
     noise_scale = np.where(problem.record_freedom > 0.0, 1.0, recorded_over_residual)
     predictions = [_predicted_trial(trial_problem, fit, noise_scale) for fit in fits]
-    gaussians = _reduced(predictions, weights)
-    return _information_of(gaussians, weights)
+    gaussians = _reduce_dimensions(predictions, weights)
+    return _simulate_information(gaussians, weights)
 
 
 class _PredictedTrial(NamedTuple):
@@ -200,7 +204,9 @@ class _Gaussian(NamedTuple):
         return np.asarray(-0.5 * (standardised**2).sum(axis=0) - log_determinant)
 
 
-def _reduced(predictions: Sequence[_PredictedTrial], weights: FloatArray) -> list[_Gaussian]:
+def _reduce_dimensions(
+    predictions: Sequence[_PredictedTrial], weights: FloatArray
+) -> list[_Gaussian]:
     """Return the predictions of all hypotheses, noise included, in a space of fewer dimensions.
 
     The space is spanned by the differences of the means and by the factors of the covariances.
@@ -212,7 +218,7 @@ def _reduced(predictions: Sequence[_PredictedTrial], weights: FloatArray) -> lis
     mean_of_hypotheses = np.average(means, axis=0, weights=weights)
     directions = np.concatenate((np.stack(means) - mean_of_hypotheses, *factors))
     _, singular_values, basis = np.linalg.svd(check_finite(directions), full_matrices=False)
-    basis = basis[singular_values > LEAST_SINGULAR * max(singular_values[0], 1e-300)]
+    basis = basis[singular_values > LEAST_SINGULAR_VALUE * max(singular_values[0], 1e-300)]
     # the rows of the basis are orthonormal, so the noise keeps its unit covariance
     gaussians = []
     for mean, factor in zip(means, factors, strict=True):
@@ -223,7 +229,7 @@ def _reduced(predictions: Sequence[_PredictedTrial], weights: FloatArray) -> lis
     return gaussians
 
 
-def _information_of(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> float:
+def _simulate_information(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> float:
     """Return the mutual information of hypothesis and data [nat], by simulated outcomes.
 
     It is the entropy of the hypotheses' probabilities, minus the mean entropy of their posterior
@@ -237,7 +243,7 @@ def _information_of(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> flo
         Their probabilities, of sum one.
     """
     generator = np.random.default_rng(SEED)
-    standard_normal = generator.standard_normal((SAMPLES, len(hypotheses[0].mean)))
+    standard_normal = generator.standard_normal((OUTCOME_SAMPLES, len(hypotheses[0].mean)))
     entropy = float(-(weights * np.log(weights)).sum())
     entropy_after = 0.0
     for true_hypothesis, weight in zip(hypotheses, weights, strict=True):
@@ -272,7 +278,7 @@ def oscillates(problem: Problem, fit: CandidateFit) -> bool:
     return False
 
 
-def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
+def feasible_proposals(problem: Problem, *, is_oscillating: bool = True) -> Iterator[Proposal]:
     """Yield feasible trials: trials of the campaign with one thing changed.
 
     The changes are the [[proposal]] tables of `sentences.toml`.
@@ -281,7 +287,7 @@ def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
     ----------
     problem : Problem
         The campaign, whose trials are varied, and the model.
-    swings : bool
+    is_oscillating : bool
         Whether the motion after a release oscillates. If not, a longer record is not proposed, as
         it would only show the structure at rest.
     """
@@ -289,14 +295,14 @@ def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
         trials_of_kind = [
             trial for trial in problem.campaign.trials if trial.kind.value == row["kind"]
         ]
-        if not trials_of_kind or (row["change"] == "length" and not swings):
+        if not trials_of_kind or (row["change"] == "length" and not is_oscillating):
             continue
         min_or_max = min if row.get("of") == "smallest" else max
-        model_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
-        changed_trial = _changed_trial(problem, model_trial, row["change"], row["by"])
+        varied_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
+        changed_trial = _changed_trial(problem, varied_trial, row["change"], row["by"])
         if changed_trial is None:
             continue
-        level = model_trial.level
+        level = varied_trial.level
         description = row["description"].format(
             top=level,
             most=abs(row["by"]) * level,
@@ -304,7 +310,7 @@ def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
             value=changed_trial.value,
         )
         trial = replace(changed_trial.trial, name=row["name"])
-        yield Proposal(trial, description, row["reason"], row["cost"], changed_trial.added)
+        yield Proposal(trial, description, row["reason"], row["cost"], changed_trial.added_patch)
 
 
 class _ChangedTrial(NamedTuple):
@@ -317,13 +323,13 @@ class _ChangedTrial(NamedTuple):
     value : float
         The new value of a length, place or mass, as the description prints it; 0 if the load, the
         release or the temperature is changed.
-    added : ModelPatch
+    added_patch : ModelPatch
         The change of the structure.
     """
 
     trial: Trial
     value: float = 0.0
-    added: ModelPatch = NO_PATCH
+    added_patch: ModelPatch = NO_PATCH
 
 
 def _changed_trial(
@@ -360,8 +366,8 @@ def _changed_trial(
         return _ChangedTrial(replace(trial, load_place=(station, 0.35)), station)
     if change == "mass" and model.supports(PointMass):
         mass = amount * problem.setting.scales.modal_mass
-        at_tip = PointMass(mass, stations[1] if stations is not None else 0.0)
-        return _ChangedTrial(trial, 1e3 * mass, ModelPatch((at_tip,)))
+        tip_mass = PointMass(mass, stations[1] if stations is not None else 0.0)
+        return _ChangedTrial(trial, 1e3 * mass, ModelPatch((tip_mass,)))
     has_reference = problem.campaign.reference_temperature is not None
     if change == "temperature" and has_reference and model.supports(ModulusTemperature):
         return _ChangedTrial(replace(trial, temperature=trial.temperature + amount))

@@ -5,14 +5,14 @@ import numpy as np
 from discrepancy.search_settings import SEARCH
 from reporting.words import capital
 
-from .comparison import Comparison, H, families_at_places
+from .comparison import Comparison, HypothesisT, family_place_pairs
 from .conclusion import (
     effects_text,
     named_effects,
 )
 
 
-def shape_sentence(comparison: Comparison[H], best: H) -> str:
+def shape_sentence(comparison: Comparison[HypothesisT], best: HypothesisT) -> str:
     """Return the sentence on the shape parameters of a single law that the data determine.
 
     It is empty if there are none, or if the law explains less with a free shape in the decisive
@@ -21,42 +21,42 @@ def shape_sentence(comparison: Comparison[H], best: H) -> str:
     if len(best.candidate.terms) != 1:
         return ""
     (term,) = best.candidate.terms
-    free_shape_hypothesis = comparison.with_free_shape(best)
+    free_shape_hypothesis = comparison.fit_with_free_shape(best)
     if free_shape_hypothesis is None:
         return ""
-    least_share = comparison.decisive_share(best).value - SEARCH.slim
-    if comparison.decisive_share(free_shape_hypothesis).value < least_share:
+    least_share = comparison.held_out_or_fitted_share(best).value - SEARCH.least_added_share
+    if comparison.held_out_or_fitted_share(free_shape_hypothesis).value < least_share:
         return ""
     first_shape = len(free_shape_hypothesis.shared) + len(term.effect.parameters)
     deviations = np.sqrt(np.diag(free_shape_hypothesis.covariance))[first_shape:]
     (effect,) = named_effects(comparison.problem, free_shape_hypothesis)
     texts = []
     for parameter, deviation in zip(effect.shape, deviations, strict=True):
-        if deviation < SEARCH.told_by_data:
+        if deviation < SEARCH.determined_shape_deviation:
             description = parameter.description.split(" (")[0]
             interval = f"{parameter.low:.2g} to {parameter.high:.2g}"
             texts.append(f"{description} {parameter.value:.2g} ({interval})")
     return f" With a shape of its own: {', '.join(texts)}." if texts else ""
 
 
-def unproved_addition_sentence(comparison: Comparison[H], best: H) -> str:
+def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: HypothesisT) -> str:
     """Return the sentence on a further law that may act too, but has too little evidence.
 
     It is empty if there is none.
     """
-    families = families_at_places(best)
-    least_score = comparison.score(best) - SEARCH.contenders
+    families = family_place_pairs(best)
+    least_score = comparison.score(best) - SEARCH.contender_range
     larger_hypothesis = None
-    for other in comparison.ranked:
-        has_more_laws = families_at_places(other) > families
-        only_laws = all(comparison.acts_on_structure(term) for term in other.candidate.terms)
-        if has_more_laws and only_laws and comparison.score(other) > least_score:
-            larger_hypothesis = other
+    for hypothesis in comparison.ranked_hypotheses:
+        has_more_laws = family_place_pairs(hypothesis) > families
+        only_laws = all(comparison.acts_on_structure(term) for term in hypothesis.candidate.terms)
+        if has_more_laws and only_laws and comparison.score(hypothesis) > least_score:
+            larger_hypothesis = hypothesis
             break
     if larger_hypothesis is None:
         return ""
-    least_share = comparison.decisive_share(best).value + SEARCH.sliver
-    if comparison.decisive_share(larger_hypothesis).value < least_share:
+    least_share = comparison.held_out_or_fitted_share(best).value + SEARCH.negligible_share
+    if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
         return ""
     added = []
     for effect in named_effects(comparison.problem, larger_hypothesis):

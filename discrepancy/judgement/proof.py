@@ -17,15 +17,15 @@ from scipy import stats
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError
-from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square, of_channel
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits, mean_square_ratio
 from discrepancy.proof_record import ClosedShare, Proof, Scores
 from discrepancy.verdict import Gate
 
-from .closed_share import closed_share, rms_by_channel, with_noise_of
+from .closed_share import closed_share, residuals_with_noise_of, rms_by_channel
 
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""
-SMALLEST_GAP = 2.0
+LEAST_EXCESS_DEVIATIONS = 2.0
 """Least excess of χ² per sample over that of noise, in its standard deviations, for held-out trials
 to test a hypothesis."""
 HELD_OUT_DEVIATIONS = 3.0
@@ -33,7 +33,7 @@ HELD_OUT_DEVIATIONS = 3.0
 which a hypothesis fails."""
 COVERAGE = (0.80, 0.97)
 """Least and largest fraction of held-out samples that may lie within their 90 % intervals."""
-LEAST_COVERED = 200
+LEAST_SAMPLES_FOR_COVERAGE = 200
 """Least number of samples for that fraction to be tested."""
 ENOUGH_TRIALS = 5
 """Least number of trials for the scatter between them alone to give the error of a score."""
@@ -46,7 +46,7 @@ REMAINING_LEVEL = 0.01
 # ---------------------------------------------------------------- scores
 
 
-def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
+def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     """Return the scores of trials that are all fitted, or all held out.
 
     Parameters
@@ -55,7 +55,7 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         One or more trials with their predictions.
     seed : int
         The seed of the random numbers that are added to residuals of a fit to make them white, see
-        `ResidualSet.white`.
+        `ResidualSet.whitened_residuals`.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         raise FitError("Scores need at least one used sample, but there is none.")
     densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
-    white = residuals.white(np.random.default_rng(seed))
-    p_values = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
+    white = residuals.whitened_residuals(np.random.default_rng(seed))
+    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(white)]
     counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
@@ -95,9 +95,9 @@ def log_density(fitted: FittedTrial) -> FloatArray:
     It is ln N(residual; 0, predictive_deviation^2) + ln s0. A perfect model with exact parameters
     has -(1 + ln 2 pi) / 2 = -1.419 on average.
     """
-    z = fitted.residual / fitted.predictive_deviation
+    deviations = fitted.residual / fitted.predictive_deviation
     relative_deviation = fitted.predictive_deviation / fitted.noise_deviation
-    return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(relative_deviation) - 0.5 * z**2)
+    return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(relative_deviation) - 0.5 * deviations**2)
 
 
 @dataclass(frozen=True)
@@ -139,16 +139,16 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     absorbs, or plus what its uncertainty adds to held-out trials.
     """
     unknown = ChiSquare(nan, nan, nan)
-    channels = residuals.recorded
+    channels = residuals.recorded_channels
     if not channels:
         return unknown
-    _, freedom = mean_square(residuals, channels)
+    _, freedom = mean_square_ratio(residuals, channels)
     if freedom <= 0.0:
         return unknown
     squares = []
     variances = []
     for name in channels:
-        for fitted, column, used in of_channel(residuals.trials, name):
+        for fitted, column, used in channel_fits(residuals.trials, name):
             squares.append(fitted.standardised[used, column] ** 2)
             variances.append(fitted.expected_variance[used, column])
     expected = float(np.concatenate(variances).mean())
@@ -255,7 +255,7 @@ def _variance_of_sum(series: FloatArray) -> float:
     record as the motion decays. A difference has twice the variance of a sum.
     """
     parts = np.array_split(series, min(PARTS_OF_RECORD, series.size))
-    sums = np.array([part.sum() for part in parts])
+    sums = np.array([part_of_series.sum() for part_of_series in parts])
     if sums.size < 2:
         return 0.0
     return float(0.5 * np.sum(np.diff(sums) ** 2) * sums.size / (sums.size - 1))
@@ -281,7 +281,7 @@ def check_held_out(after: ResidualSet) -> Gate:
     """
     if after.held_out is None:
         return _held_out_gate(None, nan, "No trial was held out.")
-    held_out_scores = scores(after.held_out)
+    held_out_scores = compute_scores(after.held_out)
     excess = chi_square_of(after.held_out).excess
     if not isfinite(excess):
         return _held_out_gate(None, nan, "No noise record to judge them by.")
@@ -290,7 +290,7 @@ def check_held_out(after: ResidualSet) -> Gate:
         return _held_out_gate(False, excess, reason)
     least, largest = COVERAGE
     is_covered = least <= held_out_scores.coverage_90 <= largest
-    if held_out_scores.sample_count >= LEAST_COVERED and not is_covered:
+    if held_out_scores.sample_count >= LEAST_SAMPLES_FOR_COVERAGE and not is_covered:
         percent = 100.0 * held_out_scores.coverage_90
         reason = f"90 % intervals hold {percent:.0f} % of the samples of held-out trials."
         return _held_out_gate(False, excess, reason)
@@ -341,7 +341,7 @@ def closed_share_or_reason(
         return closed, "No trial was held out."
     chi_square_before = _chi_square_by_diagonal(before.held_out or before)
     chi_square_after = _chi_square_by_diagonal(after.held_out or after)
-    has_no_gap_before = chi_square_before.excess_over_noise < SMALLEST_GAP
+    has_no_gap_before = chi_square_before.excess_over_noise < LEAST_EXCESS_DEVIATIONS
     if has_no_gap_before and chi_square_after.excess_over_noise <= HELD_OUT_DEVIATIONS:
         chi_square = f"χ² per sample {chi_square_before.per_sample:.3g}, 1 for noise alone"
         return None, f"Held-out trials show no gap before: {chi_square}."
@@ -357,7 +357,7 @@ def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
     return chi_square_of(replace(residuals, trials=trials))
 
 
-def prove(
+def prove_effects(
     before: ResidualSet, after: ResidualSet, *, effects: tuple[str, ...] = (), seed: int = 0
 ) -> Proof:
     """Return the proof of an effect: errors and scores without and with it.
@@ -369,18 +369,18 @@ def prove(
     effects : tuple of str
         The labels of the effects that are added, see `discrepancy.verdict.effect_label`.
     seed : int
-        The seed of the draw for the test of whiteness, see `scores`.
+        The seed of the draw for the test of whiteness, see `compute_scores`.
 
     Raises
     ------
     FitError
         If no sample of the fitted or of the held-out trials is used.
     """
-    after = with_noise_of(after, before)
+    after = residuals_with_noise_of(after, before)
     held_out_before = _held_out_scores(before, seed)
     held_out_after = _held_out_scores(after, seed)
-    fitted_before = scores(before.fitted or before, seed=seed)
-    fitted_after = scores(after.fitted or after, seed=seed)
+    fitted_before = compute_scores(before.fitted or before, seed=seed)
+    fitted_after = compute_scores(after.fitted or after, seed=seed)
     closed, reason = closed_share_or_reason(before, after)
     gain = nan
     gain_error = nan
@@ -402,8 +402,8 @@ def prove(
 
 
 def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
-    """Return the scores of the held-out trials; None without any."""
-    return None if residuals.held_out is None else scores(residuals.held_out, seed=seed)
+    """Return the scores of the held-out trials; None if there is none."""
+    return None if residuals.held_out is None else compute_scores(residuals.held_out, seed=seed)
 
 
 def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
@@ -421,8 +421,8 @@ def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
         return "Without a noise record it is not known what remains."
     trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
     chi_square_phrase = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
-    channels = residuals.recorded
-    mean_square_residual, freedom = mean_square(residuals, channels)
+    channels = residuals.recorded_channels
+    mean_square_residual, freedom = mean_square_ratio(residuals, channels)
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
     if variance_p_value(mean_square_residual, freedom, noise_freedom) < REMAINING_LEVEL:
         by_channel = {name: _channel_chi_square(residuals, name) for name in channels}
@@ -439,6 +439,6 @@ def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:
     """Return the mean square residual of a channel over its noise variance."""
     squares = []
-    for fitted, column, used in of_channel(residuals.trials, name):
+    for fitted, column, used in channel_fits(residuals.trials, name):
         squares.append(fitted.standardised[used, column] ** 2)
     return float(np.concatenate(squares).mean())

@@ -17,7 +17,7 @@ from reporting.words import listing
 
 # ---------------------------------------------------------------- when there is a gap
 
-NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
 """Kinds of verdicts by which the model stands as it is."""
 MOST_MENTIONED = 3
 """Windows, or effects that were not tested, that a sentence mentions one by one."""
@@ -43,7 +43,7 @@ def window_text(window: GapWindow) -> str:
     return f"{since}, to the end of the record"
 
 
-def when_sentence(windows: Sequence[GapWindow]) -> str:
+def gap_times_sentence(windows: Sequence[GapWindow]) -> str:
     """Return a sentence on when the model without effect has a gap; empty without a gap in time.
 
     Parameters
@@ -59,13 +59,13 @@ def when_sentence(windows: Sequence[GapWindow]) -> str:
     if len(without_effect) > MOST_MENTIONED:
         largest = max(without_effect, key=lambda window: window.size)
         count = len(without_effect)
-        return f"The gap comes and goes, {count} times; the largest is {_sized_window(largest)}."
+        return f"The gap comes and goes, {count} times; the largest is {_gap_window_text(largest)}."
     # gaps that begin inside a record first, then the others; the largest of each first
     ordered = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
-    return f"The gap is there {'; '.join(_sized_window(window) for window in ordered)}."
+    return f"The gap is there {'; '.join(_gap_window_text(window) for window in ordered)}."
 
 
-def _sized_window(window: GapWindow) -> str:
+def _gap_window_text(window: GapWindow) -> str:
     """Return in words the trial, the time and the size of a gap."""
     size = f"{window.size:.2g}"
     if "e+0" in size:
@@ -73,7 +73,7 @@ def _sized_window(window: GapWindow) -> str:
     return f"in {window.trial!r} {window_text(window)}, {size} times the noise"
 
 
-def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
+def sentence_with_times(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
     """Return the sentence of a verdict, with the times of its gap or effects if informative.
 
     Parameters
@@ -83,19 +83,19 @@ def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
     windows : sequence of GapWindow
         The windows of gaps.
     """
-    when = acting_sentence(verdict.effects)
-    is_informative = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not when and verdict.kind not in NO_GAP and is_informative:
-        when = when_sentence(windows)
-    return f"{verdict.sentence} {when}".strip()
+    times_sentence = active_windows_sentence(verdict.effects)
+    is_informative = has_gap_beginning_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
+    if not times_sentence and verdict.kind not in KINDS_WITHOUT_GAP and is_informative:
+        times_sentence = gap_times_sentence(windows)
+    return f"{verdict.sentence} {times_sentence}".strip()
 
 
-def begins_inside(windows: Sequence[GapWindow]) -> bool:
+def has_gap_beginning_inside(windows: Sequence[GapWindow]) -> bool:
     """Return whether a gap of the model without effect begins inside a record, as by an event."""
     return any(window.begin is not None for window in windows if not window.with_effect)
 
 
-def acting_sentence(effects: Sequence[NamedEffect]) -> str:
+def active_windows_sentence(effects: Sequence[NamedEffect]) -> str:
     """Return the sentences on effects that act only in windows of time; empty if there are none."""
     sentences = []
     for effect in effects:
@@ -117,7 +117,9 @@ def acting_sentence(effects: Sequence[NamedEffect]) -> str:
 # ---------------------------------------------------------------- what was not compared
 
 
-def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
+def verdict_with_untested_effects(
+    verdict: Verdict, setting: Setting, effects: Sequence[Effect]
+) -> Verdict:
     """Return the verdict with a sentence on the effects that could not be tested.
 
     The sentence is added only to a verdict on a group or on several effects. An effect that needs
@@ -173,27 +175,29 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
         return None
     named = {effect.identifier: effect.name for effect in verdict.effects}
     compared_by_identifier = {effect.identifier: effect for effect in compared}
-    likenesses = _likenesses(set(named), compared_by_identifier)
-    tried = sorted(likenesses & compared_by_identifier.keys())
-    untried = sorted(likenesses - compared_by_identifier.keys())
+    similar = _similar_effects(set(named), compared_by_identifier)
+    compared_similar = sorted(similar & compared_by_identifier.keys())
+    not_compared_similar = sorted(similar - compared_by_identifier.keys())
     does = "does" if len(named) == 1 else "do together"
     remark = (
         "A cause that the catalogue lacks and that acts on these trials as "
         f"{' and '.join(named.values())} {does}, within the noise, would be given the same name."
     )
-    not_compared = f"{', '.join(untried)} {_was(untried)} not compared."
-    if tried:
+    not_compared = (
+        f"{', '.join(not_compared_similar)} {_was_or_were(not_compared_similar)} not compared."
+    )
+    if compared_similar:
         remark += (
-            f" Of what is known to look alike, {', '.join(tried)} {_was(tried)} compared, "
-            "with less evidence"
+            f" Of what is known to look alike, {', '.join(compared_similar)} "
+            f"{_was_or_were(compared_similar)} compared, with less evidence"
         )
-        return f"{remark}; {not_compared}" if untried else f"{remark}."
-    if untried:
+        return f"{remark}; {not_compared}" if not_compared_similar else f"{remark}."
+    if not_compared_similar:
         return f"{remark} Of what is known to look alike, {not_compared}"
     return remark
 
 
-def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
+def _similar_effects(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
     """Return the identifiers of effects that are similar to a named one.
 
     The catalogue declares this for either of the two effects (`Effect.confusable`).
@@ -207,6 +211,6 @@ def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
     return likenesses - named
 
 
-def _was(names: Sequence[str]) -> str:
+def _was_or_were(names: Sequence[str]) -> str:
     """Return "was" for one name and "were" for several."""
     return "was" if len(names) == 1 else "were"

@@ -24,7 +24,7 @@ from .conclusion import (
     VerdictOutcome,
     below_limit_sentence,
     named_effects,
-    plain_names,
+    names_without_free_shape,
 )
 from .consistency_gate import check_consistency
 
@@ -36,19 +36,19 @@ class CheckedFit(NamedTuple):
     """A fit with the outcomes of the tests of absolute fit and consistency."""
 
     fit: CandidateFit
-    absolute: Gate
+    absolute_fit: Gate
     consistency: Gate
 
 
-class FittedMember(NamedTuple):
+class FittedEffectSet(NamedTuple):
     """A set of effects that may be a member of a group, its fit, and the test of absolute fit."""
 
-    names: EffectSet
+    effect_names: EffectSet
     fit: CandidateFit
-    absolute: Gate
+    absolute_fit: Gate
 
 
-class Case:
+class VerdictCase:
     """A search with all quantities that the rules of a verdict need, and the verdicts themselves.
 
     Parameters
@@ -57,7 +57,7 @@ class Case:
         The search with all candidates.
     probabilities : mapping of tuple of str to float
         The probability of each set of effects, the most probable first.
-    leading : tuple of str, optional
+    leading_set : tuple of str, optional
         The set that is considered for a name; the most probable one if left out.
     """
 
@@ -65,18 +65,18 @@ class Case:
         self,
         search: Search,
         probabilities: Mapping[EffectSet, float],
-        leading: EffectSet | None = None,
+        leading_set: EffectSet | None = None,
     ) -> None:
         self.problem = search.problem
         self.search = search
         self.probabilities = probabilities
-        self.leading = next(iter(probabilities)) if leading is None else leading
-        self.best = search.best()
-        if self.leading:
-            self.best = search.fit_exactly(search.best_fit_of_set(self.leading))
-        self.conclusion = Conclusion.from_probabilities(search, self.best, probabilities)
-        self.probability_of_none = probabilities.get((), 0.0)
-        self.has_evidence = self.conclusion.log_bayes_factor >= SEARCH.bayes_factor
+        self.leading_set = next(iter(probabilities)) if leading_set is None else leading_set
+        self.leading_fit = search.best()
+        if self.leading_set:
+            self.leading_fit = search.fit_exactly(search.best_fit_of_set(self.leading_set))
+        self.conclusion = Conclusion.from_probabilities(search, self.leading_fit, probabilities)
+        self.no_effect_probability = probabilities.get((), 0.0)
+        self.has_enough_evidence = self.conclusion.log_bayes_factor >= SEARCH.least_log_bayes_factor
         self.no_effect_gate = check_absolute_fit(self.problem, search.no_effect)
 
     # ---------------------------------------------------------------- how probable
@@ -88,7 +88,9 @@ class Case:
         That is so if the most probable set is not the empty one, and either its Bayes factor is
         large enough or the model without effect fails the test of absolute fit.
         """
-        return bool(self.leading) and (self.has_evidence or self.no_effect_gate.passed is False)
+        return bool(self.leading_set) and (
+            self.has_enough_evidence or self.no_effect_gate.has_failed
+        )
 
     @cached_property
     def probability(self) -> float:
@@ -97,22 +99,22 @@ class Case:
         It is summed over all sets that contain the leading one, with or without further effects.
         For a law of free shape it includes all effects of its family.
         """
-        leading = set(plain_names(self.leading))
+        leading = set(names_without_free_shape(self.leading_set))
         total: float = 0
         for names, probability in self.probabilities.items():
-            if leading <= set(plain_names(names)):
+            if leading <= set(names_without_free_shape(names)):
                 total += probability
         if (
-            self.best.candidate.has_free_shape
+            self.leading_fit.candidate.has_free_shape
         ):  # one family is reached from several members or places
-            family = self.best.candidate.terms[0].effect.family
+            family = self.leading_fit.candidate.terms[0].effect.family
             total = max(total, _family_probability(self.search, family))
         return min(total, 1.0)
 
     @property
     def is_sure(self) -> bool:
         """Whether the leading set is probable enough and has enough evidence to be named."""
-        return self.probability >= SEARCH.sure and self.has_evidence
+        return self.probability >= SEARCH.name_probability and self.has_enough_evidence
 
     @cached_property
     def probable_sets(self) -> list[EffectSet]:
@@ -122,12 +124,12 @@ class Case:
     # ---------------------------------------------------------------- tests
 
     @cached_property
-    def tested(self) -> CheckedFit:
+    def tested_set(self) -> CheckedFit:
         """The leading set with the tests of absolute fit and consistency."""
         return CheckedFit(
-            self.best,
-            check_absolute_fit(self.problem, self.best),
-            check_consistency(self.problem, self.best),
+            self.leading_fit,
+            check_absolute_fit(self.problem, self.leading_fit),
+            check_consistency(self.problem, self.leading_fit),
         )
 
     @cached_property
@@ -137,8 +139,8 @@ class Case:
         None if no effect of the set has a shape parameter.
         """
         fits_with_free_shape = []
-        for number in range(len(self.best.candidate.terms)):
-            free_fit = fit_free_shape(self.problem, self.best, number)
+        for term_index in range(len(self.leading_fit.candidate.terms)):
+            free_fit = fit_free_shape(self.problem, self.leading_fit, term_index)
             if free_fit is not None:
                 fits_with_free_shape.append(free_fit)
         return max(fits_with_free_shape, key=lambda fit: fit.log_evidence, default=None)
@@ -146,7 +148,7 @@ class Case:
     @cached_property
     def shape_gate(self) -> Gate:
         """The test whether a free shape explains more than the effects as they are."""
-        return check_shape(self.best, self._best_free_shape)
+        return check_shape(self.leading_fit, self._best_free_shape)
 
     @property
     def family_fit(self) -> CandidateFit | None:
@@ -159,25 +161,25 @@ class Case:
 
         The test of shape is left out if a shape is free already.
         """
-        if self.best.candidate.has_free_shape:
-            return self.tested.absolute, self.tested.consistency
-        return self.tested.absolute, self.shape_gate, self.tested.consistency
+        if self.leading_fit.candidate.has_free_shape:
+            return self.tested_set.absolute_fit, self.tested_set.consistency
+        return self.tested_set.absolute_fit, self.shape_gate, self.tested_set.consistency
 
     @property
-    def passes(self) -> bool:
+    def passes_all_tests(self) -> bool:
         """Whether no test that could be applied fails."""
         return not _any_fails(self.all_gates)
 
     @cached_property
-    def tested_family(self) -> CheckedFit | None:
+    def tested_family_set(self) -> CheckedFit | None:
         """The leading set with one law of free shape, and its tests; None if it may not be named.
 
         A free shape counts as one more effect, so the set must not have the largest size already.
         A law of free shape together with a second law could fit nearly anything.
         """
-        candidate = self.best.candidate
+        candidate = self.leading_fit.candidate
         family_fit = None if candidate.has_free_shape else self.family_fit
-        patches = candidate.patches(self.problem.setting, self.best.effect)
+        patches = candidate.patches(self.problem.setting, self.leading_fit.effect)
         law_count = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
         if family_fit is None or law_count > 1 or len(patches) == SEARCH.largest_set:
             return None
@@ -189,15 +191,15 @@ class Case:
 
     # ---------------------------------------------------------------- verdicts
 
-    def gap(self) -> VerdictOutcome:
+    def gap_verdict(self) -> VerdictOutcome:
         """Return the verdict that there is a gap which no effect of the catalogue explains."""
         sentence = (
             f"There is a gap that no effect of the catalogue explains. {self.no_effect_gate.reason}"
         )
-        probability = self.probabilities[self.leading]
-        return self._unexplained(sentence, probability, (self.no_effect_gate,))
+        probability = self.probabilities[self.leading_set]
+        return self._unexplained_verdict(sentence, probability, (self.no_effect_gate,))
 
-    def nothing_missing(self) -> VerdictOutcome:
+    def nothing_missing_verdict(self) -> VerdictOutcome:
         """Return the verdict that nothing is missing."""
         if self.no_effect_gate.passed:
             sentence = "The model explains the data within their noise."
@@ -206,90 +208,95 @@ class Case:
                 "No effect of the catalogue explains the data better than the model does. "
                 f"{self.no_effect_gate.reason}"
             )
-        return self.conclusion.outcome(
+        return self.conclusion.build_outcome(
             VerdictKind.NOTHING_MISSING,
             sentence,
-            self.probability_of_none,
+            self.no_effect_probability,
             gates=(self.no_effect_gate,),
         )
 
-    def common_effects(self) -> VerdictOutcome | None:
+    def common_effects_verdict(self) -> VerdictOutcome | None:
         """Return the verdict that names the effects which all probable sets have in common.
 
         It does not depend on which further effects there are. None is returned if these effects are
         not a probable set themselves, or cannot be named.
         """
-        common = set.intersection(*(set(plain_names(names)) for names in self.probable_sets))
+        common = set.intersection(
+            *(set(names_without_free_shape(names)) for names in self.probable_sets)
+        )
         common_set = next((names for names in self.probable_sets if set(names) == common), None)
         if not common_set:
             return None
-        case = Case(self.search, self.probabilities, common_set)
+        case = VerdictCase(self.search, self.probabilities, common_set)
         if not case.is_sure:
             return None
-        outcome = decide(case)
+        outcome = decide_verdict(case)
         return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
 
-    def open(self) -> VerdictOutcome:
+    def undecided_verdict(self) -> VerdictOutcome:
         """Return the verdict if no set reaches the probability that a name needs."""
         if () in self.probable_sets:
-            return self._below_limit()
+            return self._below_limit_verdict()
         members = []
         for names in self.probable_sets:
             fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
-            members.append(FittedMember(names, fit, check_absolute_fit(self.problem, fit)))
+            members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are no members, and their probability is not counted
-        fitting = [member for member in members if member.absolute.passed is not False]
-        probability = sum(self.probabilities[member.names] for member in fitting)
+        fitting = [member for member in members if not member.absolute_fit.has_failed]
+        probability = sum(self.probabilities[member.effect_names] for member in fitting)
         # an effect with its canonical and with a free shape is one member
-        distinct: dict[EffectSet, FittedMember] = {}
+        distinct: dict[EffectSet, FittedEffectSet] = {}
         for member in fitting:
-            distinct.setdefault(plain_names(member.names), member)
+            distinct.setdefault(names_without_free_shape(member.effect_names), member)
         group = list(distinct.values())
         if not group or len(group) > SEARCH.largest_group:
-            return self._no_group(members[0], len(group))
-        return self._group(group, probability)
+            return self._no_group_verdict(members[0], len(group))
+        return self._group_verdict(group, probability)
 
-    def _below_limit(self) -> VerdictOutcome:
+    def _below_limit_verdict(self) -> VerdictOutcome:
         """Return the verdict that something may be missing, but is too small to be detected."""
         possible_effects = sorted(
-            {name for names in self.probable_sets for name in plain_names(names)}
+            {name for names in self.probable_sets for name in names_without_free_shape(names)}
         )
-        return self.conclusion.outcome(
+        return self.conclusion.build_outcome(
             VerdictKind.BELOW_LIMIT,
             below_limit_sentence(possible_effects),
             sum(self.probabilities[names] for names in self.probable_sets),
-            self.best,
+            self.leading_fit,
             group=tuple(possible_effects),
-            gates=(check_absolute_fit(self.problem, self.best),),
+            gates=(check_absolute_fit(self.problem, self.leading_fit),),
         )
 
-    def _no_group(self, first: FittedMember, count: int) -> VerdictOutcome:
+    def _no_group_verdict(self, most_probable: FittedEffectSet, count: int) -> VerdictOutcome:
         """Return the verdict of a gap if none of the probable sets passes the test, or too many do.
 
         Parameters
         ----------
-        first : FittedMember
+        most_probable : FittedEffectSet
             The most probable set.
         count : int
             The number of sets that pass the test of absolute fit.
         """
-        sentence = f"There is a gap that no effect of the catalogue fits. {first.absolute.reason}"
+        reason = most_probable.absolute_fit.reason
+        sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
         if count:
             sentence = f"There is a gap, and {count} explanations fit it alike."
-        return self.conclusion.outcome(
+        return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
             sum(self.probabilities[names] for names in self.probable_sets),
-            gates=(first.absolute,),
-            resembles=plain_names(first.names),
+            gates=(most_probable.absolute_fit,),
+            resembles=names_without_free_shape(most_probable.effect_names),
         )
 
-    def _group(self, members: Sequence[FittedMember], probability: float) -> VerdictOutcome:
+    def _group_verdict(
+        self, members: Sequence[FittedEffectSet], probability: float
+    ) -> VerdictOutcome:
         """Return the verdict that one of several sets is missing, which cannot be told apart.
 
         Parameters
         ----------
-        members : sequence of FittedMember
+        members : sequence of FittedEffectSet
             The sets.
         probability : float
             The probability that one of them is missing.
@@ -298,105 +305,111 @@ class Case:
         effects: list[NamedEffect] = []
         for fit in fits:
             effects.extend(named_effects(self.problem, fit))
-        names = listing((" + ".join(member.names) for member in members), "or")
+        names = listing((" + ".join(member.effect_names) for member in members), "or")
         if len(members) > 1:
             sentence = f"Either {names} is missing; these data cannot tell which."
         else:
             sentence = (
                 f"There is a gap that {names} fits, but not with the probability that a name needs."
             )
-        return self.conclusion.outcome(
+        return self.conclusion.build_outcome(
             VerdictKind.GROUP,
             sentence,
             probability,
             fits[0],
             effects=tuple(effects),
-            group=tuple(" + ".join(plain_names(member.names)) for member in members),
-            gates=(members[0].absolute,),
+            group=tuple(
+                " + ".join(names_without_free_shape(member.effect_names)) for member in members
+            ),
+            gates=(members[0].absolute_fit,),
         )
 
-    def named(self) -> VerdictOutcome:
+    def named_verdict(self) -> VerdictOutcome:
         """Return the verdict that names the leading set."""
-        fit = with_draws(self.problem, self.best)
-        return self.conclusion.named(fit, self.probability, self.all_gates)
+        fit = with_draws(self.problem, self.leading_fit)
+        return self.conclusion.build_named_outcome(fit, self.probability, self.all_gates)
 
-    def family(self) -> VerdictOutcome:
+    def family_verdict(self) -> VerdictOutcome:
         """Return the verdict that names the family of the leading set, with a free shape."""
-        if self.tested_family is None:
-            tested = self.tested
-            gates: tuple[Gate, ...] = (tested.absolute, tested.consistency)
+        if self.tested_family_set is None:
+            tested = self.tested_set
+            gates: tuple[Gate, ...] = (tested.absolute_fit, tested.consistency)
         else:
-            tested = self.tested_family
-            gates = (tested.absolute, self.shape_gate, tested.consistency)
-        return self.conclusion.family(tested.fit, self.probability, gates)
+            tested = self.tested_family_set
+            gates = (tested.absolute_fit, self.shape_gate, tested.consistency)
+        return self.conclusion.build_family_outcome(tested.fit, self.probability, gates)
 
-    def unfit(self) -> VerdictOutcome:
+    def failed_test_verdict(self) -> VerdictOutcome:
         """Return the verdict of an unexplained gap, as the set or its family fails a test."""
-        tested = self.tested_family or self.tested
-        reason = tested.absolute.reason
-        if tested.absolute.passed is not False and tested.consistency.passed is False:
+        tested = self.tested_family_set or self.tested_set
+        reason = tested.absolute_fit.reason
+        if not tested.absolute_fit.has_failed and tested.consistency.has_failed:
             reason = tested.consistency.reason
-        if self.best.candidate.has_free_shape:
+        if self.leading_fit.candidate.has_free_shape:
             sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
-            gates = (tested.absolute, tested.consistency)
-            return self._unexplained(sentence, self.probability, gates)
-        if self.family_fit is not None and self.tested_family is None:
+            gates = (tested.absolute_fit, tested.consistency)
+            return self._unexplained_verdict(sentence, self.probability, gates)
+        if self.family_fit is not None and self.tested_family_set is None:
             reason = (
                 "one of them would need a shape of its own, and with so much freedom nearly "
                 "anything fits."
             )
-        nearest = " with ".join(self.best.candidate.identifiers)
+        nearest = " with ".join(self.leading_fit.candidate.identifiers)
         clause = f"{reason[0].lower()}{reason[1:]}"
         sentence = (
             f"There is a gap that no effect of the catalogue fits; the nearest is {nearest}, but "
             f"{clause}"
         )
-        gates_with_shape = (tested.absolute, self.shape_gate, tested.consistency)
-        return self._unexplained(sentence, self.probability, gates_with_shape)
+        gates_with_shape = (tested.absolute_fit, self.shape_gate, tested.consistency)
+        return self._unexplained_verdict(sentence, self.probability, gates_with_shape)
 
-    def _unexplained(
+    def _unexplained_verdict(
         self, sentence: str, probability: float, gates: tuple[Gate, ...]
     ) -> VerdictOutcome:
         """Return the verdict of an unexplained gap, with the leading set as what it resembles."""
-        return self.conclusion.outcome(
+        return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
             probability,
             gates=gates,
-            resembles=plain_names(self.best.candidate.identifiers),
+            resembles=names_without_free_shape(self.leading_fit.candidate.identifiers),
         )
 
 
-def decide(case: Case) -> VerdictOutcome:
+def decide_verdict(case: VerdictCase) -> VerdictOutcome:
     """Return the verdict by the first rule that holds.
 
     The rules in words are the `[[rule]]` tables of `sentences.toml`, in the same order.
     """
     if not case.has_leading_set:
-        if case.no_effect_gate.passed is False:
-            return case.gap()
-        if case.leading and case.probability_of_none < SEARCH.unsure:
-            return case.open()
-        return case.nothing_missing()
+        if case.no_effect_gate.has_failed:
+            return case.gap_verdict()
+        if case.leading_set and case.no_effect_probability < SEARCH.inconclusive_probability:
+            return case.undecided_verdict()
+        return case.nothing_missing_verdict()
     if not case.is_sure:
-        return case.common_effects() or case.open()
-    if case.passes:
-        return case.family() if case.best.candidate.has_free_shape else case.named()
-    family = case.tested_family
-    if family is None or _any_fails((family.absolute, family.consistency)):
-        return case.unfit()
-    return case.family()
+        return case.common_effects_verdict() or case.undecided_verdict()
+    if case.passes_all_tests:
+        return (
+            case.family_verdict()
+            if case.leading_fit.candidate.has_free_shape
+            else case.named_verdict()
+        )
+    family = case.tested_family_set
+    if family is None or _any_fails((family.absolute_fit, family.consistency)):
+        return case.failed_test_verdict()
+    return case.family_verdict()
 
 
 def _any_fails(gates: Iterable[Gate]) -> bool:
     """Return whether a test fails; a test that could not be made has not failed."""
-    return any(gate.passed is False for gate in gates)
+    return any(gate.has_failed for gate in gates)
 
 
 def most_probable_sets(probabilities: Mapping[EffectSet, float]) -> list[EffectSet]:
     """Return the most probable sets whose probabilities add up to that which a name needs."""
     cumulative = np.cumsum(list(probabilities.values()))
-    return list(probabilities)[: int(np.searchsorted(cumulative, SEARCH.sure)) + 1]
+    return list(probabilities)[: int(np.searchsorted(cumulative, SEARCH.name_probability)) + 1]
 
 
 def _family_probability(search: Search, family: str) -> float:

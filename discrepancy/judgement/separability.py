@@ -26,12 +26,12 @@ from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
 
-CONFUSED = 9.0
+CONFUSION_DISTANCE = 9.0
 """Squared distance below which two effects form a confusion group [sigma^2]."""
-DETECTED = 25.0
+DETECTION_DISTANCE = 25.0
 """Squared distance from the model at which an effect is found [sigma^2]: 3 nats of Bayes factor,
 the cost of its parameters and of its place in the catalogue."""
-LEAST_VISIBLE = 1e-6
+VISIBILITY_DISTANCE = 1e-6
 """Squared distance from the model below which an effect is not compared with others [sigma^2]."""
 
 
@@ -97,7 +97,7 @@ class Separability:
 # ---------------------------------------------------------------- a campaign as predicted
 
 
-def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
+def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
     """Return a campaign in which the readings are replaced by those that the model predicts.
 
     Such readings leave no residuals from which an unrecorded noise could be estimated. So a channel
@@ -116,9 +116,9 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     problem = Problem(campaign, model, setting)
     point = prior_point_with_initial_states(problem)
     predictions = {}
-    for number, data in enumerate(problem.trials):
-        response = problem.response_of_candidate(number, point, Candidate())
-        predictions[data.trial.name] = problem.prediction(number, point, response)
+    for trial_index, data in enumerate(problem.trials):
+        response = problem.response_of_candidate(trial_index, point, Candidate())
+        predictions[data.trial.name] = problem.prediction(trial_index, point, response)
     trials: list[Trial] = []
     for trial in campaign.trials:
         if trial.name in predictions:
@@ -165,7 +165,7 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
 # ---------------------------------------------------------------- detection and separation
 
 
-def separability(
+def compute_separability(
     campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
 ) -> Separability:
     """Return which effects a campaign can detect, and which it can tell apart.
@@ -174,7 +174,7 @@ def separability(
     ----------
     campaign : Campaign
         The campaign with its inputs, channels and noise records. The readings are used only to
-        determine unknown initial states, see `as_predicted`.
+        determine unknown initial states, see `campaign_as_predicted`.
     model : Model
         The model as it is.
     setting : Setting
@@ -182,7 +182,7 @@ def separability(
     effects : sequence of Effect
         The catalogue.
     """
-    problem = Problem(as_predicted(campaign, model, setting), model, setting)
+    problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
     screen = Screen(problem, fit(problem, Candidate(), start, iterations=1))
     detectability: list[Detectability] = []
@@ -201,7 +201,7 @@ def separability(
         small = _SmallChange(*screen.shrink_change(best))
         distance = min(best.squared_size, small.change.squared_size / small.factor**2)
         detectability.append(_detectability(effect, best, distance))
-        if best.squared_size > LEAST_VISIBLE:
+        if best.squared_size > VISIBILITY_DISTANCE:
             visible.append(_VisibleEffect(effect.identifier, best, [best, *options]))
     identifiers = tuple(effect.identifier for effect in visible)
     distance_matrix = _distances(screen, visible)
@@ -263,7 +263,7 @@ def _reference_change(
     if not references:
         return None
     best = max(references, key=lambda change: change.squared_size)
-    if best.squared_size < DETECTED:  # its median place may be where nothing is measured
+    if best.squared_size < DETECTION_DISTANCE:  # its median place may be where nothing is measured
         at_reference = [change for change in options if _has_reference_magnitude(change)]
         best = max([best, *at_reference], key=lambda change: change.squared_size)
     return best
@@ -279,9 +279,9 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
     for place in effect.places(screen.problem.setting):
         term = EffectTerm(effect, place)
         start = term.start_values()
-        for number, parameter in enumerate(term.parameters):
+        for index, parameter in enumerate(term.parameters):
             if parameter.magnitude and parameter.prior.value(0.0) == 0.0:
-                start[number] = 1.0
+                start[index] = 1.0
         with suppress(DiscrepancyError):
             changes.append(screen.change_by_effect(term, start))
     return changes
@@ -289,8 +289,8 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
     """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
-    for parameter, u in zip(change.term.parameters, change.effect_values, strict=True):
-        if parameter.magnitude and abs(u) not in (0.0, 1.0):
+    for parameter, scaled_value in zip(change.term.parameters, change.effect_values, strict=True):
+        if parameter.magnitude and abs(scaled_value) not in (0.0, 1.0):
             return False
     return True
 
@@ -310,10 +310,10 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     distance : float
         The squared distance of that change from the model [sigma^2].
     """
-    for number, parameter in enumerate(change.term.parameters):
+    for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.effect_values[number])))
-            detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
+            typical = abs(parameter.prior.value(float(change.effect_values[index])))
+            detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
             return Detectability(
                 effect=effect,
                 reason="",
@@ -341,24 +341,30 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     (E, E) array
         The distances, see `Separability.distance` [sigma^2].
     """
-    small_options = [
-        [_SmallChange(*screen.shrink_change(change)) for change in effect.options]
-        for effect in effects
-    ]
+    small_changes = [_small_changes(screen, effect) for effect in effects]
     distance = np.zeros((len(effects), len(effects)))
     for i, effect in enumerate(effects):
         reference = effect.reference
-        small_reference = small_options[i][0]
+        small_reference = small_changes[i][0]
         for j, other in enumerate(effects):
             if i == j:
                 continue
-            other_changes = [small.change for small in small_options[j]]
-            first_order = _squared_distance(screen, small_reference.change, other_changes)
+            small_changes_of_other = [small.change for small in small_changes[j]]
+            first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
             least_distance = min(_squared_distance(screen, reference, other.options), first_order)
-            distance[i, j] = least_distance * max(1.0, DETECTED / reference.squared_size)
+            distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
     return distance
+
+
+def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]:
+    """Return the changes of an effect, each with a magnitude at which it is linear."""
+    small_changes = []
+    for option in effect.options:
+        change, factor = screen.shrink_change(option)
+        small_changes.append(_SmallChange(change, factor))
+    return small_changes
 
 
 def _squared_distance(
@@ -392,15 +398,17 @@ def _squared_distance(
     nearest = max(options, key=cosine)
     if nearest.squared_size <= 0.0:
         return target.squared_size
-    # spanning changes: the nearest option, and its differences by the parameters
+    # spanning changes: the nearest option, and its differences by the parameters, over ten times
+    # the step of derivatives
     changes = [nearest.vector]
-    for number in range(len(nearest.effect_values)):
+    for index in range(len(nearest.effect_values)):
         stepped = nearest.effect_values.copy()
-        stepped[number] += 10.0 * PARAMETER_STEP
+        stepped[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
             change = screen.change_by_effect(nearest.term, stepped)
             changes.append(change.vector - nearest.vector)
-    # least squares by normal equations, scaled to unit length and regularised
+    # least squares by normal equations, scaled to unit length; a small multiple of the identity is
+    # added because changes by several parameters may be nearly parallel
     spanning_changes = np.stack(changes)
     gram = (spanning_changes * sign) @ spanning_changes.T
     lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -413,14 +421,17 @@ def _squared_distance(
 def _confusion_groups(
     identifiers: Sequence[str], distance: FloatArray
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the connected sets of effects that are closer than `CONFUSED` in either direction."""
-    is_confused = np.minimum(distance, distance.T) < CONFUSED
+    """Return the connected sets of effects that these data cannot tell apart.
+
+    Two effects are connected if they are closer than `CONFUSION_DISTANCE` in either direction.
+    """
+    is_confused = np.minimum(distance, distance.T) < CONFUSION_DISTANCE
     _, labels = connected_components(is_confused)
     groups = []
     for label in range(labels.max(initial=-1) + 1):
-        numbers = np.flatnonzero(labels == label).tolist()
-        if len(numbers) > 1:
-            groups.append(tuple(identifiers[number] for number in numbers))
+        indices = np.flatnonzero(labels == label).tolist()
+        if len(indices) > 1:
+            groups.append(tuple(identifiers[index] for index in indices))
     return tuple(groups)
 
 

@@ -29,7 +29,7 @@ class SimulationComparison(Comparison[CandidateFit]):
     The wider noise is as large as the residuals of the best hypothesis, see `search.wide_noise`.
     """
 
-    least_low_end = SEARCH.least_share
+    least_low_end = SEARCH.least_gap_share
 
     def __init__(self, search: Search) -> None:
         super().__init__(search)
@@ -41,7 +41,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         return self.search.compared_no_effect
 
     @property
-    def ranked(self) -> Sequence[CandidateFit]:
+    def ranked_hypotheses(self) -> Sequence[CandidateFit]:
         """All hypotheses, the most probable first."""
         return sorted(self.search.compared_fits().values(), key=lambda fit: -self.search.score(fit))
 
@@ -50,7 +50,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         return ""
 
     @cached_property
-    def _noise_scale(self) -> dict[str, float]:
+    def _noise_scales(self) -> dict[str, float]:
         """The factor on the noise deviation of residual sets, by channel.
 
         It is 1 with a noise record. Without one, the noise of the residual sets is that of all
@@ -65,50 +65,61 @@ class SimulationComparison(Comparison[CandidateFit]):
         )
         return dict(zip(problem.channel_names, np.sqrt(relative_variances).tolist(), strict=True))
 
-    def _gap_share(self, hypothesis: CandidateFit, *, held_out: bool) -> GapShare:
+    def _compute_gap_share(self, hypothesis: CandidateFit, *, held_out: bool) -> GapShare:
         """Return the share of the gap between readings and simulation that a hypothesis explains.
 
         Squared residuals are summed over blocks of the records, for the bootstrap of the share.
         """
-        blocks = []
-        trial_count = 0
         without_effect = self.residuals(self.search.no_effect).trials
         with_effect = self.residuals(hypothesis).trials
-        for before, after in zip(
-            _in_role(without_effect, held_out=held_out),
-            _in_role(with_effect, held_out=held_out),
-            strict=True,
-        ):
-            noise = before.noise_deviation * [
-                self._noise_scale[name] for name in before.trial.channels
-            ]
-            squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
-            squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
-            sample_count = len(before.used)
-            block_count = 1
-            if before.trial.is_dynamic:
-                block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
-            for block in np.array_split(np.arange(sample_count), block_count):
-                sums = [
-                    float(squares[block].sum())
-                    for squares in (squares_before, squares_after, before.used)
-                ]
-                blocks.append(sums)
-            trial_count += 1
+        trials_before = _trials_in_role(without_effect, held_out=held_out)
+        trials_after = _trials_in_role(with_effect, held_out=held_out)
+        blocks: list[list[float]] = []
+        for before, after in zip(trials_before, trials_after, strict=True):
+            blocks += self._block_sums(before, after)
         sums_before, sums_after, noise_sums = np.array(blocks).T
         return GapShare(
             squares_before=sums_before,
             squares_after=sums_after,
             noise_squares=noise_sums,
             held_out=held_out,
-            trial_count=trial_count,
+            trial_count=len(trials_before),
             remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
             total_rms=_rms_beyond_noise(sums_before, noise_sums),
             kind=OF_READINGS,
             is_tested=True,
         )
 
-    def fit_followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
+    def _block_sums(self, before: FittedTrial, after: FittedTrial) -> list[list[float]]:
+        """Return sums over each block of a trial without and with a hypothesis.
+
+        Returns
+        -------
+        list of list of float
+            For each block the sums of squared residuals over the noise variance, without and with
+            the hypothesis, and the number of used samples, which is the expected sum of the noise.
+        """
+        noise = before.noise_deviation * [
+            self._noise_scales[name] for name in before.trial.channels
+        ]
+        squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
+        squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
+        sample_count = len(before.used)
+        block_count = 1
+        if before.trial.is_dynamic:
+            block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
+        sums_of_blocks = []
+        for block in np.array_split(np.arange(sample_count), block_count):
+            sums_of_blocks.append(
+                [
+                    float(squares_before[block].sum()),
+                    float(squares_after[block].sum()),
+                    float(before.used[block].sum()),
+                ]
+            )
+        return sums_of_blocks
+
+    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         It is that under the wider noise; None if the candidate cannot be fitted.
@@ -118,14 +129,14 @@ class SimulationComparison(Comparison[CandidateFit]):
         if fitted is None:
             start = Point(no_effect.point.shared, no_effect.point.local, effect)
             fitted = try_fit(self.problem, candidate, start)
-        return None if fitted is None else self._under_wide_noise(fitted)
+        return None if fitted is None else self._fit_under_wide_noise(fitted)
 
-    def _under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
+    def _fit_under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
         """Return the fit of a hypothesis under the wider noise; None if it cannot be fitted."""
         wide_problem = self.search.wide_problem or self.problem
         return refit_under_wide_noise(self.problem, wide_problem, fitted)
 
-    def add_families(self) -> None:
+    def add_free_shape_families(self) -> None:
         """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
 
         The best law and those that are easily mistaken for it are fitted with a free shape. A fit
@@ -135,17 +146,19 @@ class SimulationComparison(Comparison[CandidateFit]):
         if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
             return
         compared = dict(self.search.wide_fits)
-        for single in self._related_single_laws(best):
-            free = fit_free_shape(self.problem, single, 0)
-            wide_free = None if free is None else self._under_wide_noise(free)
-            if wide_free is None:
+        for single in self._single_laws_like(best):
+            free_shape_fit = fit_free_shape(self.problem, single, 0)
+            wide_free_shape_fit = (
+                None if free_shape_fit is None else self._fit_under_wide_noise(free_shape_fit)
+            )
+            if wide_free_shape_fit is None:
                 continue
-            self._free_shape_fits[single.candidate.key] = wide_free
-            if wide_free.log_evidence > best.log_evidence + LEAST_SHAPE_GAIN:
-                compared[wide_free.candidate.key] = wide_free
+            self._free_shape_fits[single.candidate.key] = wide_free_shape_fit
+            if wide_free_shape_fit.log_evidence > best.log_evidence + LEAST_SHAPE_GAIN:
+                compared[wide_free_shape_fit.candidate.key] = wide_free_shape_fit
         self.search.wide_fits = compared
 
-    def _related_single_laws(self, best: CandidateFit) -> list[CandidateFit]:
+    def _single_laws_like(self, best: CandidateFit) -> list[CandidateFit]:
         """Return the best single law of each family and place that is easily mistaken for the best.
 
         The best law itself is one of them, if it has a shape parameter.
@@ -165,7 +178,7 @@ class SimulationComparison(Comparison[CandidateFit]):
                 singles[key] = max(singles.get(key, fitted), fitted, key=self.search.score)
         return list(singles.values())
 
-    def with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
+    def fit_with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
         """Return the fit of a single law with its shape free; None if there is none."""
         if hypothesis.candidate.has_free_shape:
             return hypothesis
@@ -179,32 +192,32 @@ class SimulationComparison(Comparison[CandidateFit]):
         """Test whether the residuals of a hypothesis are noise as in the noise records."""
         return check_absolute_fit(self.problem, hypothesis)
 
-    def failed_check(self, hypothesis: CandidateFit) -> str:
+    def failed_check_reason(self, hypothesis: CandidateFit) -> str:
         """Return the reason why a hypothesis fails the test of consistency or of held-out trials.
 
         It is empty if it fails neither, or if its residuals are more than noise anyway. In held-out
         trials they may be more than noise too if the hypothesis explains nearly all of the gap
-        there: what remains is then told with its size.
+        there: the verdict then states the size of what remains.
         """
         if hypothesis.residual_process is not None:
             return ""
         gates = [check_consistency(self.problem, hypothesis)]
         if not self._explains_nearly_all_held_out(hypothesis):
             gates.append(check_held_out(self.residuals(hypothesis)))
-        return next((gate.reason for gate in gates if gate.passed is False), "")
+        return next((gate.reason for gate in gates if gate.has_failed), "")
 
     def _explains_nearly_all_held_out(self, hypothesis: CandidateFit) -> bool:
         """Return whether a hypothesis surely explains nearly all of the gap in held-out trials."""
         if not self.has_held_out:
             return False
-        low_end, _ = self.share(hypothesis, held_out=True).interval
-        return low_end > SEARCH.nearly_all
+        low_end, _ = self.gap_share(hypothesis, held_out=True).interval
+        return low_end > SEARCH.nearly_complete_share
 
-    def _simulation(self, hypothesis: CandidateFit) -> CandidateFit:
+    def _compute_simulation(self, hypothesis: CandidateFit) -> CandidateFit:
         """Return the hypothesis, which is a simulation itself."""
         return hypothesis
 
-    def remaining_text(self, hypothesis: CandidateFit, share: GapShare) -> str:
+    def unexplained_text(self, hypothesis: CandidateFit, share: GapShare) -> str:
         """Return in words how much of the gap a hypothesis does not explain."""
         return (
             f"{share.remaining_rms:.3g} of {share.total_rms:.3g} noise deviations "
@@ -212,7 +225,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         )
 
 
-def _in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTrial]:
+def _trials_in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTrial]:
     """Return the trials that were held out, or those that were not."""
     return [fitted for fitted in trials if fitted.trial.held_out is held_out]
 

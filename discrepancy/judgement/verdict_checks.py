@@ -17,14 +17,14 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
-from .closed_share import NOMINAL_UNIT, closed_text, rms_by_channel
+from .closed_share import NOMINAL_UNIT, closed_share_text, rms_by_channel
 from .conclusion import VerdictOutcome, effects_text
 from .proof import closed_share_or_reason
-from .remarks import NO_GAP
+from .remarks import KINDS_WITHOUT_GAP
 
-VETO_NOISES = 5.0
+VETO_NOISE_DEVIATIONS = 5.0
 """rms residual over the noise deviation above which a channel of a held-out trial is far off."""
-VETO_DEVIATIONS = 3.0
+VETO_PREDICTIVE_DEVIATIONS = 3.0
 """The same over the predictive deviation, since the uncertainty of the fit is no gap."""
 MOST_MENTIONED = 3
 """Number of records that a sentence mentions."""
@@ -32,7 +32,7 @@ WHITE_SECOND_DIFFERENCES = 6.0
 """Variance of second differences of white noise over its own."""
 
 
-def checked_verdict(outcome: VerdictOutcome) -> VerdictOutcome:
+def check_against_trials(outcome: VerdictOutcome) -> VerdictOutcome:
     """Return the verdict if the trials confirm it, or one that names nothing and gives the reason.
 
     Parameters
@@ -52,17 +52,17 @@ def checked_verdict(outcome: VerdictOutcome) -> VerdictOutcome:
         return VerdictOutcome(_unfitted_verdict(verdict, unfitted), search, no_effect)
     if fit.candidate.terms:
         closed, _ = closed_share_or_reason(before, after)
-        if closed is not None and closed.grew:
-            sentence = _larger_error_sentence(verdict, closed_text(before, after, closed))
-            return VerdictOutcome(_without_name(verdict, sentence), search, no_effect)
-    far_records = far_held_out_records(before) if verdict.kind in NO_GAP else []
+        if closed is not None and closed.has_grown:
+            sentence = _larger_error_sentence(verdict, closed_share_text(before, after, closed))
+            return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
+    far_records = far_held_out_records(before) if verdict.kind in KINDS_WITHOUT_GAP else []
     if far_records:
         sentence = _held_out_gap_sentence(before, far_records)
-        return VerdictOutcome(_without_name(verdict, sentence), search, no_effect)
+        return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
     return outcome
 
 
-def _without_name(verdict: Verdict, sentence: str) -> Verdict:
+def _verdict_without_name(verdict: Verdict, sentence: str) -> Verdict:
     """Return the verdict of an unexplained gap instead of the given one, with a new sentence."""
     return replace(
         verdict,
@@ -86,7 +86,7 @@ def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
     verdict : Verdict
         The verdict that names it.
     clause : str
-        The clause on how much the error grows, from `closed_text`.
+        The clause on how much the error grows, from `closed_share_text`.
     """
     effects = effects_text(verdict.effects) or "the best hypothesis"
     return (
@@ -106,21 +106,21 @@ class FarRecord:
     ----------
     trial, channel : str
         The names of the trial and the channel.
-    noises : float
+    noise_deviations : float
         The rms residual over the noise deviation.
     """
 
     trial: str
     channel: str
-    noises: float
+    noise_deviations: float
 
 
 def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
     """Return the channels of held-out trials that are far off a prediction, the farthest first.
 
-    Their rms residual is beyond `VETO_NOISES` of the noise, and beyond `VETO_DEVIATIONS` of what
-    noise and the uncertainty of the fit make together. Without a noise record the noise is what the
-    fit leaves in the fitted trials.
+    Their rms residual is beyond `VETO_NOISE_DEVIATIONS` of the noise, and beyond
+    `VETO_PREDICTIVE_DEVIATIONS` of what noise and the uncertainty of the fit make together. Without
+    a noise record the noise is what the fit leaves in the fitted trials.
     """
     far_records = []
     for fitted in residuals.trials:
@@ -132,9 +132,9 @@ def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
                 continue
             square = float(np.mean(fitted.standardised[used, column] ** 2))
             expected = float(np.mean(fitted.expected_variance[used, column]))
-            if square > max(VETO_NOISES**2, VETO_DEVIATIONS**2 * expected):
+            if square > max(VETO_NOISE_DEVIATIONS**2, VETO_PREDICTIVE_DEVIATIONS**2 * expected):
                 far_records.append(FarRecord(fitted.trial.name, channel, float(np.sqrt(square))))
-    return sorted(far_records, key=lambda record: -record.noises)
+    return sorted(far_records, key=lambda record: -record.noise_deviations)
 
 
 def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarRecord]) -> str:
@@ -143,8 +143,8 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
     for record in far_records[:MOST_MENTIONED]:
         trials = [fitted for fitted in residuals.trials if fitted.trial.name == record.trial]
         rms = rms_by_channel(replace(residuals, trials=tuple(trials)))[record.channel]
-        size = _with_unit(residuals, record.channel, rms)
-        noises = f"{record.noises:.1f} times the noise"
+        size = _value_with_unit(residuals, record.channel, rms)
+        noises = f"{record.noise_deviations:.1f} times the noise"
         parts.append(f"{record.channel} in {record.trial!r} by {size} (rms, {noises})")
     remaining = len(far_records) - MOST_MENTIONED
     if remaining > 0:
@@ -156,7 +156,7 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
     )
 
 
-def _with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
+def _value_with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
     """Return a value of a channel (SI) in the unit of its figures."""
     factor, unit = UNITS[residuals.channels[channel].quantity].drawn
     text = f"{factor * value:.3g}"
@@ -170,7 +170,8 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
     """Return the records of fitted trials in motion whose residuals are larger than the signal.
 
     The size of the signal is the standard deviation of the readings about their mean. A channel may
-    show nothing but noise, so the rms residual must also exceed `VETO_NOISES` noise deviations.
+    show nothing but noise, so the rms residual must also exceed `VETO_NOISE_DEVIATIONS` noise
+    deviations.
     """
     unfitted = []
     for fitted in residuals.trials:
@@ -183,7 +184,7 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
             rms = float(np.sqrt(np.mean(fitted.residual[used, column] ** 2)))
             deviation = float(np.std(fitted.trial.values[used, column]))
             noise = _noise_deviation(residuals, fitted, column)
-            if rms > max(deviation, VETO_NOISES * noise):
+            if rms > max(deviation, VETO_NOISE_DEVIATIONS * noise):
                 unfitted.append(UnfittedRecord(fitted.trial.name, channel, rms, deviation))
     return tuple(unfitted)
 
@@ -212,4 +213,4 @@ def _unfitted_verdict(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> V
         "their mean. That is no evidence of a missing force. Check how the trials begin, inputs, "
         "signs and units, and try a shorter record."
     )
-    return replace(_without_name(verdict, sentence), unfitted=tuple(unfitted))
+    return replace(_verdict_without_name(verdict, sentence), unfitted=tuple(unfitted))

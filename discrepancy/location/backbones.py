@@ -11,11 +11,11 @@ from calibration.dynamics.damped_cosine import DampedCosineFit, DampedCosines
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 
-SMALLEST_SIGNAL = 4.0
+LEAST_AMPLITUDE = 4.0
 """Least amplitude of a mode that still rings in a window, in standard errors."""
-_GREATEST_CHANGE = 0.3
+_LARGEST_FREQUENCY_CHANGE = 0.3
 """Largest relative change of a frequency from its start value."""
-_FEWEST_PER_UNKNOWN = 2.0
+_LEAST_SAMPLES_PER_UNKNOWN = 2.0
 """Fewest samples of a window per unknown of the fit."""
 
 
@@ -86,7 +86,7 @@ def backbones(
     start = 2.0 * np.pi * np.sort(np.asarray(frequencies, dtype=float))
     width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
     unknown_count = 4 * start.size + 2
-    least_width = _FEWEST_PER_UNKNOWN * unknown_count
+    least_width = _LEAST_SAMPLES_PER_UNKNOWN * unknown_count
     if width < least_width or width > time.size:
         raise FitError(
             f"A window of {periods:g} periods has {width} samples, but at least {least_width:.0f} "
@@ -99,31 +99,31 @@ def backbones(
     for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
         samples = slice(first, first + width)
         window = DampedCosines(time[samples], signal[samples], averaging_width)
+        window_time = time[samples] - time[first]
         while is_ringing.any():
             solution = window.fit(poles[is_ringing])
-            window_time = time[samples] - time[first]
             modes = np.flatnonzero(is_ringing).tolist()
-            points_of_window = dict(
-                zip(modes, _points(window_time, solution, noise_deviation), strict=True)
-            )
-            died_away = [
-                mode
-                for mode, point in points_of_window.items()
-                if not point.is_credible(start[mode])
-            ]
-            if died_away:
-                # fit again without these modes, which would spoil the errors of the others
-                is_ringing[died_away] = False
-                continue
-            for mode, point in points_of_window.items():
-                points[mode].append(point._replace(time=float(time[first]) + point.time))
-            # start values for the next window: these poles, with a damping ratio of at least 1e-4
-            fitted = solution.pole
-            poles[is_ringing] = np.minimum(fitted.real, -1e-4 * fitted.imag) + 1j * fitted.imag
-            break
+            points_of_window = _points_of_window(window_time, solution, noise_deviation)
+            died_away = []
+            for mode, point in zip(modes, points_of_window, strict=True):
+                if not point.is_credible(start[mode]):
+                    died_away.append(mode)
+            if not died_away:
+                break
+            # fit again without these modes, which would spoil the errors of the others
+            is_ringing[died_away] = False
         if not is_ringing.any():
             break
-    return tuple(_backbone(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1))
+        for mode, point in zip(modes, points_of_window, strict=True):
+            points[mode].append(point._replace(time=float(time[first]) + point.time))
+        # start values for the next window: these poles, with a damping ratio of at least 1e-4
+        fitted_poles = solution.pole
+        largest_real_part = -1e-4 * fitted_poles.imag
+        real_parts = np.minimum(fitted_poles.real, largest_real_part)
+        poles[is_ringing] = real_parts + 1j * fitted_poles.imag
+    return tuple(
+        _backbone_of_points(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1)
+    )
 
 
 class BackbonePoint(NamedTuple):
@@ -140,14 +140,16 @@ class BackbonePoint(NamedTuple):
     def is_credible(self, start: float) -> bool:
         """Return whether the mode still rings, at a frequency close to its start value [rad/s].
 
-        Its amplitude must exceed `SMALLEST_SIGNAL` standard errors.
+        Its amplitude must exceed `LEAST_AMPLITUDE` standard errors.
         """
         change = abs(2.0 * np.pi * self.frequency / start - 1.0)
-        is_above_error = self.amplitude > SMALLEST_SIGNAL * self.amplitude_error
-        return is_above_error and change < _GREATEST_CHANGE and abs(self.damping_ratio) < 0.5
+        is_above_error = self.amplitude > LEAST_AMPLITUDE * self.amplitude_error
+        return (
+            is_above_error and change < _LARGEST_FREQUENCY_CHANGE and abs(self.damping_ratio) < 0.5
+        )
 
 
-def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
+def _backbone_of_points(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
     """Return the points of a mode as one record of arrays."""
     arrays: dict[str, FloatArray] = {}
     for name in BackbonePoint._fields:
@@ -155,7 +157,7 @@ def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
     return Backbone(mode=mode, **arrays)
 
 
-def _points(
+def _points_of_window(
     time: FloatArray, solution: DampedCosineFit, noise_deviation: float | None
 ) -> list[BackbonePoint]:
     """Return amplitude, frequency and damping of each mode in a window, with standard errors.

@@ -16,7 +16,12 @@ from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import periodogram
 from discrepancy.campaign.records import FloatArray
-from discrepancy.location.map import NormalEquations, explained, features, normal_equations_of
+from discrepancy.location.map import (
+    NormalEquations,
+    dependence_functions,
+    explained_sum_of_squares,
+    normal_equations_of,
+)
 from discrepancy.location.residuals import FittedTrial
 
 
@@ -130,7 +135,7 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     return tuple(sorted(frequency for _, frequency in highest))
 
 
-_HATS = 9
+_HAT_COUNT = 9
 """Number of knots of a piecewise linear function of time or amplitude."""
 
 
@@ -147,7 +152,7 @@ class Dependence(NamedTuple):
         Fraction of the excess variance that it explains.
     p_value : float
         p-value if there is no such dependence.
-    coefficients : int
+    coefficient_count : int
         Number of fitted coefficients.
     """
 
@@ -155,10 +160,10 @@ class Dependence(NamedTuple):
     name: str
     share: float
     p_value: float
-    coefficients: int
+    coefficient_count: int
 
 
-def excess(trials: Sequence[FittedTrial]) -> float:
+def excess_over_noise(trials: Sequence[FittedTrial]) -> float:
     """Return the excess variance of trials, in units of the noise variance.
 
     It is the sum of squares of their residuals minus its expectation if the model is right.
@@ -170,7 +175,7 @@ def excess(trials: Sequence[FittedTrial]) -> float:
     return float(total)
 
 
-def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
+def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
     """Return piecewise linear hat functions, whose sums are all piecewise linear functions.
 
     Parameters
@@ -182,16 +187,16 @@ def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
 
     Returns
     -------
-    (n, `_HATS`) ndarray
+    (n, `_HAT_COUNT`) ndarray
         Value of each hat function; the constant 1 in a single column if the knots coincide.
     """
     if high <= low:
         return np.ones((values.size, 1))
-    knots = np.linspace(low, high, _HATS)
-    return np.column_stack([np.interp(values, knots, hat) for hat in np.eye(_HATS)])
+    knots = np.linspace(low, high, _HAT_COUNT)
+    return np.column_stack([np.interp(values, knots, hat) for hat in np.eye(_HAT_COUNT)])
 
 
-def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
+def explained_dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
     """Yield how much of the excess variance each dependence of the residuals explains alone.
 
     A dependence (on amplitude, time, load, temperature and so on) is a set of functions that is
@@ -204,7 +209,7 @@ def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
     trials : sequence of FittedTrial
         Trials of one kind with the same channels.
     """
-    excess_variance = excess(trials)
+    excess_variance = excess_over_noise(trials)
     degrees_of_freedom = sum(
         float(np.sum(fitted.expected_variance[fitted.used])) for fitted in trials
     )
@@ -223,18 +228,18 @@ def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
             continue
         bases = dependence_bases(with_channel, column, modes)
         if line is not None:
-            bases["", line.name] = line.waves(with_channel, column)
+            bases["", line.name] = line.decaying_waves(with_channel, column)
         rows = [(fitted, fitted.used[:, column]) for fitted in with_channel]
         for key, basis in bases.items():
             channel_equations = normal_equations_of(basis, rows, column)
             if channel_equations is not None:
                 equations.setdefault(key, []).append(channel_equations)
     for (subject, name), equations_of_channels in equations.items():
-        statistic, count = explained(equations_of_channels)
+        statistic, count = explained_sum_of_squares(equations_of_channels)
         share = float(np.clip((statistic - count) / excess_variance, 0.0, 1.0))
         p_value = float(stats.chi2.sf(statistic, count)) if count else 1.0
         # Bonferroni: the line was chosen among many
-        choices = line.choices if line is not None and name == line.name else 1
+        choices = line.choice_count if line is not None and name == line.name else 1
         yield Dependence(subject, name, share, min(1.0, p_value * choices), count)
 
 
@@ -247,20 +252,20 @@ class SpectralLine(NamedTuple):
         Frequency [Hz].
     decay : float
         Decay rate [1/s].
-    choices : int
+    choice_count : int
         Number of lines from which it was chosen.
     """
 
     frequency: float
     decay: float
-    choices: int
+    choice_count: int
 
     @property
     def name(self) -> str:
         """Name such as "a line at 50 Hz" or "a decaying line at 9.1 Hz"."""
         return f"a {'decaying ' if self.decay else ''}line at {self.frequency:.3g} Hz"
 
-    def waves(self, trials: Sequence[FittedTrial], column: int) -> FloatArray:
+    def decaying_waves(self, trials: Sequence[FittedTrial], column: int) -> FloatArray:
         """Return the decaying cosine and sine of the line, with separate columns for each trial.
 
         Parameters
@@ -319,7 +324,7 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         if power[index] > 1.05 * greatest_power:
             greatest_power = float(power[index])
             strongest = SpectralLine(float(frequencies[index]), decay, choices)
-    return None if strongest is None else strongest._replace(choices=choices)
+    return None if strongest is None else strongest._replace(choice_count=choices)
 
 
 def dependence_bases(
@@ -344,16 +349,16 @@ def dependence_bases(
     """
     samples = _UsedSamples(trials, column)
     bases = {
-        ("", "zero shift"): samples.features("mean"),
-        ("", "zero shift of each trial"): samples.per_trial(np.ones((samples.count, 1))),
+        ("", "zero shift"): samples.prediction_features("mean"),
+        ("", "zero shift of each trial"): samples.split_by_trial(np.ones((samples.count, 1))),
     }
-    temperature = samples.of_trials(lambda fitted: fitted.trial.temperature)
+    temperature = samples.stack_used_samples(lambda fitted: fitted.trial.temperature)
     if np.ptp(temperature) > 0.0:
-        proportional = temperature * samples.features("x")[:, 0]
+        proportional = temperature * samples.prediction_features("x")[:, 0]
         bases["", "temperature"] = np.column_stack([temperature, proportional])
     if trials[0].trial.is_dynamic:
-        return bases | _bases_in_time(samples, modes)
-    return bases | _bases_at_rest(samples)
+        return bases | _dynamic_bases(samples, modes)
+    return bases | _static_bases(samples)
 
 
 class _UsedSamples:
@@ -372,9 +377,9 @@ class _UsedSamples:
         self.column = column
         self.rows = [fitted.used[:, column] for fitted in trials]
         self.count = sum(int(rows.sum()) for rows in self.rows)
-        self._features = [features(fitted, column) for fitted in trials]
+        self._features = [dependence_functions(fitted, column) for fitted in trials]
 
-    def of_trials(self, values: Callable[[FittedTrial], FloatArray]) -> FloatArray:
+    def stack_used_samples(self, values: Callable[[FittedTrial], FloatArray]) -> FloatArray:
         """Return an array of each trial at its used samples, stacked over the trials.
 
         Parameters
@@ -387,14 +392,14 @@ class _UsedSamples:
         (n, ...) ndarray
             Its rows at the n used samples of all trials.
         """
-        return self.stacked([values(fitted) for fitted in self.trials])
+        return self.stack_arrays([values(fitted) for fitted in self.trials])
 
-    def stacked(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def stack_arrays(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Return arrays (N, ...) of the trials at the used samples, stacked (n, ...)."""
         used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
         return np.concatenate(used)
 
-    def per_trial(self, functions: FloatArray) -> FloatArray:
+    def split_by_trial(self, functions: FloatArray) -> FloatArray:
         """Return functions with separate columns for each trial, thus separate coefficients.
 
         Parameters
@@ -410,10 +415,10 @@ class _UsedSamples:
         ends = np.cumsum([int(rows.sum()) for rows in self.rows])
         return np.asarray(block_diag(*np.split(functions, ends[:-1])))
 
-    def features(self, *names: str) -> FloatArray:
+    def prediction_features(self, *names: str) -> FloatArray:
         """Return features of the prediction by name (n, k); zeros in a trial that lacks one.
 
-        The features are those of `discrepancy.location.map.features`.
+        The features are those of `discrepancy.location.map.dependence_functions`.
         """
         widths = [
             feature.shape[1]
@@ -429,22 +434,22 @@ class _UsedSamples:
         return np.vstack(stacked)
 
 
-def _bases_at_rest(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
+def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
     """Return the functions of each dependence of static readings: on time and load."""
     bases: dict[tuple[str, str], FloatArray] = {}
-    time = samples.of_trials(lambda fitted: fitted.trial.time)
+    time = samples.stack_used_samples(lambda fitted: fitted.trial.time)
     if np.ptp(time) > 0.0:
         bases["", "time"] = np.column_stack([np.ones_like(time), time - time.mean()])
-    load = samples.of_trials(lambda fitted: fitted.trial.load)
+    load = samples.stack_used_samples(lambda fitted: fitted.trial.load)
     if np.ptp(load) > 0.0:
-        x = samples.features("x")[:, 0]
+        x = samples.prediction_features("x")[:, 0]
         bases["", "load (proportional)"] = np.column_stack([x, load])
         not_proportional = [load, np.abs(load) * load, load**2]
         bases["", "load (not proportional)"] = np.column_stack(not_proportional)
     return bases
 
 
-def _bases_in_time(
+def _dynamic_bases(
     samples: _UsedSamples, modes: Sequence[float]
 ) -> dict[tuple[str, str], FloatArray]:
     """Return the functions of each dependence of dynamic records: drift, motion, harmonics, modes.
@@ -453,12 +458,14 @@ def _bases_in_time(
     phase and a quarter of a period out of phase.
     """
     bases: dict[tuple[str, str], FloatArray] = {}
-    relative_time = samples.of_trials(lambda fitted: np.linspace(-1.0, 1.0, len(fitted.trial.time)))
+    relative_time = samples.stack_used_samples(
+        lambda fitted: np.linspace(-1.0, 1.0, len(fitted.trial.time))
+    )
     drift = np.asarray(np.polynomial.legendre.legvander(relative_time, 4), dtype=np.float64)
-    bases["", "a drift of zero in each trial"] = samples.per_trial(drift)
+    bases["", "a drift of zero in each trial"] = samples.split_by_trial(drift)
     if all(fitted.rates is not None for fitted in samples.trials):
-        bases["", "x and v"] = samples.features("x", "v")
-        bases["", "higher harmonics"] = samples.features("2nd harmonic", "3rd harmonic")
+        bases["", "x and v"] = samples.prediction_features("x", "v")
+        bases["", "higher harmonics"] = samples.prediction_features("2nd harmonic", "3rd harmonic")
     if not modes:
         return bases
     column = samples.column
@@ -466,15 +473,15 @@ def _bases_in_time(
         modal_motion(fitted.prediction[:, [column]], fitted.trial.interval, modes)
         for fitted in samples.trials
     ]
-    time = samples.of_trials(lambda fitted: fitted.trial.time)
-    by_time = _hats(time, float(time.min()), float(time.max()))
+    time = samples.stack_used_samples(lambda fitted: fitted.trial.time)
+    by_time = _hat_functions(time, float(time.min()), float(time.max()))
     for mode in range(len(modes)):
-        motion = samples.stacked([motion_of_trial[mode] for motion_of_trial in motions])
+        motion = samples.stack_arrays([motion_of_trial[mode] for motion_of_trial in motions])
         amplitude = np.abs(motion[:, 0])
         if not amplitude.any():
             continue
         log_amplitude = np.log(np.clip(amplitude / amplitude.max(), 1e-3, None))
-        by_amplitude = _hats(log_amplitude, float(log_amplitude.min()), 0.0)
+        by_amplitude = _hat_functions(log_amplitude, float(log_amplitude.min()), 0.0)
         for name, shapes in (("amplitude", by_amplitude), ("time", by_time)):
             in_and_out_of_phase = [shapes * motion.real, shapes * motion.imag]
             bases[f"mode {mode + 1}", name] = np.hstack(in_and_out_of_phase)

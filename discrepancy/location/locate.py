@@ -9,20 +9,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from discrepancy.campaign.noise_tests import holm, variance_p_value
+from discrepancy.campaign.noise_tests import holm_rejections, variance_p_value
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import (
     Dependence,
-    dependences,
-    excess,
+    excess_over_noise,
+    explained_dependences,
     mode_shares,
     predicted_frequencies,
 )
 from discrepancy.location.map import Cell, residual_map
 from discrepancy.location.omnibus_tests import (
     OmnibusTest,
-    coloured_noise,
+    coloured_noise_remarks,
     noise_groups,
     serial_tests,
     variance_test,
@@ -30,13 +30,13 @@ from discrepancy.location.omnibus_tests import (
 from discrepancy.location.patterns import (
     Disagreement,
     TrialsOfKind,
-    kinds_of,
+    group_by_kind,
     singular_patterns,
 )
 from discrepancy.location.residuals import (
     ResidualSet,
-    mean_square,
-    without_colour,
+    mean_square_ratio,
+    without_coloured_records,
 )
 
 GLOBAL_LEVEL = 0.01
@@ -45,15 +45,15 @@ GLOBAL_LEVEL = 0.01
 MAP_RATE = 0.05
 """False discovery rate of the map."""
 
-_TOO_SMALL = 1e-3
+_SMALL_RESIDUALS_P_VALUE = 1e-3
 """p-value below which residuals count as smaller than the noise record allows."""
-_FAR_OUT = 6.0
+_LEAST_OUTLIER = 6.0
 """Least size of an outlier, in standard deviations; 2e-9 of Gaussian samples exceed it."""
-_MEDIAN = 0.6745
+_MEDIAN_OF_ABSOLUTE_NORMAL = 0.6745
 """Median of the absolute value of a standard normal variable."""
 _LEAST_SHARE = 0.05
 """Least fraction of the excess variance for which a dependence is reported."""
-_CLOSE = 0.02
+_EQUAL_SHARES = 0.02
 """Largest difference of two fractions of the excess variance that count as equal."""
 
 
@@ -94,7 +94,8 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are left out.
     seed : int
-        Seed of the random draw that makes the residuals white; see `ResidualSet.white`.
+        Seed of the random draw that makes the residuals white; see
+        `ResidualSet.whitened_residuals`.
 
     Returns
     -------
@@ -111,16 +112,16 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
         raise FitError(
             "Nothing can be located: every trial is held out, and at least one fitted is needed."
         )
-    fitted = without_colour(fitted)
-    white = fitted.white(np.random.default_rng(seed))
-    coloured = coloured_noise(fitted)
+    fitted = without_coloured_records(fitted)
+    white = fitted.whitened_residuals(np.random.default_rng(seed))
+    coloured = coloured_noise_remarks(fitted)
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
-    rejected = holm([test.p_value for test in tests], GLOBAL_LEVEL)
+    rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(
         replace(test, rejected=is_rejected)
         for test, is_rejected in zip(tests, rejected, strict=True)
     )
-    findings = _findings(fitted, white) if any(rejected) else []
+    findings = _disagreements(fitted, white) if any(rejected) else []
     cells = residual_map(fitted, white, MAP_RATE)
     remarks = [*coloured.values(), *_noise_remarks(fitted)]
     has_samples = any(trial.used.any() for trial in fitted.trials)
@@ -131,7 +132,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     return Location(any(rejected), tests, cells, tuple(findings), tuple(remarks))
 
 
-def _findings(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disagreement]:
+def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disagreement]:
     """Return the findings in all kinds of trials, sorted by the excess variance that they explain.
 
     Parameters
@@ -142,9 +143,9 @@ def _findings(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disag
         White residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
-    for kind in kinds_of(residuals, white):
+    for kind in group_by_kind(residuals, white):
         # the share of a finding is a fraction of the excess in its own kind of trial
-        excess_of_kind = sum(max(excess([fitted]), 0.0) for fitted in kind.trials)
+        excess_of_kind = sum(max(excess_over_noise([fitted]), 0.0) for fitted in kind.trials)
         patterns = singular_patterns(residuals, kind)
         dependence = _main_dependence(kind, patterns)
         findings_of_kind = patterns if dependence is None else [dependence, *patterns]
@@ -157,7 +158,7 @@ def _findings(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disag
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     """Return the remarks on missing noise records, and on residuals smaller than the noise."""
     remarks = []
-    unknown = sorted({*residuals.measured} - {*residuals.recorded})
+    unknown = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
     if unknown:
         remarks.append(
             f"No noise record for {', '.join(unknown)}: nothing absolute can be said about the "
@@ -165,12 +166,12 @@ def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
             "with its degrees of freedom."
         )
     for names in noise_groups(residuals).values():
-        square, freedom = mean_square(residuals, names)
+        square, freedom = mean_square_ratio(residuals, names)
         if freedom < 1.0:
             continue
         noise_freedom = residuals.degrees_of_freedom(names[0])
         p_value = variance_p_value(square, freedom, noise_freedom, small=True)
-        if p_value < _TOO_SMALL:
+        if p_value < _SMALL_RESIDUALS_P_VALUE:
             first_names = f"{', '.join(names[:4])}{' ..' if len(names) > 4 else ''}"
             remarks.append(
                 f"Residuals of {first_names} are smaller than their noise record allows (mean "
@@ -197,34 +198,36 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
         if not fitted.trial.is_dynamic:
             continue
         for column, name in enumerate(fitted.trial.channels):
-            count = _count_far_out(np.abs(fitted.standardised[:, column]))
+            count = _count_isolated_outliers(np.abs(fitted.standardised[:, column]))
             counts[name] = counts.get(name, 0) + count
     phrases = [f"{name} ({count})" for name, count in counts.items() if count]
     if not phrases:
         return ()
     return (
-        f"Single samples lie beyond {_FAR_OUT:g} deviations of noise and rest while their "
+        f"Single samples lie beyond {_LEAST_OUTLIER:g} deviations of noise and rest while their "
         f"neighbours do not: {', '.join(phrases)}; if they are errors of the data, leave them out.",
     )
 
 
-def _count_far_out(size: FloatArray) -> int:
+def _count_isolated_outliers(absolute_residuals: FloatArray) -> int:
     """Return the number of isolated outliers in a record.
 
     Parameters
     ----------
-    size : (N,) ndarray
+    absolute_residuals : (N,) ndarray
         Absolute residuals in units of the noise; nan in gaps.
     """
-    finite = size[np.isfinite(size)]
+    finite = absolute_residuals[np.isfinite(absolute_residuals)]
     if not finite.size:
         return 0
-    limit = _FAR_OUT * max(1.0, float(np.median(finite)) / _MEDIAN)
-    neighbours = np.full((2, len(size)), np.nan)
-    neighbours[0, 1:] = size[:-1]
-    neighbours[1, :-1] = size[1:]
+    limit = _LEAST_OUTLIER * max(1.0, float(np.median(finite)) / _MEDIAN_OF_ABSOLUTE_NORMAL)
+    neighbours = np.full((2, len(absolute_residuals)), np.nan)
+    neighbours[0, 1:] = absolute_residuals[:-1]
+    neighbours[1, :-1] = absolute_residuals[1:]
     # next to a gap a neighbour is nan, and the comparison with it is false
-    is_isolated_outlier = (size > limit) & (neighbours.max(axis=0) < 0.5 * size)
+    is_isolated_outlier = (absolute_residuals > limit) & (
+        neighbours.max(axis=0) < 0.5 * absolute_residuals
+    )
     return int(is_isolated_outlier.sum())
 
 
@@ -241,7 +244,7 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
     patterns : sequence of Disagreement
         Their patterns over the channels.
     """
-    candidates = list(dependences(kind.trials))
+    candidates = list(explained_dependences(kind.trials))
     significant = [
         candidate
         for candidate in candidates
@@ -251,10 +254,12 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
         return None
     largest_share = max(candidate.share for candidate in significant)
     nearly_as_good = [
-        candidate for candidate in significant if candidate.share >= largest_share - _CLOSE
+        candidate for candidate in significant if candidate.share >= largest_share - _EQUAL_SHARES
     ]
-    simplest = min(nearly_as_good, key=lambda candidate: (candidate.coefficients, -candidate.share))
-    subject = simplest.subject or _subject(kind, patterns)
+    simplest = min(
+        nearly_as_good, key=lambda candidate: (candidate.coefficient_count, -candidate.share)
+    )
+    subject = simplest.subject or _disagreeing_subject(kind, patterns)
     phrase = f"by {simplest.name}"
     if _amplitude_and_time_look_alike(simplest, candidates):
         phrase = "by amplitude or time (these releases do not tell the two apart)"
@@ -278,12 +283,12 @@ def _amplitude_and_time_look_alike(
     return any(
         candidate.subject == dependence.subject
         and candidate.name == other_name
-        and candidate.share >= dependence.share - _CLOSE
+        and candidate.share >= dependence.share - _EQUAL_SHARES
         for candidate in candidates
     )
 
 
-def _subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
+def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
     """Return what disagrees: a single channel, the mode with most of the excess, or all channels.
 
     A channel or a mode is named only if it has more than half of the excess variance.

@@ -18,9 +18,9 @@ from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
+from discrepancy.location.residuals import FittedTrial, ResidualSet, sum_of_squares_moments
 
-_LEAST_SURVIVING = 0.02
+_LEAST_REMAINING_VARIANCE = 0.02
 """Least variance of the projection on a unit function, as a fraction of that before the fit.
 
 Below it the fit has absorbed the function, and its projection is not evidence."""
@@ -35,13 +35,13 @@ class NormalEquations(NamedTuple):
         B^T B; without sensitivities B^T V B, with the expected variances V of the residuals.
     projection : (k,) ndarray
         B^T r.
-    absorbed : (P, k) ndarray
+    absorbed_by_fit : (P, k) ndarray
         S^T B, with the sensitivities S of the residuals to P parameters; (0, k) without them.
     """
 
     gram: FloatArray
     projection: FloatArray
-    absorbed: FloatArray
+    absorbed_by_fit: FloatArray
 
 
 def normal_equations_of(
@@ -82,7 +82,22 @@ def normal_equations_of(
     return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
 
-def explained(equations: Sequence[NormalEquations]) -> tuple[float, int]:
+class ExplainedSquares(NamedTuple):
+    """What functions explain in the residuals.
+
+    Attributes
+    ----------
+    sum_of_squares : float
+        Explained sum of squares, in units of the noise variance.
+    degrees_of_freedom : int
+        Number of directions that remain after the fit of the model; chi-squared has as many.
+    """
+
+    sum_of_squares: float
+    degrees_of_freedom: int
+
+
+def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedSquares:
     """Return the sum of squares that functions explain in the residuals of several channels.
 
     If the model is right, the projection B^T r has the covariance G = B^T (I - S S^T) B, so that
@@ -92,26 +107,19 @@ def explained(equations: Sequence[NormalEquations]) -> tuple[float, int]:
     ----------
     equations : sequence of NormalEquations
         Normal equations of each channel; every channel has its own coefficients.
-
-    Returns
-    -------
-    sum_of_squares : float
-        Explained sum of squares, in units of the noise variance.
-    count : int
-        Its degrees of freedom: the number of directions that remain.
     """
     covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
-    if all(channel_equations.absorbed.shape[0] for channel_equations in equations):
-        absorbed = np.hstack([channel_equations.absorbed for channel_equations in equations])
+    if all(channel_equations.absorbed_by_fit.shape[0] for channel_equations in equations):
+        absorbed = np.hstack([channel_equations.absorbed_by_fit for channel_equations in equations])
         covariance = covariance - absorbed.T @ absorbed
     projection = np.concatenate([channel_equations.projection for channel_equations in equations])
     eigenvalues, eigenvectors = np.linalg.eigh(covariance)
-    survives = eigenvalues > _LEAST_SURVIVING
-    squares = (eigenvectors[:, survives].T @ projection) ** 2 / eigenvalues[survives]
-    return float(np.sum(squares)), int(survives.sum())
+    is_remaining = eigenvalues > _LEAST_REMAINING_VARIANCE
+    squares = (eigenvectors[:, is_remaining].T @ projection) ** 2 / eigenvalues[is_remaining]
+    return ExplainedSquares(float(np.sum(squares)), int(is_remaining.sum()))
 
 
-def envelope(fitted: FittedTrial, column: int) -> FloatArray:
+def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
     """Return the amplitude of a channel's predicted motion at each sample of a dynamic trial.
 
     It is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the rate v,
@@ -154,7 +162,7 @@ def _value_at_rest(fitted: FittedTrial, column: int) -> float:
     return float(np.mean(values[-max(len(values) // 4, 1) :]))
 
 
-def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
+def dependence_functions(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
     """Return the functions that the residuals of a channel may depend on, at its used samples.
 
     Here x is the predicted displacement from rest and v its rate. The nonlinear functions (x^3,
@@ -191,7 +199,7 @@ def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
         linear["v"] = v
         nonlinear["sgn v"] = [np.sign(v)]
         nonlinear["|v|v"] = [np.abs(v) * v]
-        amplitude = envelope(fitted, column)[used]
+        amplitude = motion_envelope(fitted, column)[used]
         # phase of a harmonic motion x = a cos(phase), v = -a w sin(phase)
         phase = np.angle(x / _rms_or_one(x) - 1j * v / _rms_or_one(v))
         for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
@@ -207,13 +215,13 @@ def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
         if np.any(values):
             functions[name] = values[:, np.newaxis]
     for name, columns in nonlinear.items():
-        _add_projected(functions, name, np.column_stack(columns), linear_basis)
+        _add_projected_function(functions, name, np.column_stack(columns), linear_basis)
     for name, values in conditions.items():
-        _add_projected(functions, name, values[:, np.newaxis], mean_basis)
+        _add_projected_function(functions, name, values[:, np.newaxis], mean_basis)
     return functions
 
 
-def _add_projected(
+def _add_projected_function(
     functions: dict[str, FloatArray], name: str, columns: FloatArray, basis: FloatArray
 ) -> None:
     """Add a function to a dictionary after it was made orthogonal to a basis.
@@ -243,11 +251,17 @@ def _rms_or_one(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) or 1.0
 
 
-BINS = 6
+BIN_COUNT = 6
 """Bins of time, amplitude and frequency of a dynamic record."""
+LOAD_BIN_COUNT = 3
+"""Bins of load of a static trial, which has few rows."""
 
-_FEWEST = 4
+_LEAST_SAMPLES_OF_CELL = 4
 """Fewest samples of a cell whose size is tested."""
+
+
+_LEAST_FREEDOM_OF_CELL = 0.5
+"""Least effective degrees of freedom of a cell: with fewer, the fit has absorbed the residuals."""
 
 
 @dataclass(frozen=True)
@@ -302,7 +316,8 @@ def residual_map(
     residuals : ResidualSet
         Fitted trials.
     white : tuple of (N, C) ndarray
-        White residuals of each trial, from its method `white`, for the bins of frequency.
+        White residuals of each trial, from its method `whitened_residuals`, for the bins of
+        frequency.
     rate : float
         False discovery rate.
     """
@@ -353,7 +368,7 @@ def _cells_of_trial(
             cell = replace(template, axis=span.axis, low=span.low, high=span.high, count=count)
             functions = {"mean": np.ones((count, 1))}
             if span.axis == "whole":
-                functions = features(fitted, column)
+                functions = dependence_functions(fitted, column)
             for name, columns in functions.items():
                 cell_of_function = replace(cell, statistic=name)
                 yield from _dependence_cells(
@@ -392,20 +407,22 @@ def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
     used = fitted.used[:, column]
     yield _Span("whole", np.nan, np.nan, used)
     if trial.is_dynamic:
-        edges = np.linspace(trial.time[0], trial.time[-1], BINS + 1)
-        yield from _bins("time", trial.time, edges, used)
+        edges = np.linspace(trial.time[0], trial.time[-1], BIN_COUNT + 1)
+        yield from _spans_of_bins("time", trial.time, edges, used)
         if fitted.rates is not None:
-            amplitude = envelope(fitted, column)
+            amplitude = motion_envelope(fitted, column)
             if amplitude.any():
                 least = max(amplitude.min(), 1e-4 * amplitude.max())
-                edges = np.geomspace(least, amplitude.max(), BINS + 1)
-                yield from _bins("amplitude", amplitude, edges, used)
+                edges = np.geomspace(least, amplitude.max(), BIN_COUNT + 1)
+                yield from _spans_of_bins("amplitude", amplitude, edges, used)
     else:
-        edges = np.linspace(trial.load.min(), trial.load.max(), 4)
-        yield from _bins("load", trial.load, edges, used)
+        edges = np.linspace(trial.load.min(), trial.load.max(), LOAD_BIN_COUNT + 1)
+        yield from _spans_of_bins("load", trial.load, edges, used)
 
 
-def _bins(axis: str, values: FloatArray, edges: FloatArray, used: BoolArray) -> Iterator[_Span]:
+def _spans_of_bins(
+    axis: str, values: FloatArray, edges: FloatArray, used: BoolArray
+) -> Iterator[_Span]:
     """Yield a span for each bin of an axis.
 
     Parameters
@@ -419,10 +436,10 @@ def _bins(axis: str, values: FloatArray, edges: FloatArray, used: BoolArray) -> 
     used : (N,) ndarray of bool
         Used samples.
     """
-    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
-    for number, (low, high) in enumerate(pairwise(edges.tolist())):
+    bin_of_sample = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+    for bin_index, (low, high) in enumerate(pairwise(edges.tolist())):
         if low < high:
-            yield _Span(axis, low, high, used & (numbers == number))
+            yield _Span(axis, low, high, used & (bin_of_sample == bin_index))
 
 
 def _dependence_cells(
@@ -455,7 +472,7 @@ def _dependence_cells(
     equations = normal_equations_of(columns, ((fitted, used),), column)
     if equations is None:
         return
-    statistic, count = explained((equations,))
+    statistic, count = explained_sum_of_squares((equations,))
     if count < columns.shape[1]:
         return
     residual = fitted.standardised[used, column]
@@ -471,7 +488,10 @@ def _dependence_cells(
 def _variance_cells(
     fitted: FittedTrial, column: int, used: BoolArray, cell: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the cell of the residuals' mean square over its expectation, if the noise is recorded.
+    """Yield a cell with the sum of squared residuals over its expectation.
+
+    Nothing is yielded without a noise record, with too few samples, or if the fit has absorbed the
+    residuals.
 
     Parameters
     ----------
@@ -486,19 +506,22 @@ def _variance_cells(
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 without one.
     """
-    fewest = 1 if cell.axis == "whole" else _FEWEST
-    if noise_freedom <= 0.0 or cell.count < fewest:
+    # a bin of few samples is not tested; a whole record is, however short
+    least_count = 1 if cell.axis == "whole" else _LEAST_SAMPLES_OF_CELL
+    if noise_freedom <= 0.0 or cell.count < least_count:
         return
     sensitivity = None if fitted.sensitivity is None else fitted.sensitivity[used, column]
-    mean, freedom = quadratic_moments([(fitted.expected_variance[used, column], sensitivity)])
-    if freedom >= 0.5:
-        value = float(np.sum(fitted.standardised[used, column] ** 2)) / mean
+    expected_sum, freedom = sum_of_squares_moments(
+        [(fitted.expected_variance[used, column], sensitivity)]
+    )
+    if freedom >= _LEAST_FREEDOM_OF_CELL:
+        value = float(np.sum(fitted.standardised[used, column] ** 2)) / expected_sum
         p_value = variance_p_value(value, freedom, noise_freedom)
         yield replace(cell, statistic="variance", value=value, p_value=p_value)
 
 
 def _frequency_cells(
-    series: FloatArray, interval: float, empty: Cell, noise_freedom: float
+    series: FloatArray, interval: float, template: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
     """Yield the cells of a dynamic record in bands of frequency, which are wider at high frequency.
 
@@ -508,25 +531,25 @@ def _frequency_cells(
         White residuals of a channel.
     interval : float
         Sampling interval [s].
-    empty : Cell
+    template : Cell
         Cell with the names of trial and channel.
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 without one.
     """
     ordinates = periodogram(series)
-    if ordinates.size < 4 * BINS or noise_freedom <= 0.0:
+    if ordinates.size < 4 * BIN_COUNT or noise_freedom <= 0.0:
         return
-    edges = np.unique(np.round(np.geomspace(4, ordinates.size, BINS)).astype(int)).tolist()
+    edges = np.unique(np.round(np.geomspace(4, ordinates.size, BIN_COUNT)).astype(int)).tolist()
     resolution = 1.0 / (series.size * interval)
-    for first, last in pairwise([0, *edges]):
-        count = 2 * (last - first)  # a cosine and a sine for each ordinate
-        value = float(ordinates[first:last].mean())
+    for first_ordinate, last_ordinate in pairwise([0, *edges]):
+        count = 2 * (last_ordinate - first_ordinate)  # a cosine and a sine for each ordinate
+        value = float(ordinates[first_ordinate:last_ordinate].mean())
         yield replace(
-            empty,
+            template,
             axis="frequency",
             statistic="variance",
-            low=(first + 0.5) * resolution,
-            high=(last + 0.5) * resolution,
+            low=(first_ordinate + 0.5) * resolution,
+            high=(last_ordinate + 0.5) * resolution,
             count=count,
             value=value,
             p_value=variance_p_value(value, count, noise_freedom),

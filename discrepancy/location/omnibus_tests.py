@@ -9,7 +9,7 @@ import numpy as np
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.noise import NOISE_RECORD_LEVEL, record_at_rest, whiteness_is_tested
 from discrepancy.campaign.records import FloatArray
-from discrepancy.location.residuals import ResidualSet, mean_square
+from discrepancy.location.residuals import ResidualSet, mean_square_ratio
 
 LEAST_FREEDOM = 0.5
 """Fewest degrees of freedom of residuals whose variance is tested."""
@@ -54,7 +54,7 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
         Names of the channels of each group, by the first of them.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
-    for name in residuals.recorded:
+    for name in residuals.recorded_channels:
         channel = residuals.channels[name]
         noise = channel.noise
         assert noise is not None
@@ -78,7 +78,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
     OmnibusTest
         The test; its statistic is nan if no channel has a noise record.
     """
-    subsets = [residuals, *_by_kind(residuals)]
+    subsets = [residuals, *_split_by_kind(residuals)]
     p_values_of_groups: list[float] = []
     records: list[_RecordVariance] = []
     weighted_sum = 0.0
@@ -87,7 +87,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
         noise_freedom = residuals.degrees_of_freedom(names[0])
         p_values = []
         for subset in subsets:
-            square, freedom = mean_square(subset, names)
+            square, freedom = mean_square_ratio(subset, names)
             if freedom < LEAST_FREEDOM:
                 continue
             p_values.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
@@ -96,10 +96,10 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
                 total_freedom = total_freedom + freedom
         if p_values:
             p_values_of_groups.append(min(1.0, len(p_values) * min(p_values)))
-        records += _variances_of_records(residuals, names)
+        records += _variance_tests_of_records(residuals, names)
     if not p_values_of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
-    p_value = noise_tests.combine(p_values_of_groups)
+    p_value = noise_tests.combine_p_values(p_values_of_groups)
     worst = min(records, key=lambda record: record.p_value, default=_RecordVariance("", 2.0))
     if len(records) > 1:
         p_value = min(1.0, 2.0 * min(p_value, len(records) * worst.p_value))
@@ -116,7 +116,7 @@ class _RecordVariance(NamedTuple):
     p_value: float
 
 
-def _variances_of_records(
+def _variance_tests_of_records(
     residuals: ResidualSet, channels: Sequence[str]
 ) -> Iterator[_RecordVariance]:
     """Yield the variance test of each record of channels that share a noise record."""
@@ -124,13 +124,13 @@ def _variances_of_records(
     for fitted in residuals.trials:
         single_trial = replace(residuals, trials=(fitted,))
         for name in channels:
-            square, freedom = mean_square(single_trial, (name,))
+            square, freedom = mean_square_ratio(single_trial, (name,))
             if freedom >= LEAST_FREEDOM:
                 p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
                 yield _RecordVariance(f"{fitted.trial.name}, {name}", p_value)
 
 
-def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
+def _split_by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
     """Return the set split by the kind of its trials; nothing if there is only one kind."""
     kinds = list(dict.fromkeys(fitted.trial.kind for fitted in residuals.trials))
     if len(kinds) < 2:
@@ -155,65 +155,69 @@ def serial_tests(
     residuals : ResidualSet
         The set.
     white : sequence of (N, C) ndarray
-        White residuals of each trial, from its method `white`.
+        White residuals of each trial, from its method `whitened_residuals`.
     coloured : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """
-    ljung_box: list[_SerialTest] = []
-    cumulative_periodogram: list[_SerialTest] = []
-    fisher_g: list[_SerialTest] = []
-    for fitted, name, series in residuals.series(white):
-        if name in coloured:
+    portmanteau_tests: list[_RecordTest] = []
+    periodogram_tests: list[_RecordTest] = []
+    line_tests: list[_RecordTest] = []
+    for series in residuals.dynamic_series(white):
+        if series.channel in coloured:
             continue
-        where = f"{fitted.trial.name}, {name}"
-        statistic, p_value = noise_tests.ljung_box(series)
-        ljung_box.append(_SerialTest(statistic, p_value, where))
-        statistic, p_value = noise_tests.cumulative_periodogram(series)
-        cumulative_periodogram.append(_SerialTest(statistic, p_value, where))
-        statistic, p_value, index = noise_tests.fisher_g(series)
-        frequency = index / (len(series) * fitted.trial.interval)
-        fisher_g.append(_SerialTest(statistic, p_value, f"{where}, {frequency:.4g} Hz"))
+        trial = series.fitted_trial.trial
+        record = f"{trial.name}, {series.channel}"
+        portmanteau = noise_tests.ljung_box(series.values)
+        portmanteau_tests.append(_RecordTest(portmanteau.statistic, portmanteau.p_value, record))
+        cumulative = noise_tests.cumulative_periodogram(series.values)
+        periodogram_tests.append(_RecordTest(cumulative.statistic, cumulative.p_value, record))
+        line = noise_tests.fisher_g(series.values)
+        frequency = line.frequency_index / (len(series.values) * trial.interval)
+        record_and_line = f"{record}, {frequency:.4g} Hz"
+        line_tests.append(_RecordTest(line.statistic, line.p_value, record_and_line))
     return (
-        _combined("Ljung-Box", ljung_box),
-        _combined("cumulative periodogram", cumulative_periodogram),
-        _combined("Fisher g", fisher_g),
+        _combine_record_tests("Ljung-Box", portmanteau_tests),
+        _combine_record_tests("cumulative periodogram", periodogram_tests),
+        _combine_record_tests("Fisher g", line_tests),
     )
 
 
-class _SerialTest(NamedTuple):
-    """A test of one series: statistic, p-value, and its trial and channel."""
+class _RecordTest(NamedTuple):
+    """A test of one record: statistic, p-value, and its trial and channel in words."""
 
     statistic: float
     p_value: float
     where: str
 
 
-def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
-    """Return the tests of all series combined into one; its p-value is nan if there are none.
+def _combine_record_tests(name: str, tests: Sequence[_RecordTest]) -> OmnibusTest:
+    """Return the tests of all records combined into one; its p-value is nan if there are none.
 
-    Statistic and place are those of the series with the least p-value.
+    Statistic and place are those of the record with the least p-value.
     """
     if not tests:
         return OmnibusTest(name, np.nan, np.nan, "")
     worst = min(tests, key=lambda test: test.p_value)
-    p_value = noise_tests.combine([test.p_value for test in tests])
+    p_value = noise_tests.combine_p_values([test.p_value for test in tests])
     return OmnibusTest(name, p_value, worst.statistic, worst.where)
 
 
-def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
+def coloured_noise_remarks(residuals: ResidualSet) -> dict[str, str]:
     """Return a remark on each channel whose noise record is not white itself, by its name."""
     remarks = {}
     for name, channel in residuals.channels.items():
         series = record_at_rest(channel)
         if series is None or channel.noise is None or whiteness_is_tested(channel):
             continue
-        fraction, p_value, index = noise_tests.fisher_g(series)
-        if p_value < NOISE_RECORD_LEVEL:
+        line = noise_tests.fisher_g(series)
+        if line.p_value < NOISE_RECORD_LEVEL:
             frequency = ""
             if channel.noise.interval:
-                frequency = f" at {index / (series.size * channel.noise.interval):.4g} Hz"
+                hertz = line.frequency_index / (series.size * channel.noise.interval)
+                frequency = f" at {hertz:.4g} Hz"
+            percent = 100.0 * line.statistic
             remarks[name] = (
-                f"The noise record of {name} holds a line{frequency} ({100.0 * fraction:.0f} % of "
+                f"The noise record of {name} holds a line{frequency} ({percent:.0f} % of "
                 "its variance): the line is in the acquisition, and whiteness is not tested on "
                 "this channel."
             )

@@ -10,7 +10,7 @@ from scipy import stats
 from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
-ALIKE = 0.9
+LEAST_AGREEMENT = 0.9
 """Least squared cosine between two patterns over the channels that count as the same."""
 PATTERN_LEVEL = 0.01
 """Largest p-value of a pattern that is reported."""
@@ -77,7 +77,7 @@ class TrialsOfKind(NamedTuple):
         subject, dependence : str
             Entries of the finding.
         phrase : str
-            Begin of its sentence.
+            Start of its sentence.
         share : float
             Fraction of the excess variance that it explains.
         p_value : float
@@ -91,7 +91,7 @@ class TrialsOfKind(NamedTuple):
         return Disagreement(self.name, subject, dependence, share, p_value, sentence)
 
 
-def kinds_of(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[TrialsOfKind]:
+def group_by_kind(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[TrialsOfKind]:
     """Return the trials grouped by kind and channels; the residuals of a group form one matrix.
 
     Parameters
@@ -157,7 +157,7 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
         # noise alone has about this squared singular value, if samples and channels differ much
         square_of_noise = max(sample_count, channel_count)
         share = float(np.clip((square - square_of_noise) / excess_squares, 0.0, 1.0))
-        meaning, phrase = _meaning(residuals, kind.trials, weights)
+        meaning, phrase = _interpret_pattern(residuals, kind.trials, weights)
         channel = kind.trials[0].trial.channels[int(np.argmax(np.abs(weights)))]
         finding = kind.disagreement(meaning, "channels", phrase, share, p_value)
         patterns.append(replace(finding, channel=channel))
@@ -194,20 +194,21 @@ class _PatternMeaning(NamedTuple):
     subject : str
         "sensor", "common", "dynamics or load" or "mixed".
     phrase : str
-        Begin of a sentence about it.
+        Start of a sentence about it.
     """
 
     subject: str
     phrase: str
 
 
-def _meaning(
+def _interpret_pattern(
     residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
 ) -> _PatternMeaning:
     """Interpret a pattern over the channels by the known pattern that it agrees with best.
 
     The agreement is the squared cosine of the angle between the two. The meaning is "mixed" if it
-    is less than `ALIKE` for all known patterns, or if two of them agree about equally well.
+    is less than `LEAST_AGREEMENT` for all known patterns, or if two of them agree about equally
+    well.
 
     Parameters
     ----------
@@ -225,13 +226,13 @@ def _meaning(
             norms = (weights @ weights) * (pattern @ pattern)
             candidates.append((float((weights @ pattern) ** 2 / norms), meaning))
     best_agreement, best = max(candidates, key=lambda candidate: candidate[0])
-    if best_agreement < ALIKE:
+    if best_agreement < LEAST_AGREEMENT:
         strongest = np.argsort(-np.abs(weights))[:3]
         names = ", ".join(channels[index] for index in strongest)
         return _PatternMeaning("mixed", f"A pattern of its own, strongest on {names},")
     competing_subjects = set()
     for agreement, meaning in candidates:
-        agrees_as_well = agreement >= max(ALIKE, best_agreement - 0.05)
+        agrees_as_well = agreement >= max(LEAST_AGREEMENT, best_agreement - 0.05)
         if agrees_as_well and meaning.subject != best.subject:
             competing_subjects.add(meaning.subject)
     if competing_subjects:

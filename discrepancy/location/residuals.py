@@ -119,7 +119,25 @@ class ChannelFit(NamedTuple):
     used: BoolArray
 
 
-def of_channel(trials: Iterable[FittedTrial], channel: str) -> Iterator[ChannelFit]:
+class DynamicSeries(NamedTuple):
+    """White residuals of a channel in a dynamic trial.
+
+    Attributes
+    ----------
+    fitted_trial : FittedTrial
+        The trial.
+    channel : str
+        Name of the channel.
+    values : (N,) ndarray
+        The residuals, in units of the noise.
+    """
+
+    fitted_trial: FittedTrial
+    channel: str
+    values: FloatArray
+
+
+def channel_fits(trials: Iterable[FittedTrial], channel: str) -> Iterator[ChannelFit]:
     """Yield the column and the used samples of a channel in each trial that records it."""
     for fitted_trial in trials:
         if channel in fitted_trial.trial.channels:
@@ -148,7 +166,7 @@ class ResidualSet:
     trials: tuple[FittedTrial, ...]
 
     def __post_init__(self) -> None:
-        if not self.measured or not {*self.measured} <= self.channels.keys():
+        if not self.channel_names or not {*self.channel_names} <= self.channels.keys():
             raise FitError(
                 "A set of residuals needs at least one trial, and the channels of all its trials."
             )
@@ -156,35 +174,35 @@ class ResidualSet:
     @property
     def fitted(self) -> "ResidualSet | None":
         """The set of the fitted trials; None if there are none."""
-        return self._where(held_out=False)
+        return self._subset_of_role(held_out=False)
 
     @property
     def held_out(self) -> "ResidualSet | None":
         """The set of the trials that were held out for proof; None if there are none."""
-        return self._where(held_out=True)
+        return self._subset_of_role(held_out=True)
 
-    def _where(self, *, held_out: bool) -> "ResidualSet | None":
+    def _subset_of_role(self, *, held_out: bool) -> "ResidualSet | None":
         """Return the set of the held-out trials, or of the fitted ones; None if there are none."""
         trials = tuple(fitted for fitted in self.trials if fitted.trial.held_out is held_out)
         return replace(self, trials=trials) if trials else None
 
     @property
-    def measured(self) -> tuple[str, ...]:
+    def channel_names(self) -> tuple[str, ...]:
         """Names of the channels of its trials, in the order of their first occurrence."""
         names = [name for fitted in self.trials for name in fitted.trial.channels]
         return tuple(dict.fromkeys(names))
 
     @property
-    def recorded(self) -> tuple[str, ...]:
+    def recorded_channels(self) -> tuple[str, ...]:
         """Names of its channels with a noise record."""
-        return tuple(name for name in self.measured if self.degrees_of_freedom(name) > 0.0)
+        return tuple(name for name in self.channel_names if self.degrees_of_freedom(name) > 0.0)
 
     def degrees_of_freedom(self, channel: str) -> float:
         """Return the degrees of freedom n0 of a channel's noise record; 0 without a record."""
         noise = self.channels[channel].noise
         return 0.0 if noise is None else noise.degrees_of_freedom
 
-    def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
+    def whitened_residuals(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
         """Return residuals that are white with unit variance if the model is right.
 
         A fit absorbs part of the noise: its residuals r have the covariance I - S S^T. The sum
@@ -231,29 +249,20 @@ class ResidualSet:
                 return int(fitted.sensitivity.shape[2])
         return 0
 
-    def series(self, white: Sequence[FloatArray]) -> Iterator[tuple[FittedTrial, str, FloatArray]]:
+    def dynamic_series(self, white: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
         """Yield the white residuals of each dynamic record that is long enough for serial tests.
 
         Parameters
         ----------
         white : sequence of (N, C) ndarray
-            White residuals of each trial, from the method `white`.
-
-        Yields
-        ------
-        fitted : FittedTrial
-            The trial.
-        channel : str
-            Name of the channel.
-        series : (N,) ndarray
-            White residuals of the channel, in units of the noise.
+            White residuals of each trial, from the method `whitened_residuals`.
         """
         for fitted, values in zip(self.trials, white, strict=True):
             if not fitted.trial.is_dynamic or len(values) < SHORTEST_SERIES:
                 continue
             for column, name in enumerate(fitted.trial.channels):
                 if fitted.used[:, column].any():
-                    yield fitted, name, values[:, column]
+                    yield DynamicSeries(fitted, name, values[:, column])
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
         """Return a draw (P,) of the error z of the parameters, given the held-out residuals.
@@ -280,7 +289,7 @@ class ResidualSet:
         return np.asarray(mean + np.linalg.solve(factor.T, draw))
 
 
-def without_colour(residuals: ResidualSet) -> ResidualSet:
+def without_coloured_records(residuals: ResidualSet) -> ResidualSet:
     """Mark the records with coloured noise that cannot be whitened as not used.
 
     Correlated noise in them would be taken for a discrepancy of the model.
@@ -294,9 +303,24 @@ def without_colour(residuals: ResidualSet) -> ResidualSet:
     return replace(residuals, trials=tuple(trials))
 
 
-def quadratic_moments(
-    items: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
-) -> tuple[float, float]:
+class SumOfSquaresMoments(NamedTuple):
+    """Moments of a sum of squares of residuals, if the model is right.
+
+    Attributes
+    ----------
+    expected_sum : float
+        Expected sum of squares, in units of the noise variance.
+    degrees_of_freedom : float
+        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
+    """
+
+    expected_sum: float
+    degrees_of_freedom: float
+
+
+def sum_of_squares_moments(
+    records: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
+) -> SumOfSquaresMoments:
     """Return mean and effective degrees of freedom of a sum of squares of residuals.
 
     If the residuals have the covariance A, the sum has the mean tr A and the variance 2 tr A^2. A
@@ -306,47 +330,56 @@ def quadratic_moments(
 
     Parameters
     ----------
-    items : iterable of ((n,) ndarray, (n, P) ndarray or None)
+    records : iterable of ((n,) ndarray, (n, P) ndarray or None)
         Expected variances of n residuals in units of the noise variance (the diagonal of A), and
         their sensitivities S, for each trial and channel.
     held_out : bool
         True for residuals of held-out trials, where A = I + S S^T.
-
-    Returns
-    -------
-    mean : float
-        Expected sum of squares tr A, in units of the noise variance.
-    degrees_of_freedom : float
-        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
     """
     trace = 0.0
     trace_of_square = 0.0
     gram_of_sensitivities: FloatArray | None = None
-    for expected_variance, sensitivity in items:
+    for expected_variance, sensitivity in records:
         trace += float(expected_variance.sum())
         if sensitivity is None:
             # A^2 = A for a projection, such as I - S S^T of a linear fit without priors
             trace_of_square += float(expected_variance.sum())
             continue
         # A^2 = I -+ 2 S S^T + (S S^T)^2, thus tr A^2 = n -+ 2 tr S S^T + tr (S^T S)^2. The last
-        # term does not split into items: S^T S is summed over them first.
+        # term does not split into records: S^T S is summed over them first.
         leverage = np.einsum("np,np->n", sensitivity, sensitivity)
         trace_of_square += float(np.sum(1.0 + (2.0 if held_out else -2.0) * leverage))
-        gram_of_item = sensitivity.T @ sensitivity
+        gram_of_record = sensitivity.T @ sensitivity
         gram_of_sensitivities = (
-            gram_of_item if gram_of_sensitivities is None else gram_of_sensitivities + gram_of_item
+            gram_of_record
+            if gram_of_sensitivities is None
+            else gram_of_sensitivities + gram_of_record
         )
     if gram_of_sensitivities is not None:
         trace_of_square += float(np.sum(gram_of_sensitivities**2))
+    # traces below these limits are rounding errors: the fit has absorbed all residuals
     if trace <= 1e-9 or trace_of_square <= 1e-12:
-        return max(trace, 0.0), 0.0
-    return trace, trace**2 / trace_of_square
+        return SumOfSquaresMoments(max(trace, 0.0), 0.0)
+    return SumOfSquaresMoments(trace, trace**2 / trace_of_square)
 
 
-def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float, float]:
+class MeanSquareRatio(NamedTuple):
+    """A sum of squares of residuals over its expectation.
+
+    Attributes
+    ----------
+    ratio : float
+        The ratio; 1 on average if the model is right, nan if the expectation is zero.
+    degrees_of_freedom : float
+        Effective degrees of freedom of the sum; see `sum_of_squares_moments`.
+    """
+
+    ratio: float
+    degrees_of_freedom: float
+
+
+def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> MeanSquareRatio:
     """Return the sum of squares of channels' residuals divided by its expectation.
-
-    It is 1 on average if the model is right.
 
     Parameters
     ----------
@@ -354,22 +387,18 @@ def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float,
         Trials that are all fitted, or all held out.
     channels : sequence of str
         Names of the channels.
-
-    Returns
-    -------
-    ratio : float
-        Sum of squares over its expectation; nan if that is zero.
-    degrees_of_freedom : float
-        Effective degrees of freedom of the sum; see `quadratic_moments`.
     """
     sum_of_squares = 0.0
-    moments = []
+    records = []
     for name in channels:
-        for fitted, column, used in of_channel(residuals.trials, name):
+        for fitted, column, used in channel_fits(residuals.trials, name):
             sum_of_squares += float(np.sum(fitted.standardised[used, column] ** 2))
             sensitivity = None
             if fitted.sensitivity is not None:
                 sensitivity = fitted.sensitivity[used, column]
-            moments.append((fitted.expected_variance[used, column], sensitivity))
-    mean, freedom = quadratic_moments(moments, held_out=residuals.trials[0].trial.held_out)
-    return (sum_of_squares / mean if mean > 0.0 else np.nan), freedom
+            records.append((fitted.expected_variance[used, column], sensitivity))
+    expected_sum, freedom = sum_of_squares_moments(
+        records, held_out=residuals.trials[0].trial.held_out
+    )
+    ratio = sum_of_squares / expected_sum if expected_sum > 0.0 else np.nan
+    return MeanSquareRatio(ratio, freedom)

@@ -53,7 +53,7 @@ class MissingForces:
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear_model, self.model_laws = problem.model.apart()
+        linear_model, self.model_laws = problem.model.without_laws()
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
         self.problem = problem.with_trials(trials, linear_model)
@@ -131,7 +131,7 @@ class MissingForces:
     def evaluate_model_laws(self, shared: FloatArray) -> ModelPatch:
         """Return the model's own laws at values (K,) of the shared unknowns."""
         parameters = self.problem.shared.parameters(shared)
-        return self.model.own_laws(parameters) + self.model.patch.of(PortForce)
+        return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
 
     def force_deviation(self, port: int) -> float:
         """Return the standard deviation of the missing force at a port without any effect.

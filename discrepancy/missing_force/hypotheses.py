@@ -75,7 +75,7 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
         return log(SEARCH.prior_none)
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
     shape_price = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
-    probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
+    probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_probabilities[len(terms) - 1]
     number_of_sets = comb(max(effect_count, len(terms)), len(terms))
     return log(probability_of_length / number_of_sets) - log_places - shape_price
 
@@ -406,7 +406,7 @@ class ColumnBuilder:
         added_state = np.zeros_like(motion.added_state)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
-        for law in self.problem.model.at_ports(laws):
+        for law in self.problem.model.forces_at_ports(laws):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)

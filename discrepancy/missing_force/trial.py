@@ -26,7 +26,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
-from discrepancy.system.sensing import in_own_clock
+from discrepancy.system.sensing import shift_clock_to_first_sample
 from discrepancy.system.time_history import subdivide
 from fe.runtime.patch import ModelPatch
 
@@ -447,7 +447,7 @@ def correlated_noise_part(
     interval : float or None
         The interval between samples [s]; None if the samples are not equally spaced.
     """
-    if interval is None or not noise.applies(interval):
+    if interval is None or not noise.can_whiten(interval):
         return None
     impulse_response = lfilter(
         [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_CORRELATION)]
@@ -498,7 +498,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
         residual=residual / deviation * trial.used,
         used=trial.used,
         deviation=deviation,
-        coloured_noises=_coloured_noises(data.noise_models, trial.whitened_at),
+        coloured_noises=_coloured_noises(data.noise_models, trial.whitening_interval),
         shared_derivatives=by_shared / deviation * trial.used,
         local_derivatives=by_local / deviation * trial.used,
         local_precision=data.unknowns.precision,
@@ -626,7 +626,7 @@ def _port_motion(
     """
     data = problem.trials[trial_index]
     shared = problem.shared
-    trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
+    trial_in_own_clock, _ = shift_clock_to_first_sample(data.trial, ModelPatch())
 
     def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
         parameters = shared.parameters(shared_values)
@@ -671,7 +671,7 @@ def _ported_system(
     outputs = problem.campaign.outputs(trial)
 
     def system(u: FloatArray) -> PortedSystem:
-        return problem.model.ported(trial, outputs, unknowns.parameters(u))
+        return problem.model.ported_system(trial, outputs, unknowns.parameters(u))
 
     derivatives: list[PortedSystem | None] = []
     for k in range(unknowns.parameter_count):

@@ -59,11 +59,11 @@ def gap_windows(
         The residuals of the unchanged model. They alone are examined if missing forces cannot be
         estimated, or if the model has laws of its own, which are exact only in a simulation.
     seed : int
-        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
-        that the fit has absorbed.
+        The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
+        the noise that the fit has absorbed.
     """
     dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
-    _, own_laws = problem.model.apart()
+    _, own_laws = problem.model.without_laws()
     if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
         return windows_of_residuals(residuals, seed=seed)
     try:
@@ -147,15 +147,15 @@ def windows_of_residuals(
     residuals : ResidualSet
         The residuals.
     seed : int
-        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
-        that the fit has absorbed.
+        The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
+        the noise that the fit has absorbed.
     with_effect : bool
         Whether the residuals are those of the best hypothesis, not of the unchanged model.
     kinds : frozenset of TrialKind
         The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
-    white = residuals.white(np.random.default_rng((seed, 1)))
+    white = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
     for fitted, white_residuals in zip(residuals.trials, white, strict=True):
         trial = fitted.trial
         extends_in_time = fitted.used.any() and np.ptp(trial.time) > 0.0

@@ -18,7 +18,7 @@ from calibration.result.record import (
 )
 from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.model_check import MOST_OF_PRIOR
+from discrepancy.checks.model_check import LARGEST_DEVIATION_RATIO
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
@@ -26,7 +26,7 @@ from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
 from discrepancy.search.wide_noise import estimate_residual_process
 from discrepancy.verdict import Gate
-from discrepancy.workflow import checked, without_wrong_ends
+from discrepancy.workflow import check_and_prepare, problem_without_wrong_ends
 from reporting.progress import Progress, reporter
 from reporting.provenance import collect_provenance
 from reporting.words import counted, small
@@ -77,11 +77,11 @@ def calibrate_parameters(
     # before the model is evaluated: it may fail for values outside its range
     priors = stated_priors(campaign, choice)
     with progress.stage("Checking the data"):
-        campaign, faults = checked(campaign, model, hold_out=False)
+        campaign, faults = check_and_prepare(campaign, model, hold_out=False)
     for fault in faults:
         if fault.fatal:
             raise CampaignDataError(fault.sentence)
-    problem = without_wrong_ends(campaign, model)
+    problem = problem_without_wrong_ends(campaign, model)
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
@@ -120,7 +120,7 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
     """
     model = choice.label or choice.model.name
     priors = []
-    moments = choice.model.stated(campaign)
+    moments = choice.model.prior_moments(campaign)
     for parameter, (mean, deviation) in zip(choice.model.parameters, moments, strict=True):
         name = parameter.name
         if not parameter.low <= mean <= parameter.high:
@@ -209,7 +209,7 @@ def findings(
         The remarks of the campaign.
     """
     sentences: list[str] = []
-    if gate.passed is False:
+    if gate.has_failed:
         sentences.append(
             f"The campaign is not explained by these parameters: {small(gate.reason)} The "
             "posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on "
@@ -260,7 +260,7 @@ def _range_findings(
     deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.parameter_indices]), 1e-12)
     probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
     probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
-    is_determined = remaining_deviations(posterior) <= MOST_OF_PRIOR
+    is_determined = remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
     is_cut_off = is_determined & (probability_below + probability_above > LEAST_CUT_OFF)
     for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
         if cut_off:
@@ -314,7 +314,7 @@ def _undetermined_findings(
 ) -> Iterator[str]:
     """Yield findings on parameters that the campaign does not determine, or not separately."""
     for prior, ratio in zip(priors, remaining_deviations(posterior).tolist(), strict=True):
-        if ratio > MOST_OF_PRIOR:
+        if ratio > LARGEST_DEVIATION_RATIO:
             remaining = "all" if ratio > 0.995 else f"{100.0 * ratio:.0f} %"
             yield (
                 f"The campaign does not tell {prior.name}: {remaining} of its prior deviation is "

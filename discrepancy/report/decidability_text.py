@@ -7,12 +7,17 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    DETECTION_DISTANCE,
+    Detectability,
+    Separability,
+)
 from discrepancy.report.text import WORDS, number, unit_text
 from reporting.words import listing
 
 
-def seen_of(detectability: Detectability) -> tuple[str, str, str]:
+def detectability_texts(detectability: Detectability) -> tuple[str, str, str]:
     """Return texts on the detectability of an effect, for a row of a table.
 
     Returns
@@ -24,7 +29,7 @@ def seen_of(detectability: Detectability) -> tuple[str, str, str]:
     median : str
         Prior median of its size, with unit; empty for an effect without a size.
     """
-    is_visible = detectability.distance >= DETECTED
+    is_visible = detectability.distance >= DETECTION_DISTANCE
     visible = "yes" if is_visible else "larger than usual only"
     if not detectability.parameter:
         return visible, "at once" if is_visible else "not at its prior median", ""
@@ -36,13 +41,13 @@ def seen_of(detectability: Detectability) -> tuple[str, str, str]:
     return visible, least_size, median
 
 
-def neighbours(separability: Separability, name: str) -> list[str]:
+def confused_effects(separability: Separability, name: str) -> list[str]:
     """Return the effects that these data cannot distinguish from one, in either direction."""
     if name not in separability.identifiers:
         return []
     index = separability.identifiers.index(name)
     distance = np.minimum(separability.distance[index], separability.distance[:, index])
-    is_confusable = distance < CONFUSED
+    is_confusable = distance < CONFUSION_DISTANCE
     return [
         other
         for other_index, other in enumerate(separability.identifiers)
@@ -61,9 +66,13 @@ def group_lines(separability: Separability, hint: str = "the table says to which
         Where a reader finds which member is close to which.
     """
     detectable = [
-        item for item in separability.detectability if not item.reason and isfinite(item.detectable)
+        detectability
+        for detectability in separability.detectability
+        if not detectability.reason and isfinite(detectability.detectable)
     ]
-    shows_any = any(item.parameter and item.distance > 0.0 for item in detectable)
+    shows_any = any(
+        detectability.parameter and detectability.distance > 0.0 for detectability in detectable
+    )
     if not separability.identifiers or not shows_any:
         return [WORDS.say("nothing_shown")]
     if not separability.groups:
@@ -80,11 +89,11 @@ def group_lines(separability: Separability, hint: str = "the table says to which
     return lines
 
 
-def needs(
+def campaign_needs(
     separability: Separability,
     campaign: Campaign,
     effects: Sequence[Effect],
-    possible: Collection[TrialKind],
+    possible_kinds: Collection[TrialKind],
 ) -> list[str]:
     """Return sentences on what the campaign would need to decide more.
 
@@ -96,22 +105,24 @@ def needs(
         The campaign.
     effects : sequence of Effect
         The catalogue.
-    possible : collection of TrialKind
+    possible_kinds : collection of TrialKind
         Kinds of trials that the model follows.
     """
-    known_effects = {effect.identifier: effect for effect in effects}
-    missing_kinds = set(possible) - {trial.kind for trial in campaign.trials}
-    lines = []
+    effects_by_identifier = {effect.identifier: effect for effect in effects}
+    missing_kinds = set(possible_kinds) - {trial.kind for trial in campaign.trials}
+    sentences = []
     for group in separability.groups:
-        kinds_of_effects = [known_effects[name].acts_on for name in group if name in known_effects]
-        lines.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
-    lines += _sentence_on_hidden_effects(separability)
+        kinds_of_effects = [
+            effects_by_identifier[name].acts_on for name in group if name in effects_by_identifier
+        ]
+        sentences.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
+    sentences += _sentence_on_hidden_effects(separability)
     without_noise = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if without_noise:
-        lines.append(WORDS.say("give_noise", names=", ".join(without_noise)))
+        sentences.append(WORDS.say("give_noise", names=", ".join(without_noise)))
     if not campaign.held_out:
-        lines.append(WORDS.say("hold_out"))
-    return lines
+        sentences.append(WORDS.say("hold_out"))
+    return sentences
 
 
 def _sentence_on_group(
@@ -147,22 +158,24 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     Empty without any.
     """
     hidden = [
-        item
-        for item in separability.detectability
-        if not item.reason
-        and item.parameter
-        and isfinite(item.detectable)
-        and item.distance < DETECTED
+        detectability
+        for detectability in separability.detectability
+        if not detectability.reason
+        and detectability.parameter
+        and isfinite(detectability.detectable)
+        and detectability.distance < DETECTION_DISTANCE
     ]
     if not hidden:
         return []
-    nearest = max(hidden, key=lambda item: item.distance)
+    nearest = max(hidden, key=lambda detectability: detectability.distance)
     factor = inf
     if nearest.distance > 0.0:
-        factor = (DETECTED / nearest.distance) ** 0.5
+        factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5
     sentence = WORDS.say(
         "unseen" if len(hidden) > 1 else "unseen_one",
-        unseen=listing(item.effect.identifier.replace("_", " ") for item in hidden),
+        unseen=listing(
+            detectability.effect.identifier.replace("_", " ") for detectability in hidden
+        ),
         first=nearest.effect.identifier.replace("_", " "),
         factor=factor,
         trials=factor**2,

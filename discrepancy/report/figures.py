@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import FloatArray
 from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
+from discrepancy.judgement.separability import CONFUSION_DISTANCE, DETECTION_DISTANCE, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce
 from discrepancy.proof_record import Scores
@@ -28,7 +28,13 @@ from discrepancy.report.motion_figures import (
     spectrum_figure,
     worst_record,
 )
-from discrepancy.report.text import WORDS, added_label, force_sentence, motion_of, scored
+from discrepancy.report.text import (
+    WORDS,
+    added_label,
+    force_sentence,
+    port_motion_units,
+    proof_scores,
+)
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
@@ -49,13 +55,13 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """
     if not scores:
         return None
-    figure, grid = residual_figures.panels(1, 2, 1.9)
+    figure, grid = residual_figures.new_panels(1, 2, 1.9)
     all_axes = style.keep_first_panels(grid, len(scores))
     highest = max(max(score.pit) for score in scores.values())
     has_two_panels = len(scores) > 1
-    for number, (axes, (title, score)) in enumerate(zip(all_axes, scores.items(), strict=True)):
+    for panel, (axes, (title, score)) in enumerate(zip(all_axes, scores.items(), strict=True)):
         bin_count = len(score.pit)
-        is_before = number == 0 and has_two_panels
+        is_before = panel == 0 and has_two_panels
         axes.bar(
             (np.arange(bin_count) + 0.5) / bin_count,
             score.pit,
@@ -70,8 +76,8 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
             ylim=(0.0, 1.1 * max(highest, 0.16)),
             xlabel="probability integral transform",
         )
-        axes.set_ylabel("share of samples" if number == 0 else "")
-        axes.set_title(f"{'ab'[number]}  {title}" if has_two_panels else title)
+        axes.set_ylabel("share of samples" if panel == 0 else "")
+        axes.set_title(f"{'ab'[panel]}  {title}" if has_two_panels else title)
     return figure
 
 
@@ -95,10 +101,10 @@ def _map_of_names(
     texts : (R, C) ndarray of str, optional
         Texts of the cells.
     """
-    figure, ((axes,),) = residual_figures.panels(1, 1, 0.175 * len(rows) + 1.6)
+    figure, ((axes,),) = residual_figures.new_panels(1, 1, 0.175 * len(rows) + 1.6)
     row_names = [name.replace("_", " ") for name in rows]
     column_names = [name.replace("_", " ") for name in columns]
-    image = residual_figures.heat_map(axes, values, (row_names, column_names), norm, 55, texts)
+    image = residual_figures.draw_heat_map(axes, values, (row_names, column_names), norm, 55, texts)
     axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
@@ -126,15 +132,15 @@ def separability_figure(separability: Separability) -> Figure | None:
     np.fill_diagonal(cells, np.nan)
     labels = [names[index] for index in order]
     figure, axes, image = _map_of_names(cells, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
-    for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
+    for row, column in zip(*np.nonzero(distance < CONFUSION_DISTANCE), strict=True):
         if row != column:
             axes.plot(column, row, "x", color=style.PREDICTION, ms=4.0, mew=1.1)
     cell_width = 1.0 / len(names)
     bar_axes = axes.inset_axes((1.0 + 0.4 * cell_width, 0.0, 0.4 * cell_width, 1.0))
     bar = style.color_bar(figure, image, "squared distance d²", cax=bar_axes)
     style.plain_powers(bar.yaxis, (1.0,))
-    bar.axhline(CONFUSED, color=style.PREDICTION, lw=1.2)
-    bar.axhline(DETECTED, color="white", lw=1.2)
+    bar.axhline(CONFUSION_DISTANCE, color=style.PREDICTION, lw=1.2)
+    bar.axhline(DETECTION_DISTANCE, color="white", lw=1.2)
     return figure
 
 
@@ -154,7 +160,7 @@ def confusion_figure(self_calibration: SelfCalibration) -> Figure:
 
 MOST_DOTS = 3000
 """Most dots of a panel; longer records are thinned evenly."""
-MOST_TURNS = 400
+MOST_FORCE_SAMPLES = 400
 """Most samples of the force in a panel over time, centred on its largest value."""
 
 
@@ -166,7 +172,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     row_titles = {"force": "missing force"}
     if missing.law:
         row_titles["left"] = "what is left"
-    name_of_force, displacement_unit, speed_unit = motion_of(missing.at_port)
+    name_of_force, displacement_unit, speed_unit = port_motion_units(missing.at_port)
     if displacement_unit:
         motions = {
             "position": f"displacement, {displacement_unit}",
@@ -176,7 +182,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
         motions = {"position": "integral of the state", "speed": f"state, {speed_unit}"}
     sample_count = sum(len(course.time) for course in missing.courses)
     drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
-    figure, rows = residual_figures.panels(
+    figure, rows = residual_figures.new_panels(
         len(row_titles), 3, 2.4 * len(row_titles) + 0.5, sharey=True
     )
     letters = iter("abcdef")
@@ -212,9 +218,9 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
         True to draw the law as well.
     """
     strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
-    first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
-    first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
-    drawn = slice(first, first + MOST_TURNS)
+    first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
+    first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
+    drawn = slice(first, first + MOST_FORCE_SAMPLES)
     time = strongest.time[drawn]
     values = getattr(strongest, series)[drawn]
     two_deviations = 2.0 * strongest.deviation[drawn]
@@ -312,7 +318,7 @@ class ReportInput:
 
 def _unit_of_noise(before: ResidualSet) -> str:
     """Return the sentence on the unit of the rms residuals in figures: the noise, if recorded."""
-    unknown = [name for name in before.measured if name not in before.recorded]
+    unknown = [name for name in before.channel_names if name not in before.recorded_channels]
     if not unknown:
         return "1 is noise."
     return (
@@ -335,24 +341,26 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     missing = investigation.missing
     if missing is not None:
         sentence = force_sentence(missing.at_port)
-        _add(figures, "missing_force", missing_force_figure(missing), sentence=sentence)
+        _add_figure(figures, "missing_force", missing_force_figure(missing), sentence=sentence)
     if investigation.before is not None:
         _add_residual_figures(figures, content, investigation.before)
     if investigation.proof is not None:
-        before, after, trials = scored(investigation.proof)
+        before, after, trials = proof_scores(investigation.proof)
         scores = {"model as it was": before, "with the effect": after}
         with_pit = {title: score for title, score in scores.items() if score.pit}
-        where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
-        _add(figures, "pit", pit_figure(with_pit), where=where)
+        trials_text = (
+            "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
+        )
+        _add_figure(figures, "pit", pit_figure(with_pit), where=trials_text)
     if content.separability is not None:
         figure = separability_figure(content.separability)
-        _add(figures, "separability", figure, confused=CONFUSED)
+        _add_figure(figures, "separability", figure, confused=CONFUSION_DISTANCE)
     if content.self_calibration is not None:
-        _add(figures, "self_calibration", confusion_figure(content.self_calibration))
+        _add_figure(figures, "self_calibration", confusion_figure(content.self_calibration))
     return figures
 
 
-def _add(
+def _add_figure(
     figures: dict[str, ReportFigure], name: str, figure: Figure | None, **fields: object
 ) -> None:
     """Add a figure, if there is one, with the caption that these fields fill in."""
@@ -373,22 +381,22 @@ def _add_residual_figures(
     }
     if content.design is not None:
         figure = residual_figures.planform_figure(before, after, content.design)
-        _add(figures, "residual_map", figure, **scale)
-    _add(figures, "residual_table", residual_figures.heat_figure(before, after), **scale)
-    _add(figures, "load", load_figure(before, after))
+        _add_figure(figures, "residual_map", figure, **scale)
+    _add_figure(figures, "residual_table", residual_figures.heat_figure(before, after), **scale)
+    _add_figure(figures, "load", load_figure(before, after))
     windows = investigation.verdict.windows
     remark = ""
     if any(window.with_effect for window in windows):
         remark = " The thin bars below are what the hypothesis leaves."
-    _add(figures, "time_line", time_line_figure(windows), left=remark)
+    _add_figure(figures, "time_line", time_line_figure(windows), left=remark)
     worst = worst_record(before.trials)
     if worst is not None:
         trial = before.trials[worst.trial].trial
         role = "held out" if trial.held_out else "fitted"
         figure = history_figure(before, after, worst)
-        _add(figures, "history", figure, channel=worst.channel, trial=trial.name, role=role)
-        _add(figures, "spectrum", spectrum_figure(before, after, worst))
+        _add_figure(figures, "history", figure, channel=worst.channel, trial=trial.name, role=role)
+        _add_figure(figures, "spectrum", spectrum_figure(before, after, worst))
     backbone = backbone_figure(before, after)
     if backbone is not None:
         figure, channel = backbone
-        _add(figures, "backbone", figure, channel=channel)
+        _add_figure(figures, "backbone", figure, channel=channel)

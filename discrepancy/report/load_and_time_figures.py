@@ -14,11 +14,11 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.report.residual_figures import (
     DrawnModel,
+    add_size_bar,
     draw_noise,
-    models,
-    panels,
-    scale_of,
-    size_bar,
+    models_to_draw,
+    new_panels,
+    size_colour_scale,
 )
 from discrepancy.verdict import GapWindow
 from reporting import figures as style
@@ -77,12 +77,12 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
         return None
     columns = min(len(load_panels), 2)
     rows = (len(load_panels) + columns - 1) // columns
-    figure, grid = panels(rows, columns, 2.25 * rows + 0.3)
+    figure, grid = new_panels(rows, columns, 2.25 * rows + 0.3)
     all_axes = style.keep_first_panels(grid, len(load_panels))
     for letter, axes, panel in zip("abcd", all_axes, load_panels, strict=False):
         factor, unit = UNITS[panel.quantity].drawn
         noises = []
-        for drawn in models(before, after):
+        for drawn in models_to_draw(before, after):
             noises.append(_draw_loads(axes, drawn, panel.kind, panel.names, factor))
         draw_noise(axes, noises[0], 0.25)
         axes.axhline(0.0, color=style.OBSERVED, lw=0.6)
@@ -170,23 +170,23 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
         largest_gap_of_trial, key=lambda name: -largest_gap_of_trial[name]
     )[:MOST_RECORDS]
     trials = [name for name in largest_gap_of_trial if name in trials_with_largest_gaps]
-    norm = scale_of([window.size for window in windows])
+    norm = size_colour_scale([window.size for window in windows])
     has_two_rows = any(window.with_effect for window in windows)
-    figure, ((axes,),) = panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
+    figure, ((axes,),) = new_panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
     for row, name in enumerate(trials):
         windows_of_trial = [window for window in windows if window.trial == name]
-        _draw_record(axes, row, windows_of_trial, norm, both=has_two_rows)
-    axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
+        _draw_record(axes, row, windows_of_trial, norm, has_two_rows=has_two_rows)
+    axes.set_yticks(range(len(trials)), [_shorten_name(name) for name in trials])
     axes.set_ylim(len(trials) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
     axes.set_xlabel("time since the start of the trial, s")
-    size_bar(figure, norm, [axes])
+    add_size_bar(figure, norm, [axes])
     return figure
 
 
 def _draw_record(
-    axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool
+    axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, has_two_rows: bool
 ) -> None:
     """Draw the windows of a record as bars, with the uncertainty of their ends.
 
@@ -200,20 +200,20 @@ def _draw_record(
         Windows of the record.
     norm : Normalize
         Scale from the size of a gap to the colour of its bar.
-    both : bool
+    has_two_rows : bool
         True if the windows that remain with the effect have a line of their own below the others.
     """
     first, last = windows[0].first, windows[0].last
-    lines = (row - 0.14, row + 0.2) if both else row
+    lines = (row - 0.14, row + 0.2) if has_two_rows else row
     axes.hlines(lines, first, last, color=style.REFERENCE, lw=1.0, zorder=1)
     for window in windows:
-        # a window without a begin or an end extends to that end of the record
+        # a window without a start or an end extends to that end of the record
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
         if window.with_effect:
             bottom, height = row + 0.1, 0.2
         else:
-            bottom, height = row - 0.34, 0.4 if both else 0.68
+            bottom, height = row - 0.34, 0.4 if has_two_rows else 0.68
         axes.broken_barh(
             [(begin, end - begin)],
             (bottom, height),
@@ -239,7 +239,7 @@ def _draw_record(
             )
 
 
-def _short(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """Return a name, cut off with an ellipsis if it is long."""
     if len(name) <= LONGEST_NAME:
         return name

@@ -14,8 +14,14 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
 from discrepancy.location.backbones import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
-from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
-from discrepancy.report.residual_figures import DrawnModel, draw_noise, models, panels, size
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
+from discrepancy.report.residual_figures import (
+    DrawnModel,
+    draw_noise,
+    models_to_draw,
+    new_panels,
+    rms_over_noise,
+)
 from reporting import figures as style
 
 _ARRAYS = [entry.name for entry in fields(Backbone) if entry.name != "mode"]
@@ -45,7 +51,7 @@ def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
         if not fitted.trial.is_dynamic:
             continue
         for name in fitted.trial.channels:
-            size_of_record = size([fitted], name)
+            size_of_record = rms_over_noise([fitted], name)
             if np.isfinite(size_of_record):
                 candidates.append((size_of_record, index, name))
     if not candidates:
@@ -69,10 +75,10 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     used = fitted.used[:, column]
     time = fitted.trial.time
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     panel_count = 1 + len(drawn_models)
     height_ratios = [1.25, *[1.0] * len(drawn_models)]
-    figure, ((axes,), *rows_below) = panels(
+    figure, ((axes,), *rows_below) = new_panels(
         panel_count, 1, 1.45 * panel_count + 0.35, height_ratios=height_ratios, sharex=True
     )
     axes.margins(x=0.01)
@@ -101,13 +107,13 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
     The power is relative to white noise of the stated variance. None if no trial is long enough.
     """
     spectra = []
-    for drawn in models(before, after):
-        spectrum = _spectrum(drawn.residuals, worst.channel)
+    for drawn in models_to_draw(before, after):
+        spectrum = _mean_spectrum(drawn.residuals, worst.channel)
         if spectrum is not None:
             spectra.append((spectrum, drawn))
     if not spectra:
         return None
-    figure, ((axes,),) = panels(1, 1, 2.7)
+    figure, ((axes,),) = new_panels(1, 1, 2.7)
     _draw_noise_spectrum(axes, before.channels[worst.channel].noise)
     axes.axhline(1.0, color=style.TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
     for spectrum, drawn in spectra:
@@ -161,14 +167,14 @@ class _Spectrum(NamedTuple):
     power: FloatArray
 
 
-def _spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
+def _mean_spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
     """Return the mean spectrum of a channel's residuals over the dynamic trials.
 
     Trials of different lengths have spectra at different frequencies; only the largest group of
     trials with equal frequencies is averaged. None if no trial has 32 samples.
     """
     groups: dict[float, list[_Spectrum]] = {}
-    for fitted, column, _ in of_channel(residuals.trials, channel):
+    for fitted, column, _ in channel_fits(residuals.trials, channel):
         if not fitted.trial.is_dynamic or len(fitted.trial.time) < 32:
             continue
         interval = fitted.trial.interval
@@ -213,17 +219,17 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     if worst is None or not frequencies:
         return None
     channel = worst.channel
-    measured = _backbones(before, channel, frequencies, measured=True)
+    measured = _backbones_by_mode(before, channel, frequencies, measured=True)
     curves = []
-    for drawn in models(before, after):
-        curves.append((drawn, _backbones(drawn.residuals, channel, frequencies)))
+    for drawn in models_to_draw(before, after):
+        curves.append((drawn, _backbones_by_mode(drawn.residuals, channel, frequencies)))
     modes = [
         mode for mode in sorted(measured) if np.isfinite(measured[mode].time).sum() >= LEAST_POINTS
     ][:2]
     if not modes:
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
-    figure, grid = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
+    figure, grid = new_panels(len(modes), 2, 2.3 * len(modes) + 0.3)
     letters = iter("abcd")
     for row, mode in zip(grid, modes, strict=True):
         curves_of_mode = [(drawn, curve[mode]) for drawn, curve in curves if mode in curve]
@@ -304,7 +310,7 @@ def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
     axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
-def _backbones(
+def _backbones_by_mode(
     residuals: ResidualSet, channel: str, frequencies: Sequence[float], *, measured: bool = False
 ) -> dict[int, Backbone]:
     """Return the backbones of the ring-downs by mode, of the predictions or of the readings.
@@ -324,7 +330,7 @@ def _backbones(
         True for the readings.
     """
     backbones_of_modes: dict[int, list[Backbone]] = {}
-    for fitted, column, used in of_channel(residuals.trials, channel):
+    for fitted, column, used in channel_fits(residuals.trials, channel):
         if fitted.trial.kind is not TrialKind.RINGDOWN:
             continue
         noise = float(fitted.noise_deviation[column])
@@ -340,11 +346,14 @@ def _backbones(
                 clear_points = _clear_points(curve)
                 if clear_points is not None:
                     backbones_of_modes.setdefault(curve.mode, []).append(clear_points)
-    return {mode: _joined(mode, parts) for mode, parts in backbones_of_modes.items()}
+    return {mode: _join_backbones(mode, parts) for mode, parts in backbones_of_modes.items()}
 
 
 def _clear_points(curve: Backbone) -> Backbone | None:
-    """Return the points of a backbone with small errors, and nan after them; None without any."""
+    """Return the points of a backbone with small errors, and nan after them.
+
+    None is returned if there is no such point.
+    """
     median_ratio = float(np.median(np.abs(curve.damping_ratio)))
     is_clear = curve.damping_ratio_error < LARGEST_ERROR * max(median_ratio, 1e-4)
     if not is_clear.any():
@@ -353,7 +362,7 @@ def _clear_points(curve: Backbone) -> Backbone | None:
     return Backbone(mode=curve.mode, **arrays)
 
 
-def _joined(mode: int, parts: Sequence[Backbone]) -> Backbone:
+def _join_backbones(mode: int, parts: Sequence[Backbone]) -> Backbone:
     """Return the backbones of several ring-downs as one."""
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     return Backbone(mode=mode, **arrays)

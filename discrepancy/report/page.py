@@ -9,19 +9,23 @@ from typing import Any
 
 from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
-from discrepancy.judgement.remarks import NO_GAP, when_sentence
+from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.report import text as words
-from discrepancy.report.decidability_text import group_lines, neighbours, seen_of
+from discrepancy.report.decidability_text import (
+    confused_effects,
+    detectability_texts,
+    group_lines,
+)
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
-from discrepancy.self_calibration import Proportion, SelfCalibration, outcomes
+from discrepancy.self_calibration import Proportion, SelfCalibration, ordered_outcomes
 from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.templates import fill_template
 from reporting.words import listing, plus_minus
 
-SHOWN_HYPOTHESES = 8
+MOST_SHOWN_HYPOTHESES = 8
 """Most hypotheses in the table of evidence."""
 NINETY = 1.6449
 """Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
@@ -30,8 +34,8 @@ NINETY = 1.6449
 def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
     """Return the rows of the table of evidence: hypotheses with their roles.
 
-    Those of the verdict come first, then the most probable others, at most `SHOWN_HYPOTHESES` in
-    all. The hypothesis without effects is always included.
+    Those of the verdict come first, then the most probable others, at most `MOST_SHOWN_HYPOTHESES`
+    in all. The hypothesis without effects is always included.
     """
     if verdict.group:
         members = [*verdict.group]
@@ -41,17 +45,17 @@ def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
         role = verdict.kind.value
     remaining_members = {member for member in members if member}
     chosen: list[tuple[Hypothesis, str]] = []
-    others: list[tuple[Hypothesis, str]] = []
+    remaining_hypotheses: list[tuple[Hypothesis, str]] = []
     for hypothesis in verdict.hypotheses:  # the most probable first
         identifiers = " + ".join(hypothesis.identifiers)
         if identifiers in remaining_members:
             remaining_members.remove(identifiers)
             chosen.append((hypothesis, role))
         else:
-            others.append((hypothesis, ""))
-    ranked = chosen + others
-    without_effects = [row for row in ranked[SHOWN_HYPOTHESES:] if not row[0].effects]
-    return ranked[:SHOWN_HYPOTHESES] + without_effects
+            remaining_hypotheses.append((hypothesis, ""))
+    ranked = chosen + remaining_hypotheses
+    without_effects = [row for row in ranked[MOST_SHOWN_HYPOTHESES:] if not row[0].effects]
+    return ranked[:MOST_SHOWN_HYPOTHESES] + without_effects
 
 
 def not_compared_rows(verdict: Verdict) -> list[tuple[str, str]]:
@@ -143,7 +147,7 @@ def effect_rows(verdict: Verdict) -> list[dict[str, Any]]:
     `item`.
     """
     rows = []
-    members = [*words.members_of(verdict).values()] or [verdict.effects]
+    members = [*words.group_members(verdict).values()] or [verdict.effects]
     for number, effects in enumerate(members, start=1):
         label: int | str = number
         for effect in effects:
@@ -157,9 +161,9 @@ LONGEST_CARD = 60
 """Most characters of a card of the page; the sentence below it has all names."""
 
 
-def what_is_missing(verdict: Verdict) -> str:
+def missing_effects_text(verdict: Verdict) -> str:
     """Return what the model lacks in a few words, for a card at the top of the page."""
-    members = words.members_of(verdict)
+    members = words.group_members(verdict)
     if members:
         names = listing(members, "or")
         return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
@@ -187,23 +191,25 @@ def sizes_sentence(content: ReportInput) -> str:
     return WORDS.say("sizes", effects=verdict.effects if verdict.kind in words.NAMING else ())
 
 
-def deciding(verdict: Verdict) -> list[Gate]:
+def deciding_gates(verdict: Verdict) -> list[Gate]:
     """Return the gates that compared a p-value; those that did not pass come first."""
     compared = [
         gate
         for gate in verdict.gates
         if isfinite(gate.statistic) and gate.name not in ("shape", "held-out trials")
     ]
-    return sorted(compared, key=lambda gate: gate.passed is not False)
+    return sorted(compared, key=lambda gate: not gate.has_failed)
 
 
-def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Proportion]]:
+def calibration_rows(self_calibration: SelfCalibration) -> list[tuple[str, str, Proportion]]:
     """Return the rows of the self-calibration: hidden or not, the outcome, and its fraction."""
     rows = []
     for title, null in (("an effect was hidden", False), ("nothing was hidden", True)):
-        for outcome in outcomes(tried, null=null):
-            rows.append((title, outcome, tried.share(outcome, null=null)))
-    rows.append(("named rightly", "90 % intervals that hold the true value", tried.coverage()))
+        for outcome in ordered_outcomes(self_calibration, null=null):
+            rows.append((title, outcome, self_calibration.share(outcome, null=null)))
+    rows.append(
+        ("named rightly", "90 % intervals that hold the true value", self_calibration.coverage())
+    )
     return rows
 
 
@@ -213,14 +219,14 @@ FUNCTIONS = (
     parameter_rows,
     score_rows,
     effect_rows,
-    what_is_missing,
+    missing_effects_text,
     sizes_sentence,
-    deciding,
+    deciding_gates,
     calibration_rows,
     group_lines,
-    neighbours,
-    seen_of,
-    when_sentence,
+    confused_effects,
+    detectability_texts,
+    gap_times_sentence,
     words.hypothesis_name,
     words.headline,
     words.error_sentence,
@@ -232,7 +238,7 @@ FUNCTIONS = (
 """Functions that the templates of the page and of the command call by name."""
 
 
-def said_on_page(content: ReportInput) -> dict[str, Any]:
+def template_values(content: ReportInput) -> dict[str, Any]:
     """Return the names that the templates of the page and of the command use, with their values."""
     investigation = content.investigation
     verdict = investigation.verdict
@@ -258,10 +264,10 @@ def said_on_page(content: ReportInput) -> dict[str, Any]:
         "location": investigation.location,
         "fitted": verdict.kind is not VerdictKind.DATA_ERROR,
         "named": verdict.kind in words.NAMING,
-        "nothing": verdict.kind in NO_GAP,
+        "nothing": verdict.kind in KINDS_WITHOUT_GAP,
         "label": words.added_label(investigation),
-        "members": words.members_of(verdict),
-        "scored": None if proof is None else words.scored(proof),
+        "members": words.group_members(verdict),
+        "scored": None if proof is None else words.proof_scores(proof),
         "without": without_effects,
         "catalogue": {effect.identifier: effect for effect in effects},
         "remarks": [remark for remark in verdict.remarks if remark not in fault_sentences],
@@ -292,5 +298,5 @@ def render_report(
             f"{origin.provenance.seed}.",
         ),
     )
-    WORDS.fill(page, drawings, figures=figures, **said_on_page(content))
+    WORDS.fill(page, drawings, figures=figures, **template_values(content))
     return page.render()

@@ -13,14 +13,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity
-from discrepancy.judgement.closed_share import with_noise_of
-from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
+from discrepancy.judgement.closed_share import residuals_with_noise_of
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
 from reporting import figures as style
 
 AFTER = "with the effect"
-EMPTY = "#f0f1f2"
+EMPTY_CELL_COLOUR = "#f0f1f2"
 """Colour of cells of a map that hold nothing."""
 
 
@@ -35,17 +35,19 @@ class DrawnModel(NamedTuple):
     title: str
 
 
-def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
+def models_to_draw(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     """Return the residuals to draw, with style and label: before and, if given, with the effect."""
     was = DrawnModel(before, style.PREDICTION, "--", "o", "model", "model as it is")
     if after is None:
         return [was]
     was = was._replace(label="model as it was", title="a  model as it was")
-    with_effect = with_noise_of(after, before)
+    with_effect = residuals_with_noise_of(after, before)
     return [was, DrawnModel(with_effect, style.PAST, "-", "D", AFTER, f"b  {AFTER}")]
 
 
-def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:
+def new_panels(
+    rows: int, columns: int, height: float, **grid: Any
+) -> tuple[Figure, list[list[Axes]]]:
     """Return a new figure and its grid of panels.
 
     Parameters
@@ -74,7 +76,7 @@ def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
     )
 
 
-def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
+def size_colour_scale(values: Sequence[float] | FloatArray) -> Normalize:
     """Return the logarithmic colour scale of sizes of residuals; 1 (noise) is dark.
 
     Sizes below the scale have the colour of its end: a window whose readings are all missing has
@@ -84,13 +86,13 @@ def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
     return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
-def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
+def add_size_bar(figure: Figure, norm: Normalize, panels: Sequence[Axes]) -> None:
     """Draw the colour bar of sizes of residuals beside panels."""
     bar = style.color_bar(
         figure,
         ScalarMappable(norm, style.LEVELS),
         "rms residual / noise",
-        ax=beside,
+        ax=panels,
         fraction=0.045,
         pad=0.02,
         aspect=14,
@@ -99,7 +101,7 @@ def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
     style.plain_powers(bar.yaxis, (1.0, 2.0, 5.0) if largest < 50.0 else (1.0,))
 
 
-def heat_map(
+def draw_heat_map(
     axes: Axes,
     values: FloatArray,
     names: tuple[Iterable[str], Iterable[str]],
@@ -132,7 +134,7 @@ def heat_map(
     axes.set_yticks(range(len(row_names)), row_names)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    axes.set_facecolor(EMPTY)
+    axes.set_facecolor(EMPTY_CELL_COLOUR)
     if texts is None:
         return image
     for (row, column), text in np.ndenumerate(texts):
@@ -161,17 +163,17 @@ BELOW: dict[str, Any] = {
 """How gauges and their names are drawn on the wing."""
 
 
-def size(trials: Sequence[FittedTrial], channel: str) -> float:
+def rms_over_noise(trials: Sequence[FittedTrial], channel: str) -> float:
     """Return the rms residual of a channel over the noise; nan if no sample is used."""
     sum_of_squares = 0.0
     count = 0
-    for fitted, column, used in of_channel(trials, channel):
+    for fitted, column, used in channel_fits(trials, channel):
         sum_of_squares += float(np.sum(fitted.standardised[used, column] ** 2))
         count += int(used.sum())
     return float(np.sqrt(sum_of_squares / count)) if count else float("nan")
 
 
-def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
+def rms_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
     """Return the sizes of residuals by channel and trial.
 
     Returns
@@ -181,7 +183,7 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
     sizes : (C, T) ndarray
         rms residuals over the noise; nan if a trial lacks a channel.
     """
-    measured = {*residuals.measured}
+    measured = {*residuals.channel_names}
     channels = [name for name in residuals.channels if name in measured]
     trial_names = []
     sizes = np.full((len(channels), len(residuals.trials)), np.nan)
@@ -191,7 +193,7 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
         mark = " (held out)" if trial.held_out and not is_marked else ""
         trial_names.append(f"{trial.name}{mark}")
         for row, channel in enumerate(channels):
-            sizes[row, column] = size([fitted], channel)
+            sizes[row, column] = rms_over_noise([fitted], channel)
     return channels, trial_names, sizes
 
 
@@ -224,30 +226,30 @@ def planform_figure(
     places = gauge_places(list(before.channels.values()), design)
     if not places:
         return None
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     sizes_of_models = []
     for drawn in drawn_models:
-        sizes_of_models.append([size(drawn.residuals.trials, name) for name in places])
-    norm = scale_of(np.array(sizes_of_models))
+        sizes_of_models.append([rms_over_noise(drawn.residuals.trials, name) for name in places])
+    norm = size_colour_scale(np.array(sizes_of_models))
     row_count = len(drawn_models)
-    figure, grid = panels(row_count, 1, 1.62 * row_count + 0.35, sharex=True)
+    figure, grid = new_panels(row_count, 1, 1.62 * row_count + 0.35, sharex=True)
     all_axes = [axes for (axes,) in grid]
     for axes, sizes, drawn in zip(all_axes, sizes_of_models, drawn_models, strict=True):
         _draw_planform(axes, design)
         for (name, place), value in zip(places.items(), sizes, strict=True):
             if np.isfinite(value):
-                position = _position(design, *place)
+                position = _planform_position(design, *place)
                 is_strain = before.channels[name].quantity is Quantity.STRAIN
                 marker = "o" if is_strain else "s"
                 axes.scatter(*position, c=[value], norm=norm, marker=marker, **GAUGE)
                 axes.annotate(name, position, (0.0, -6.5), **BELOW)
         axes.set(title=drawn.title, ylabel="chord, m")
     all_axes[-1].set_xlabel("distance from the root, m")
-    size_bar(figure, norm, all_axes)
+    add_size_bar(figure, norm, all_axes)
     return figure
 
 
-def _position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
+def _planform_position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
     """Return the coordinates of a place in the planform [m]: along the span, and along the chord.
 
     The chordwise coordinate is measured from the leading edge at the root. The wing is straight at
@@ -293,7 +295,7 @@ def _draw_panel(
     root, tip = span
     front, rear = chord
     corners = ((root, front), (tip, front), (tip, rear), (root, rear))
-    positions = [_position(design, station, fraction) for station, fraction in corners]
+    positions = [_planform_position(design, station, fraction) for station, fraction in corners]
     axes.fill(*np.transpose(positions), **look)
 
 
@@ -302,24 +304,24 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
 
     Both maps share one colour scale.
     """
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     tables = []
     for drawn in drawn_models:
-        _, _, sizes = size_table(drawn.residuals)
+        _, _, sizes = rms_table(drawn.residuals)
         tables.append(sizes)
-    channels, trials, _ = size_table(before)
-    norm = scale_of(np.concatenate([sizes.ravel() for sizes in tables]))
+    channels, trials, _ = rms_table(before)
+    norm = size_colour_scale(np.concatenate([sizes.ravel() for sizes in tables]))
     longest_name = max(len(name) for name in trials)
     below = min(0.22 + 0.042 * longest_name, 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
-    figure, (row,) = panels(1, len(tables), height)
+    figure, (row,) = new_panels(1, len(tables), height)
     has_texts = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
-    for number, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
-        row_names = channels if number == 0 else [""] * len(channels)
+    for panel, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
+        row_names = channels if panel == 0 else [""] * len(channels)
         texts = _cell_texts(sizes) if has_texts else None
-        heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
+        draw_heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
         axes.set_title(drawn.title)
-    size_bar(figure, norm, row)
+    add_size_bar(figure, norm, row)
     return figure
 
 

@@ -9,7 +9,7 @@ from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
-from discrepancy.judgement.closed_share import closed_text, share_text
+from discrepancy.judgement.closed_share import closed_share_text, percent_with_interval
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.proof_record import Proof, Scores
 from discrepancy.system.interface import Model
@@ -33,7 +33,7 @@ BEYOND_DOUBT = 1e6
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that name what is missing, or part of it."""
 
-LARGEST_PLAIN = 1e6
+LARGEST_PLAIN_NUMBER = 1e6
 """Numbers below this are written without a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
@@ -48,11 +48,11 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
     return rounded(estimate.value, half_width), interval
 
 
-def p_value_text(p: float) -> str:
+def p_value_text(p_value: float) -> str:
     """Return a p-value."""
-    if isnan(p):
+    if isnan(p_value):
         return "not known"
-    return "< 1e-6" if p < 1e-6 else f"{p:.2g}"
+    return "< 1e-6" if p_value < 1e-6 else f"{p_value:.2g}"
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -60,7 +60,7 @@ def number(value: float, digits: int = 3) -> str:
     if isnan(value):
         return "\N{EN DASH}"
     text = f"{value:.{digits}g}"
-    if "e+0" in text and abs(value) < LARGEST_PLAIN:
+    if "e+0" in text and abs(value) < LARGEST_PLAIN_NUMBER:
         text = f"{float(text):,.0f}"
     return text.replace("-", "\N{MINUS SIGN}")
 
@@ -89,7 +89,7 @@ def headline(verdict: Verdict) -> str:
     return f"{sentence} ({role} {probability_text(verdict.probability)})."
 
 
-def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
+def group_members(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     """Return the effects of each member of a group by its name; empty for any other verdict."""
     if verdict.kind is not VerdictKind.GROUP:
         return {}
@@ -106,7 +106,7 @@ def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     return members
 
 
-def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
+def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
     """Return the name of a missing force and the units of its port's motion.
 
     Returns
@@ -124,7 +124,7 @@ def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
 
 def force_sentence(force: ForceAtPort) -> str:
     """Return the sentence on a missing force: where, how large, and what its law leaves."""
-    name, displacement_unit, speed_unit = motion_of(force)
+    name, displacement_unit, speed_unit = port_motion_units(force)
     evidence = force.evidence[force.port]
     other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
     nearest = max(other_ports, key=lambda port: other_ports[port], default="")
@@ -155,7 +155,7 @@ def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
     return tested
 
 
-def scored(proof: Proof) -> tuple[Scores, Scores, str]:
+def proof_scores(proof: Proof) -> tuple[Scores, Scores, str]:
     """Return the scores before and after, and their trials: held-out ones if there are any."""
     if proof.held_out_before is not None and proof.held_out_after is not None:
         return proof.held_out_before, proof.held_out_after, "held-out"
@@ -175,8 +175,8 @@ def error_sentence(investigation: Investigation) -> str:
     if proof.closed is None:
         return proof.closed_reason
     is_named = investigation.verdict.kind in NAMING
-    predicate = closed_text(before, after, proof.closed).removeprefix("it ")
-    if proof.closed.grew:
+    predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
+    if proof.closed.has_grown:
         subject = "With it" if is_named else "With the best hypothesis, which is no name,"
     else:
         subject = "It" if is_named else "The best hypothesis, which is no name,"
@@ -185,7 +185,7 @@ def error_sentence(investigation: Investigation) -> str:
 
 def noise_levels(proof: Proof) -> tuple[str, str]:
     """Return the rms of the residuals over the noise, before and after, as texts."""
-    before, after, _ = scored(proof)
+    before, after, _ = proof_scores(proof)
     rms_before = number(before.chi_square_per_sample**0.5, 2)
     rms_after = number(after.chi_square_per_sample**0.5, 2)
     return rms_before, rms_after
@@ -196,7 +196,7 @@ def remainders_sentence(verdict: Verdict) -> str:
     return WORDS.say("left", remainders=verdict.remainders)
 
 
-def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
+def _effects_label(effects: Iterable[tuple[str, str, bool]]) -> str:
     """Return effects joined by plus signs: their names, places and whether a shape is free."""
     labels = []
     for name, place, has_free_shape in effects:
@@ -210,7 +210,7 @@ def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
 def hypothesis_name(hypothesis: Hypothesis) -> str:
     """Return the effects of a hypothesis in words."""
     effects = [(effect.name, effect.place, bool(effect.shape)) for effect in hypothesis.effects]
-    return _labels(effects) or "nothing missing"
+    return _effects_label(effects) or "nothing missing"
 
 
 def added_label(investigation: Investigation) -> str:
@@ -218,7 +218,7 @@ def added_label(investigation: Investigation) -> str:
     if investigation.fit is None:
         return ""
     terms = investigation.fit.candidate.terms
-    return _labels((term.effect.name, term.place, term.free_shape) for term in terms)
+    return _effects_label((term.effect.name, term.place, term.free_shape) for term in terms)
 
 
 _WORD = re.compile(r"\b([a-z]+)(?=\b|_)")
@@ -245,7 +245,7 @@ def parameter_text(estimate: Estimate) -> str:
 _NUMBERS: tuple[Any, ...] = (
     number,
     nats,
-    share_text,
+    percent_with_interval,
     formula,
     p_value_text,
     estimate_text,
@@ -297,8 +297,8 @@ def si_sizes(
             half_width = 0.5 * (size.high - size.low)
             interval = f" ({between(size.low, size.high, half_width)})"
         name = _size_name(size.parameter, primitive, unit)
-        where = _where(primitive, size, model, campaign)
-        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{where}"] = None
+        place_text = _location_text(primitive, size, model, campaign)
+        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
     return ", ".join(sizes)
 
 
@@ -349,7 +349,9 @@ def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
     return name.replace("force", "moment") if is_at_turning_port else name
 
 
-def _where(primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
+def _location_text(
+    primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign
+) -> str:
     """Return the reference speed or displacement of a force, or the station of a mass.
 
     It is a phrase such as " at 0.3 m/s"; empty for other sizes.

@@ -138,7 +138,7 @@ class FittedCandidates:
         if key in self.wide_fits:
             return self.wide_fits[key]
         previous = self.exact_fits.get(key)
-        if previous is None or previous.log_evidence < rough.log_evidence - SEARCH.gained_again:
+        if previous is None or previous.log_evidence < rough.log_evidence - SEARCH.refit_gain:
             exact = try_fit(self.problem, rough.candidate, rough.point)
             # the rough fit may be at a point from which the model cannot be fitted further
             self.record_fit(rough if exact is None else exact, exact=True)

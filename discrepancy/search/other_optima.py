@@ -45,7 +45,8 @@ def canonical_relatives(
 def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Point) -> list[Point]:
     """Return points at which a single effect has another magnitude, to begin fits at.
 
-    They are sorted by their objective, the least first; `SEARCH.restarts` of them are returned.
+    They are sorted by their objective, the least first; `SEARCH.most_restarts` of them are
+    returned.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
         with suppress(DiscrepancyError):  # the effect is larger than the model allows
             valued_points.append((objective(problem, candidate, point), point))
     valued_points.sort(key=lambda valued_point: valued_point[0])
-    return [point for _, point in valued_points[: SEARCH.restarts]]
+    return [point for _, point in valued_points[: SEARCH.most_restarts]]
 
 
 def sets_at_other_places(candidate: Candidate, setting: Setting) -> list[Candidate]:

@@ -106,7 +106,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     places = effect.places(setting)
     has_few_places = len(places) <= SEARCH.few_places
     other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
-    count = SEARCH.starts * 3 if other_parameter_count > 1 else SEARCH.starts
+    count = SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
     best_changes: list[ScreenedChange] = []
     for place in places:
         best_of_place: list[ScreenedChange] = []
@@ -114,7 +114,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
             EffectTerm(effect, place), with_small_magnitude=has_few_places
         ):
             changes = [change]
-            is_nonlinear = change.squared_size > SEARCH.first_order and changes_structure(
+            is_nonlinear = change.squared_size > SEARCH.first_order_change and changes_structure(
                 effect, setting
             )
             # a large change that is not linear in its magnitude is tried at a small one too
@@ -238,7 +238,7 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     for place in effect.places(problem.setting):
         term = EffectTerm(effect, place)
         parameter_count = len(term.parameters)
-        level_counts = SEARCH.far_levels
+        level_counts = SEARCH.grid_levels_far_from_data
         level_count = level_counts[min(parameter_count, len(level_counts) - 1)]
         # quantiles of the prior
         levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
@@ -248,4 +248,4 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
                 value = objective(problem, start.candidate, start.point)
                 valued_starts.append((value, start))
     valued_starts.sort(key=lambda valued_start: valued_start[0])
-    return [start for _, start in valued_starts[: SEARCH.far_starts]]
+    return [start for _, start in valued_starts[: SEARCH.starts_far_from_data]]

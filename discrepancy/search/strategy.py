@@ -123,7 +123,7 @@ class Search(FittedCandidates):
 
     def _has_large_residuals(self, base: CandidateFit) -> bool:
         """Return whether χ² per sample of a fit is above `SEARCH.far`: much more than noise."""
-        return base.chi_square > SEARCH.far * float(self.problem.sample_counts.sum())
+        return base.chi_square > SEARCH.far_chi_square * float(self.problem.sample_counts.sum())
 
     def _is_far_from_truth(self, base: CandidateFit) -> bool:
         """Return whether a fit is far from the truth.
@@ -134,7 +134,7 @@ class Search(FittedCandidates):
         has_prior = self.problem.shared.precision > 0.0
         deviations = np.abs(base.point.shared[has_prior])
         return self._has_large_residuals(base) or bool(
-            deviations.max(initial=0.0) > SEARCH.strained
+            deviations.max(initial=0.0) > SEARCH.far_prior_deviations
         )
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
@@ -153,7 +153,7 @@ class Search(FittedCandidates):
             The best fit of each effect that was fitted.
         """
         has_effects = bool(base.candidate.terms)
-        least_gain = SEARCH.worth_adding if has_effects else SEARCH.worth_fitting
+        least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
         screen = Screen(self.problem, base)
         changes_by_effect = []
         for effect in report_each(
@@ -225,12 +225,12 @@ class Search(FittedCandidates):
                     start.candidate,
                     start.point,
                     nearby_derivatives=base.trial_derivatives or None,
-                    iterations=SEARCH.rough_steps,
+                    iterations=SEARCH.rough_fit_iterations,
                     objective_limit=give_up,
                 )
                 if rough is not None:  # None if the effect is larger than the model allows
                     fits.append(rough)
-                    give_up = min(give_up, rough.objective + SEARCH.out_of_reach)
+                    give_up = min(give_up, rough.objective + SEARCH.largest_rough_deficit)
             if fits:
                 best_fits.append(max(fits, key=self.score))
         return best_fits
@@ -251,9 +251,9 @@ class Search(FittedCandidates):
             return []
         best_score = self.score(rough[0])
         # far from the truth, the scores after few steps are only roughly in order
-        margin = max(SEARCH.close, SEARCH.close_share * (best_score - floor))
+        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor))
         least_score = max(best_score - margin, floor)
-        chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least_score]
+        chosen = [fit for fit in rough[: SEARCH.most_exact_fits] if self.score(fit) > least_score]
         exact = []
         for fit in report_each(
             self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
@@ -269,12 +269,12 @@ class Search(FittedCandidates):
         """
         problem = self.problem
         while (
-            problem.refinement < SEARCH.finest
-            and time_step_error(problem, self.best()) > SEARCH.solver_share
+            problem.refinement < SEARCH.largest_step_reduction
+            and time_step_error(problem, self.best()) > SEARCH.largest_step_error
         ):
             problem.refinement *= 2
             ranked = sorted(self.exact_fits.values(), key=lambda fit: -self.score(fit))
-            for fit in ranked[: SEARCH.refitted]:
+            for fit in ranked[: SEARCH.most_refitted]:
                 if not fit.candidate.terms:
                     continue
                 finer = try_fit(problem, fit.candidate, fit.point)
@@ -286,7 +286,7 @@ class Search(FittedCandidates):
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
         rough = self.fit_one_more_effect(self.no_effect, self.effects)
-        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.hopeless)
+        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.largest_single_deficit)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
@@ -328,11 +328,11 @@ class Search(FittedCandidates):
                 eligible.append(hypothesis)
         leading = []
         for hypothesis in eligible:
-            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.followed:
+            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.force_fit_range:
                 leading.append(hypothesis)
         for hypothesis in report_each(
             self.on_progress,
-            leading[: SEARCH.far_fits],
+            leading[: SEARCH.most_far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
             start = force_search.point_with_effects(hypothesis)
@@ -385,7 +385,7 @@ class Search(FittedCandidates):
             present = {term.effect.identifier for term in current.candidate.terms}
             others = [effect for effect in self.effects if effect.identifier not in present]
             rough = self.fit_one_more_effect(current, others)
-            exact = self.fit_best_exactly(rough, current_score - SEARCH.hopeless_longer)
+            exact = self.fit_best_exactly(rough, current_score - SEARCH.largest_longer_set_deficit)
             if not exact or self.score(exact[0]) <= current_score:
                 break
             current = exact[0]
@@ -398,7 +398,7 @@ class Search(FittedCandidates):
         """
         best = self.best()
         while len(best.candidate.terms) > 1 and self.is_unexplained():
-            give_up = best.objective + SEARCH.out_of_reach
+            give_up = best.objective + SEARCH.largest_rough_deficit
             for candidate in sets_at_other_places(best.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
@@ -417,7 +417,7 @@ class Search(FittedCandidates):
         """
         best = self.best()
         while len(best.candidate.terms) > 1:
-            give_up = best.objective + SEARCH.out_of_reach
+            give_up = best.objective + SEARCH.largest_rough_deficit
             numbers = range(len(best.candidate.terms))
             for dropped in numbers:
                 remaining = [number for number in numbers if number != dropped]
@@ -474,11 +474,11 @@ class Search(FittedCandidates):
         for fit in self.exact_fits.values():
             if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
                 single_fits.append(fit)
-        single_fits = sorted(single_fits, key=self.score, reverse=True)[: SEARCH.exact_fits]
+        single_fits = sorted(single_fits, key=self.score, reverse=True)[: SEARCH.most_exact_fits]
         explaining_fits = [fit for fit in single_fits if self._is_not_refuted(fit)]
         if not explaining_fits or explaining_fits[0] is not single_fits[0]:
             return single_fits
-        least_score = self.score(single_fits[0]) - SEARCH.rivals
+        least_score = self.score(single_fits[0]) - SEARCH.family_fit_range
         competing_fits = [fit for fit in explaining_fits if self.score(fit) > least_score]
         if len(competing_fits) == 1 or self._is_not_refuted(self.no_effect):
             return []
@@ -491,7 +491,7 @@ class Search(FittedCandidates):
         for effect in self.effects:
             changes.extend(best_changes_by_effect(screen, effect))
         starts_by_pair = []
-        for pair in best_pairs(changes, screen.inner_product_signs)[: SEARCH.pairs_fitted]:
+        for pair in best_pairs(changes, screen.inner_product_signs)[: SEARCH.most_fitted_pairs]:
             candidate = Candidate((pair.first.term, pair.second.term))
             if candidate.key in self.exact_fits:
                 continue
@@ -502,4 +502,4 @@ class Search(FittedCandidates):
         for fit in rough:
             self.record_fit(fit, exact=False)
         rough.sort(key=lambda fit: -self.score(fit))
-        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.close)
+        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.exact_fit_range)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.library import in_events
+from discrepancy.catalogue.library import variants_in_events
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, try_fit
@@ -51,18 +51,20 @@ def search(
     """
     on_progress("fitting the model as it is")
     start = problem.prior_mean_point(Candidate())
-    no_effect = fit(problem, Candidate(), start, iterations=SEARCH.none_steps)
-    no_effect = refit_from_first_readings(problem, no_effect, iterations=SEARCH.none_steps)
+    no_effect = fit(problem, Candidate(), start, iterations=SEARCH.no_effect_iterations)
+    no_effect = refit_from_first_readings(
+        problem, no_effect, iterations=SEARCH.no_effect_iterations
+    )
     usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
-    usable_effects = (*usable, *in_events(tuple(usable), problem.setting))
+    usable_effects = (*usable, *variants_in_events(tuple(usable), problem.setting))
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
-    _, own_laws = problem.model.apart()
+    _, own_laws = problem.model.without_laws()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
         start = result.force_search.point_with_effects(result.force_search.hypothesis_of_all_ports)
         second_fit = try_fit(problem, Candidate(), start)
-        least_gain = SEARCH.worth_fitting
+        least_gain = SEARCH.least_gain_to_fit
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)

@@ -137,7 +137,9 @@ def _channel_process(
         wide_variance = max(mean_square, 1.0)
     else:
         wide_variance = mean_square
-    noise_factor = np.sqrt(wide_variance * noise_tests.times_fewer(autocorrelation, white_variance))
+    noise_factor = np.sqrt(
+        wide_variance * noise_tests.statistical_inefficiency(autocorrelation, white_variance)
+    )
     process = _ChannelProcess(noise_factor=noise_factor, is_recorded_colour=is_recorded_colour)
     # the process is what the residuals have besides the noise
     process_variance = mean_square / noise_level - 1.0
@@ -173,7 +175,7 @@ def _add_correlation_in_time(
     # White noise adds to the variance of the residuals, but not to their correlation. So the
     # correlation of the process is larger by the ratio of the variances.
     residuals_over_process = (1.0 + process_variance) / process_variance
-    correlation_time = interval * noise_tests.times_fewer(
+    correlation_time = interval * noise_tests.statistical_inefficiency(
         autocorrelation, white_variance, residuals_over_process
     )
     frequency = 0.0
@@ -282,7 +284,7 @@ def _recorded_colour(
                 residuals.steps / record.interval, lags, np.r_[1.0, autocorrelation]
             )
             correlation = float(np.mean(at_steps))
-            times_fewer = noise_tests.times_fewer(autocorrelation, white_variance)
+            times_fewer = noise_tests.statistical_inefficiency(autocorrelation, white_variance)
         colours.append(_RecordedColour(correlation, 1.0 / len(centred_record), times_fewer))
     return _RecordedColour(*np.mean(colours, axis=0).tolist())
 
@@ -372,8 +374,8 @@ def compare_under_wide_noise(search: Search) -> None:
 def _most_probable_sets(search: Search) -> list[CandidateFit]:
     """Return the best fits of the most probable sets of one, two and three effects.
 
-    Each set of effects is represented by its best fit over places. `SEARCH.weighed_sets` has the
-    number of sets of each length.
+    Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has
+    the number of sets of each length.
     """
     best: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
@@ -383,7 +385,7 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
         ):
             best[identifiers] = fit
     chosen: list[CandidateFit] = []
-    for length, count in enumerate(SEARCH.weighed_sets, start=1):
+    for length, count in enumerate(SEARCH.most_weighed_sets, start=1):
         fits_of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
         chosen += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
     return chosen
@@ -405,8 +407,10 @@ def _fit_under_wide_noise(
     """
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
     fits_with_scores.sort(key=lambda entry: entry[1], reverse=True)
-    least = fits_with_scores[0][1] - SEARCH.weighed_within if fits_with_scores else 0.0
-    promising = [fit for fit, score in fits_with_scores[: SEARCH.weighed_fits] if score > least]
+    least = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
+    promising = [
+        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least
+    ]
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in report_each(

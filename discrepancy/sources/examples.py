@@ -20,7 +20,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.writing import write_campaign
-from discrepancy.checks.model_check import prior_mean
+from discrepancy.checks.model_check import prior_conditions
 from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
@@ -112,7 +112,7 @@ def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
     return ExamplePlan((*channels, tip), flight_channels=names_of_gauges)
 
 
-def plan_of(model: Model) -> ExamplePlan:
+def usual_plan(model: Model) -> ExamplePlan:
     """Return the usual plan for a model: gauges and tip of a wing, else outputs at rest.
 
     Raises
@@ -127,10 +127,10 @@ def plan_of(model: Model) -> ExamplePlan:
             f"{model.name} has no force, and an example is made by forces: write a campaign of it."
         )
     outputs = tuple(name for name, quantity in model.quantities.items() if quantity.order == 0)
-    return plan_for(model, outputs, model.load_places[0], model.largest_force)
+    return plan_from_scales(model, outputs, model.load_places[0], model.largest_force)
 
 
-def plan_for(
+def plan_from_scales(
     model: Model,
     outputs: tuple[str, ...],
     load_place: str | tuple[float, float],
@@ -179,8 +179,8 @@ def plan_for(
         load_place=load_place,
     )
     # noise from the readings under the largest force; a channel that shows nothing gets the largest
-    trial = _static_trial("", plan, np.array([force]), start=0.0)
-    conditions = prior_mean(campaign, model, trial)
+    trial = _planned_static_trial("", plan, np.array([force]), start=0.0)
+    conditions = prior_conditions(campaign, model, trial)
     readings = np.abs(observe(model, campaign, trial, ModelPatch(), conditions).values[0])
     noises = 1e-3 * np.where(readings > 0.0, readings, readings.max() or 1.0)
     noisy_channels = []
@@ -261,7 +261,7 @@ def example_campaign(
     trials = []
     for trial_kind in kinds:
         for trial in _planned_trials(trial_kind, plan):
-            trials.append(_measured(model, campaign, trial, patch, gains, generator))
+            trials.append(_simulate_readings(model, campaign, trial, patch, gains, generator))
     return replace(campaign, channels=recorded_channels, trials=tuple(trials))
 
 
@@ -310,15 +310,17 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     if kind is TrialKind.STATIC:
         levels = plan.force * np.arange(6, dtype=np.float64) / 5.0
         return [
-            _static_trial("loading", plan, levels, start=0.0, run="A"),
-            _static_trial("unloading", plan, levels[::-1], start=600.0, run="A"),
-            _static_trial("loading again", plan, levels, start=3600.0, run="B", held_out=True),
+            _planned_static_trial("loading", plan, levels, start=0.0, run="A"),
+            _planned_static_trial("unloading", plan, levels[::-1], start=600.0, run="A"),
+            _planned_static_trial(
+                "loading again", plan, levels, start=3600.0, run="B", held_out=True
+            ),
         ]
     if kind is TrialKind.FLIGHT:
         factors = np.array(plan.load_factors)
         return [
-            _flight("turns", plan, factors, start=10000.0),
-            _flight("turns again", plan, factors[1:], start=11000.0, held_out=True),
+            _planned_flight("turns", plan, factors, start=10000.0),
+            _planned_flight("turns again", plan, factors[1:], start=11000.0, held_out=True),
         ]
     samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
     time = plan.interval * samples
@@ -340,7 +342,7 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     return releases
 
 
-def _static_trial(
+def _planned_static_trial(
     name: str, plan: ExamplePlan, forces: FloatArray, start: float, **fields: Any
 ) -> Trial:
     """Return a static trial without readings, with a row for each force [N]."""
@@ -356,7 +358,7 @@ def _static_trial(
     )
 
 
-def _flight(
+def _planned_flight(
     name: str, plan: ExamplePlan, load_factors: FloatArray, start: float, **fields: Any
 ) -> Trial:
     """Return a flight without readings, with a row for each load factor [1]."""
@@ -373,7 +375,7 @@ def _flight(
     )
 
 
-def _measured(
+def _simulate_readings(
     model: Model,
     campaign: Campaign,
     trial: Trial,
@@ -396,7 +398,7 @@ def _measured(
     generator : Generator
         Source of the errors of release and zeros, and of noise.
     """
-    conditions = prior_mean(campaign, model, trial)
+    conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:
         initial_modes = conditions.initial.copy()
         initial_modes[0, 0] = trial.release.deviation * generator.normal()

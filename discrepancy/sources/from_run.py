@@ -3,6 +3,7 @@
 `docs/run_folder.md` describes the folder; only its files are read.
 """
 
+from collections.abc import Sequence
 from itertools import product
 from math import inf
 from pathlib import Path
@@ -89,11 +90,11 @@ def run_campaign(
     folder = Path(folder)
     restore_folder(folder)
     try:
-        scenario = _config(folder)["scenario"]
+        scenario = _read_config(folder)["scenario"]
         _check_scenario(folder, scenario)
-        run = _run(folder)
+        run = _read_run(folder)
         steps = _steps_with_last_patch(run, first_step, last_step)
-        return _campaign(folder, run, scenario, steps, held_out_share)
+        return _build_campaign(folder, run, scenario, steps, held_out_share)
     except DiscrepancyError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
@@ -132,7 +133,7 @@ def _steps_with_last_patch(
     return slice(max(firsts, default=None), last_step)
 
 
-def _campaign(
+def _build_campaign(
     folder: Path,
     run: xr.DataTree,
     scenario: dict[str, Any],
@@ -157,23 +158,16 @@ def _campaign(
     observed = run["observed"].to_dataset().sel(step=steps)
     count = observed.sizes["step"]
     if not count:
-        raise CampaignDataError(_no_steps(folder, run, steps))
+        raise CampaignDataError(_no_steps_message(folder, run, steps))
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
         raise CampaignDataError(
             f"No strain reached the twin in {folder}: there is nothing to compare."
         )
-    noise, source_of_noise = _noise(scenario)
-    channels = {}
-    for number in observed["sensor"].values.tolist():
-        channels[f"g{number}"] = records.Channel(
-            name=f"g{number}",
-            quantity=records.Quantity.STRAIN,
-            output=f"strain[{number}]",
-            noise=records.NoiseRecord(noise, inf),
-        )
-    temperature = _temperature(run, steps)
+    noise, source_of_noise = _strain_noise(scenario)
+    channels = _strain_channels(observed["sensor"].values.tolist(), noise)
+    temperature = _temperature_rises(run, steps)
     belief = run["smoothed"].to_dataset().sel(step=steps)
     flight = records.Trial.plain(
         "steps",
@@ -192,7 +186,7 @@ def _campaign(
     trials = [flight.rows(~is_held_out)]
     if is_held_out.any():
         trials.append(flight.rows(is_held_out, name="steps held out", held_out=True))
-    remarks = _remarks(used, noise, source_of_noise)
+    remarks = _flight_remarks(used, noise, source_of_noise)
     return records.Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
@@ -204,7 +198,20 @@ def _campaign(
     )
 
 
-def _remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
+def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, records.Channel]:
+    """Return a channel for each strain gauge, by its name, with a stated noise deviation [1]."""
+    channels = {}
+    for gauge_number in gauge_numbers:
+        channels[f"g{gauge_number}"] = records.Channel(
+            name=f"g{gauge_number}",
+            quantity=records.Quantity.STRAIN,
+            output=f"strain[{gauge_number}]",
+            noise=records.NoiseRecord(noise, inf),
+        )
+    return channels
+
+
+def _flight_remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
     """Return the remarks on a flight.
 
     Parameters
@@ -228,7 +235,7 @@ def _remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, 
     return tuple(remarks)
 
 
-def _no_steps(folder: Path, run: xr.DataTree, steps: slice) -> str:
+def _no_steps_message(folder: Path, run: xr.DataTree, steps: slice) -> str:
     """Return the message that a run has none of the requested steps."""
     flown_steps = np.asarray(run["observed"]["step"].values).tolist()
     flown = f"{flown_steps[0]} to {flown_steps[-1]}" if flown_steps else "none"
@@ -268,7 +275,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
         If the wing cannot be modelled.
     """
     folder = Path(folder)
-    _config(folder)
+    _read_config(folder)
     wing_file = folder / (CALIBRATION_FILE if _is_calibrated_wing(folder) else DESIGN_FILE)
     if not wing_file.is_file():
         raise CampaignFileError(
@@ -279,7 +286,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
         model = WingModel.of_calibration(wing_file)
     else:
         model = WingModel.of_design(wing_file)
-    run = _run(folder)
+    run = _read_run(folder)
     patch_file = folder / str(run.attrs.get(PATCH_NAME, MODEL_PATCH_FILE))
     if not patch_file.is_file():
         return model, wing_file, None
@@ -289,7 +296,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
         gauge_count = len(run["observed"]["sensor"])
         effects = load_patch(patch_file).for_gauges(gauge_count).effects
     for effect in effects:
-        model = model.patched(effect.patch)
+        model = model.with_patch(effect.patch)
     return model, wing_file, patch_file
 
 
@@ -333,7 +340,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
 # ---------------------------------------------------------------- files of the run folder
 
 
-def _config(folder: Path) -> dict[str, Any]:
+def _read_config(folder: Path) -> dict[str, Any]:
     """Return the content of `config.json`, which has a scenario."""
     with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is no run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
@@ -344,7 +351,7 @@ def _config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def _run(folder: Path) -> xr.DataTree:
+def _read_run(folder: Path) -> xr.DataTree:
     """Return the groups of `run.nc`; refuse a file that lacks something of the run of a wing."""
     path = folder / RUN_FILE
     try:
@@ -376,7 +383,7 @@ def _end_times(folder: Path, steps: records.FloatArray) -> records.FloatArray:
     return np.asarray(start + interval * (steps + 1.0))
 
 
-def _temperature(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
+def _temperature_rises(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
     """Return the temperatures of steps (N,) minus the reference temperature [K].
 
     None if they were not recorded.
@@ -388,7 +395,7 @@ def _temperature(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
     return None
 
 
-def _noise(scenario: dict[str, Any]) -> tuple[float, str]:
+def _strain_noise(scenario: dict[str, Any]) -> tuple[float, str]:
     """Return the standard deviation of a strain reading [1], and its source as a phrase."""
     truth = scenario.get("truth") or {}
     deviation = (truth.get("noise") or {}).get("standard_deviation")

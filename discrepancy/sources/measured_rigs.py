@@ -19,20 +19,20 @@ from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text
 
-FALLING = 3.0
+LARGEST_FALLING_READING = 3.0
 """Absolute reading of the phone's axis z below which it falls [m/s^2]."""
-CUT = 0.04
+END_CUT = 0.04
 """Time that is left out at both ends of a fall, for the hands and the ground [s]."""
 HELD_OUT_FALLS = ("fall_14", "fall_5")
 """Falls that are kept for proof."""
 LARGEST_LEVEL = 10.0
 """End of the range of the tank's level sensor, where readings are left out [V]."""
-SMOOTHED = 7
+SMOOTHED_SAMPLES = 7
 """Samples of the local cubic that smooths the pendulum's angle.
 
 Its encoder has steps of 0.0029 rad.
 """
-STEP = 0.02
+AVERAGING_TIME = 0.02
 """Time over which a sample of the pendulum is averaged [s]: one of its slower record, six of the
 faster one."""
 SHIPPED = Path(__file__).with_name("rigs")
@@ -71,12 +71,12 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: Any) -> Pa
     """
     if rig not in RIGS:
         raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join(RIGS)}.")
-    made = RIGS[rig](Path(data), **options)
-    keys = dict(made.campaign_keys)
+    files = RIGS[rig](Path(data), **options)
+    keys = dict(files.campaign_keys)
     texts = {}
     for file in (SHIPPED / rig).glob("*.toml"):
         texts[file.name] = file.read_text(encoding="utf-8")
-    texts |= made.tables
+    texts |= files.tables
     # remarks are a key of the top level, which must come before the first table
     remarks = toml_text({"remarks": keys.pop("remarks", [])})
     texts[CAMPAIGN_FILE] = f"{remarks}{texts.pop(CAMPAIGN_FILE)}\n{toml_text(keys)}"
@@ -85,7 +85,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: Any) -> Pa
     return folder
 
 
-def _numbers(
+def _read_numbers(
     file: Path, columns: Sequence[str], separator: str | None = ",", skipped: int = 1
 ) -> dict[str, FloatArray]:
     """Return the first columns of a published table, by name.
@@ -124,14 +124,14 @@ def _numbers(
     return numbers
 
 
-def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
-    """Return the longest free fall in a record of a phone, without `CUT` seconds at its ends.
+def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
+    """Return the longest free fall in a record of a phone, without `END_CUT` seconds at its ends.
 
     Returns
     -------
     time : (N,) ndarray
         Times since the release [s].
-    z : (N,) ndarray
+    acceleration : (N,) ndarray
         Readings of the acceleration along z [m/s^2].
 
     Raises
@@ -139,27 +139,30 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     CampaignFileError
         If the file is not as it was published, or holds no fall.
     """
-    columns = _numbers(file, ("time", "x", "y", "z"))
-    is_falling = np.abs(columns["z"]) < FALLING
+    columns = _read_numbers(file, ("time", "x", "y", "z"))
+    is_falling = np.abs(columns["z"]) < LARGEST_FALLING_READING
     edges = np.flatnonzero(np.diff(np.r_[False, is_falling, False].astype(int)))
     begins, ends = edges[::2], edges[1::2]
     if not len(begins):
         raise CampaignFileError(
-            f"{file} holds no fall: its column z never stays below {FALLING:g} m/s2."
+            f"{file} holds no fall: its column z never stays below {LARGEST_FALLING_READING:g} "
+            "m/s2."
         )
     longest = int(np.argmax(ends - begins))
     in_fall = slice(begins[longest], ends[longest])
-    time, z = columns["time"][in_fall], columns["z"][in_fall]
-    is_inside = (time >= time[0] + CUT) & (time <= time[-1] - CUT)
-    return np.round(time[is_inside] - time[0], 9), z[is_inside]
+    time, acceleration = columns["time"][in_fall], columns["z"][in_fall]
+    is_inside = (time >= time[0] + END_CUT) & (time <= time[-1] - END_CUT)
+    return np.round(time[is_inside] - time[0], 9), acceleration[is_inside]
 
 
-def _phone(data: Path) -> RigFiles:
+def _phone_files(data: Path) -> RigFiles:
     """Return the files of a campaign of falls of a phone.
 
     Its sensor shows acceleration minus gravity, thus only its bias in a free fall.
     """
-    at_rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0)
+    at_rest = _read_numbers(
+        data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0
+    )
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
     if not files:
         raise CampaignFileError(
@@ -168,8 +171,8 @@ def _phone(data: Path) -> RigFiles:
     tables = {}
     trials = []
     for file in files:
-        time, z = fall_of(file)
-        tables[file.name] = table_text({"time": time, "z": z})
+        time, acceleration = longest_fall(file)
+        tables[file.name] = table_text({"time": time, "z": acceleration})
         trials.append(
             {
                 "name": file.stem,
@@ -183,9 +186,9 @@ def _phone(data: Path) -> RigFiles:
     return RigFiles(tables, {"trial": trials})
 
 
-def _tanks(data: Path) -> RigFiles:
+def _tank_files(data: Path) -> RigFiles:
     """Return the records of two tanks for estimation and for validation."""
-    columns = _numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
+    columns = _read_numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
     time: FloatArray = 4.0 * np.arange(len(columns["uEst"]), dtype=np.float64)
     tables = {}
     for name, suffix in (("estimation", "Est"), ("validation", "Val")):
@@ -197,7 +200,7 @@ def _tanks(data: Path) -> RigFiles:
     return RigFiles(tables, {})
 
 
-def _pendulum(data: Path) -> RigFiles:
+def _pendulum_files(data: Path) -> RigFiles:
     """Return the files of two records of a pendulum, with the angle as input and torque as output.
 
     The rod turns over: a motion that was simulated from the torque would soon diverge from the
@@ -205,19 +208,19 @@ def _pendulum(data: Path) -> RigFiles:
     """
     tables = {}
     for name in ("pd_trajectory", "ilqr"):
-        columns = _numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
+        columns = _read_numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
         published_interval = float(np.median(np.diff(columns["time"])))
-        averaged = max(round(STEP / published_interval), 1)
+        averaged = max(round(AVERAGING_TIME / published_interval), 1)
         samples = np.stack((columns["time"], columns["position"], columns["torque"]), axis=1)
-        time, angle, torque = _means(samples, averaged).T
-        angle = savgol_filter(angle, SMOOTHED, 3)
+        time, angle, torque = _group_means(samples, averaged).T
+        angle = savgol_filter(angle, SMOOTHED_SAMPLES, 3)
         tables[f"{name}.csv"] = table_text(
             {"time": np.round(time, 9), "angle": angle, "torque": torque}
         )
     return RigFiles(tables, {})
 
 
-def _means(samples: FloatArray, averaged: int) -> FloatArray:
+def _group_means(samples: FloatArray, averaged: int) -> FloatArray:
     """Return the means of successive groups of samples.
 
     Parameters
@@ -239,8 +242,8 @@ def _means(samples: FloatArray, averaged: int) -> FloatArray:
 
 RIGS: dict[str, Callable[..., RigFiles]] = {
     "real_wing": real_wing,
-    "falling_phone": _phone,
-    "two_tanks": _tanks,
-    "pendulum": _pendulum,
+    "falling_phone": _phone_files,
+    "two_tanks": _tank_files,
+    "pendulum": _pendulum_files,
 }
 """Functions that make the files of a campaign from a published folder, by the name of the rig."""

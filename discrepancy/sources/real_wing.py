@@ -42,20 +42,20 @@ READING_ERROR = 33e-6 / 3.0**0.5
 The plots show the same motion on the same grid, so that the error is common to the trials, and
 averaging does not reduce it.
 """
-TREND = 67
+TREND_COLUMNS = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
-BEGIN = 0.8
-"""Begin of the window after the release [s].
+WINDOW_BEGIN = 0.8
+"""Start of the window after the release [s].
 
 Before it higher modes ring, which the model does not have.
 """
-COLUMNS = 4
+AVERAGED_COLUMNS = 4
 """Columns of the plot that are averaged into one sample.
 
 Four columns (32 ms) have a zero of their frequency response at 30.8 Hz, where the second bending
 mode rings."""
 RELEASE = {"displacement": 0.05, "deviation": 1.0, "at_rest": False, "mode_count": 2}
-"""Release of the ring-downs: nominal displacement of the tip at the begin of the window [m].
+"""Release of the ring-downs: nominal displacement of the tip at the start of the window [m].
 
 As the scale of the signal is unknown, any displacement would do. The state of two modes is free."""
 AT_TIP = {"name": TIP, "quantity": "displacement", "unit": "m", "output": "load_point_displacement"}
@@ -64,7 +64,11 @@ HELD_OUT = (3, 5)
 
 
 def real_wing(
-    data: Path, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
+    data: Path,
+    *,
+    begin: float = WINDOW_BEGIN,
+    columns: int = AVERAGED_COLUMNS,
+    detrended: bool = True,
 ) -> RigFiles:
     """Return the ring-downs of the wing of Kapteyn et al., and its loading runs.
 
@@ -73,7 +77,7 @@ def real_wing(
     data : Path
         The authors' calibration folder, with `step2` and `step3`.
     begin : float
-        Begin of the window after the release [s].
+        Start of the window after the release [s].
     columns : int
         Columns of the plot that are averaged into one sample.
     detrended : bool
@@ -88,19 +92,7 @@ def real_wing(
     CampaignDataError
         If there are fewer than two records, or of several lengths, or too short ones.
     """
-    with CampaignFileError.instead_of(
-        CalibrationError, before="The measurements of the wing cannot be read: "
-    ):
-        records = read_records(data)
-        folders = [data / above / "step2" for above in (".", "datafiles", "src/datafiles")]
-        measurements = None
-        if any(folder.is_dir() for folder in folders):
-            measurements = read_measurements(data)
-    if len({len(record.time) for record in records}) > 1 or len(records) < 2:
-        raise CampaignDataError(
-            f"{data} must hold two or more ring-down records of one length; it holds "
-            f"{len(records)}."
-        )
+    records, measurements = _read_lab_data(data)
     zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
     windows = [_plot_window(record, zero, begin, columns) for record in records]
     interval = float(windows[0].time[1])
@@ -127,18 +119,49 @@ def real_wing(
         keys["channel"] = loading.campaign_keys["channel"]
         trials += loading.campaign_keys["trial"]
     for number, window in enumerate(windows, start=1):
-        file = f"release_{number}.csv"
-        tables[file] = table_text({"time": window.time, SIGNAL: window.signal})
-        trials.append(
-            {
-                "name": f"release {number}",
-                "kind": "ringdown",
-                "file": file,
-                "held_out": number in HELD_OUT,
-                "release": RELEASE,
-            }
-        )
+        trial = {
+            "name": f"release {number}",
+            "kind": "ringdown",
+            "file": f"release_{number}.csv",
+            "held_out": number in HELD_OUT,
+            "release": RELEASE,
+        }
+        tables[f"release_{number}.csv"] = table_text({"time": window.time, SIGNAL: window.signal})
+        trials.append(trial)
     return RigFiles(tables, {**keys, "trial": trials})
+
+
+class _LabData(NamedTuple):
+    """The ring-downs of the wing, and its loading runs; None if the folder has no loading runs."""
+
+    records: tuple[RingDownRecord, ...]
+    measurements: LoadDisplacementData | None
+
+
+def _read_lab_data(data: Path) -> _LabData:
+    """Read the ring-downs and loading runs of the wing from the authors' calibration folder.
+
+    Raises
+    ------
+    CampaignFileError
+        If the measurements cannot be read.
+    CampaignDataError
+        If there are fewer than two ring-downs, or ring-downs of several lengths.
+    """
+    with CampaignFileError.instead_of(
+        CalibrationError, before="The measurements of the wing cannot be read: "
+    ):
+        records = read_records(data)
+        folders = [data / above / "step2" for above in (".", "datafiles", "src/datafiles")]
+        measurements = None
+        if any(folder.is_dir() for folder in folders):
+            measurements = read_measurements(data)
+    if len({len(record.time) for record in records}) > 1 or len(records) < 2:
+        raise CampaignDataError(
+            f"{data} must hold two or more ring-down records of one length; it holds "
+            f"{len(records)}."
+        )
+    return _LabData(records, measurements)
 
 
 def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
@@ -200,10 +223,10 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
     It is the weighted moving average of the mean record; nan at the ends, where the average is
     incomplete.
     """
-    weights = np.hanning(TREND + 2)[1:-1]
+    weights = np.hanning(TREND_COLUMNS + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
     zero = np.full(len(mean), np.nan)
-    half = TREND // 2
+    half = TREND_COLUMNS // 2
     zero[half : len(mean) - half] = np.convolve(mean, weights / weights.sum(), "valid")
     return zero
 
@@ -211,7 +234,7 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 def _plot_window(
     record: RingDownRecord, zero: FloatArray, begin: float, columns: int
 ) -> PlotWindow:
-    """Return the part of a record from the begin of the window on, averaged over plot columns.
+    """Return the part of a record from the start of the window on, averaged over plot columns.
 
     The slow zero is subtracted, and the times are made even and start at zero.
 
@@ -222,7 +245,7 @@ def _plot_window(
     zero : (N,) ndarray
         Slow zero that is subtracted [V]; nan where it is not known.
     begin : float
-        Begin of the window after the release [s].
+        Start of the window after the release [s].
     columns : int
         Columns that are averaged into one sample.
 

@@ -97,9 +97,9 @@ class Excitation:
     release: ReleasePoint | None = None
 
     @property
-    def edges(self) -> FloatArray:
+    def jump_times(self) -> FloatArray:
         """Times at which a load jumps, begins or ends, (J,) [s]."""
-        return np.concatenate([np.zeros(0), *(load.history.edges for load in self.loads)])
+        return np.concatenate([np.zeros(0), *(load.history.jump_times for load in self.loads)])
 
     @property
     def is_smooth(self) -> bool:
@@ -107,7 +107,7 @@ class Excitation:
         return any(load.history.hold is Hold.SMOOTH for load in self.loads)
 
     @property
-    def levels(self) -> LoadLevels:
+    def load_levels(self) -> LoadLevels:
         """The recorded loads of a trial at rest, in each of its rows."""
         directions = []
         values = []

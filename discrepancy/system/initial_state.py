@@ -38,7 +38,7 @@ def state_at_first_stamp(
         The system that moves.
     excitation : Excitation
         Its loads, prescribed motions and release.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
 
     Raises
@@ -47,7 +47,7 @@ def state_at_first_stamp(
         If the record begins at rest but the system has no equilibrium.
     """
     mode_count = len(system.angular_frequency)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     first_stamp = excitation.time[:1]
     motions = list(excitation.prescribed_motions.values())
     drive_positions = np.array([float(motion.values_at(first_stamp)[0]) for motion in motions])
@@ -68,7 +68,7 @@ def state_at_first_stamp(
         # an exact zero, since dry friction acts at any other speed
         drive_speeds[np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)] = 0.0
     if excitation.begins is Start.SETTLED:
-        load = excitation.loads_at(first_stamp, np.eye(system.size))
+        load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))
         if load.any() or drive_positions.any():
             drive_displacement = system.drive_shapes @ drive_positions
             equilibrium = system.static_path(
@@ -104,7 +104,7 @@ def released_state(
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
 
     Raises
@@ -127,7 +127,7 @@ def released_state(
     initial_by_mode = np.zeros((len(system.angular_frequency), 2))
     initial_by_mode[: len(excitation.initial)] = excitation.initial[: len(initial_by_mode)]
     relative_displacements, relative_velocities = initial_by_mode.T
-    first_load = excitation.loads_at(excitation.time[:1], np.eye(system.size))
+    first_load = excitation.loads_at(excitation.time[:1], np.eye(system.unknown_count))
     if point.release.at_rest:
         return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
     frequency = system.angular_frequency
@@ -162,7 +162,7 @@ def _held_state(
         What else acts [N].
     """
     row = point.row
-    unit_force_displacement = system.flexibility(row)
+    unit_force_displacement = system.apply_flexibility(row)
     compliance = float(row @ unit_force_displacement)
     deviation = displacements * unit_amplitudes
     deviation[0] = 0.0
@@ -178,7 +178,9 @@ def _held_state(
         total_force = holding_force * row + load[0] - memory[:, LAGGED_FORCE] @ law_rows
         if system.is_truncated:
             # the part of the port's position that fades after the release
-            memory[:, FADING_POSITION] = holding_force * (law_rows @ system.residual(row))
+            memory[:, FADING_POSITION] = holding_force * (
+                law_rows @ system.residual_displacements(row)
+            )
     frequency = system.angular_frequency
     q = total_force @ system.shapes / frequency**2 + deviation
     return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding_force * row)

@@ -85,7 +85,7 @@ class Model(ABC):
         return brief(self, name=self.name, parameters=parameters, effects=len(self.patch))
 
     @property
-    def what(self) -> str:
+    def quoted_name(self) -> str:
         """The model as it is called in a sentence."""
         return f"the model {self.name!r}"
 
@@ -94,7 +94,7 @@ class Model(ABC):
         return self.quantities.get(output)
 
     @property
-    def shown_outputs(self) -> tuple[str, ...]:
+    def outputs_with_quantities(self) -> tuple[str, ...]:
         """The outputs as they are listed in a sentence."""
         return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
 
@@ -126,7 +126,7 @@ class Model(ABC):
             Parameters, initial state, clock and health.
         """
 
-    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+    def initial_state_magnitudes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return typical magnitudes (L,) of an unknown initial state; empty if it is known."""
         return np.zeros(0)
 
@@ -146,11 +146,13 @@ class Model(ABC):
         """
         raise NotImplementedError
 
-    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    def _ported_system(
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray
+    ) -> PortedSystem:
         """Return the linear system from missing forces at ports to outputs, which are checked."""
         raise NotImplementedError
 
-    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+    def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return the internal forces of a patch, expressed at the ports of `ported`."""
         return forces
 
@@ -158,7 +160,7 @@ class Model(ABC):
         """Return the units of force and motion at a port; `EITHER` if they are not known."""
         return EITHER
 
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+    def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws that the model itself has at ports."""
         return NO_PATCH
 
@@ -169,7 +171,7 @@ class Model(ABC):
 
     # ------------------------------------------------------------ checks
 
-    def check(self, trial: Trial) -> None:
+    def check_trial(self, trial: Trial) -> None:
         """Refuse a trial that the model cannot follow.
 
         Raises
@@ -180,27 +182,28 @@ class Model(ABC):
         """
         if trial.kind is TrialKind.FLIGHT and TrialKind.FLIGHT not in self.kinds:
             raise ModelError(
-                f"The trial {trial.name!r} is a flight, but {self.what} has no input load_factor: "
-                "give it one."
+                f"The trial {trial.name!r} is a flight, but {self.quoted_name} has no input "
+                "load_factor: give it one."
             )
         if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
             raise ModelError(
-                f"The trial {trial.name!r} is a ring-down, which {self.what} cannot begin, since "
-                'it is free, driven or has states; say kind = "driven" and begins = "unknown".'
+                f"The trial {trial.name!r} is a ring-down, which {self.quoted_name} cannot begin, "
+                'since it is free, driven or has states; say kind = "driven" and begins = '
+                '"unknown".'
             )
         is_driven = trial.kind is TrialKind.DRIVEN
         if TrialKind.DRIVEN not in self.kinds and (is_driven or trial.begins is not Start.SETTLED):
             how = "is driven" if is_driven else f"begins {trial.begins.value}"
             raise ModelError(
-                f"The trial {trial.name!r} {how}, which {self.what} cannot follow: describe the "
-                "rig as a lumped model, or record it forced from rest."
+                f"The trial {trial.name!r} {how}, which {self.quoted_name} cannot follow: describe "
+                "the rig as a lumped model, or record it forced from rest."
             )
         if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
             inputs = ", ".join(map(repr, trial.input_names))
             raise ModelError(
-                f"The trial {trial.name!r} is static under the inputs {inputs}, which {self.what} "
-                "does not have at rest: describe the asset as an FMU model with [[input]], or "
-                'record the trial as "driven".'
+                f"The trial {trial.name!r} is static under the inputs {inputs}, which "
+                f"{self.quoted_name} does not have at rest: describe the asset as an FMU model "
+                'with [[input]], or record the trial as "driven".'
             )
 
     def check_outputs(self, outputs: Outputs) -> None:
@@ -209,13 +212,13 @@ class Model(ABC):
             quantity = self.output_quantity(output)
             if quantity is None:
                 raise ModelError(
-                    f"{capital(self.what)} has no output {output!r}; it has "
-                    f"{', '.join(self.shown_outputs)}."
+                    f"{capital(self.quoted_name)} has no output {output!r}; it has "
+                    f"{', '.join(self.outputs_with_quantities)}."
                 )
-            if not measured.shows(quantity):
+            if not measured.can_measure(quantity):
                 raise ModelError(
-                    f"The output {output!r} of {self.what} is a {quantity.value}, but a channel "
-                    f"measures {measured.value}."
+                    f"The output {output!r} of {self.quoted_name} is a {quantity.value}, but a "
+                    f"channel measures {measured.value}."
                 )
 
     def _check_primitives(self, patch: ModelPatch) -> None:
@@ -226,10 +229,11 @@ class Model(ABC):
             lacks_port = isinstance(primitive, INTERNAL_FORCES) and not self.ports
             reason = " (it has no port)" if lacks_port else ""
             raise ModelError(
-                f"{capital(self.what)} cannot carry the primitive {primitive.kind!r}{reason}."
+                f"{capital(self.quoted_name)} cannot carry the primitive "
+                f"{primitive.kind!r}{reason}."
             )
 
-    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of the model's regions in each row.
 
         Parameters
@@ -251,20 +255,20 @@ class Model(ABC):
             elif np.any(region_losses):
                 raise ModelError(
                     f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
-                    f"{self.what} has {comma_list(self.regions)}."
+                    f"{self.quoted_name} has {comma_list(self.regions)}."
                 )
         return [tuple(row) for row in losses.tolist()]
 
     # ------------------------------------------------------------ parameters
 
     @property
-    def declared(self) -> tuple[ParameterPrior, ...]:
+    def unpatched_parameters(self) -> tuple[ParameterPrior, ...]:
         """Calibrated parameters as they are without what is added."""
         if self._unpatched_parameters is None:
             return self.parameters
         return self._unpatched_parameters
 
-    def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
+    def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and standard deviation of each parameter.
 
         They are those of the campaign; the model's, if the campaign does not state them.
@@ -280,9 +284,9 @@ class Model(ABC):
 
         The campaign's mean is taken if it states one, else the model's.
         """
-        means = [parameter.mean for parameter in self.declared]
+        means = [parameter.mean for parameter in self.unpatched_parameters]
         if campaign is not None:
-            for index, parameter in enumerate(self.declared):
+            for index, parameter in enumerate(self.unpatched_parameters):
                 if parameter.name in campaign.parameters:
                     means[index] = campaign.parameters[parameter.name][0]
         return np.array(means)
@@ -290,7 +294,7 @@ class Model(ABC):
     # ------------------------------------------------------------ response
 
     @property
-    def sensors(self) -> ModelPatch:
+    def built_in_sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
         They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
@@ -338,17 +342,17 @@ class Model(ABC):
         count = len(self.parameters)
         if conditions.parameters.shape != (count,):
             raise ModelError(
-                f"{capital(self.what)} has {counted(count, 'parameter')}, but "
+                f"{capital(self.quoted_name)} has {counted(count, 'parameter')}, but "
                 f"{conditions.parameters.size} came."
             )
         whole_patch = (self.patch + patch).in_trial(trial.name)
-        self.check(trial)
+        self.check_trial(trial)
         self.check_outputs(outputs)
         self._check_primitives(whole_patch)
         with ModelError.instead_of(FiniteElementError):
             return self._respond(trial, outputs, whole_patch, conditions)
 
-    def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    def ported_system(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the linear system from missing forces at ports to outputs; see `PortedSystem`.
 
         Parameters
@@ -366,21 +370,21 @@ class Model(ABC):
             If the model has sensors built in, whose effect on a missing force is not modelled.
         """
         self.check_outputs(outputs)
-        if len(self.sensors):
+        if len(self.built_in_sensors):
             raise ModelError(
                 f"{self.name} has sensors built in, which hide a missing force; leave them out."
             )
-        return self._ported(trial, outputs, parameters)
+        return self._ported_system(trial, outputs, parameters)
 
     # ------------------------------------------------------------ the model with changes
 
-    def remembering(self) -> Self:
+    def with_response_cache(self) -> Self:
         """Return the model as one that keeps responses: many sensors are tried on one motion."""
         if self._responses is not None:
             return self
         return self._copy_with(_responses=ResultCache(MOST_RESPONSES))
 
-    def patched(
+    def with_patch(
         self,
         patch: ModelPatch,
         calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({}),
@@ -402,13 +406,13 @@ class Model(ABC):
         return self._copy_with(
             patch=self.patch + patch,
             parameters=tuple(parameters),
-            _unpatched_parameters=self.declared,
+            _unpatched_parameters=self.unpatched_parameters,
             _responses=None,
         )
 
-    def apart(self) -> tuple[Self, ModelPatch]:
+    def without_laws(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these laws at the prior means."""
-        laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
+        laws = self.built_in_laws(self.prior_mean()) + self.patch.of(PortForce)
         without_laws = self._copy_with(
             patch=self.patch.without(PortForce), linear=True, _responses=None
         )

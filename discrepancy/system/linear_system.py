@@ -4,8 +4,8 @@ Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u'
 state is the speed of a coordinate that has no stiffness, x = s', so that both are one equation in z
 = (u, s). A prescribed motion (a drive) takes its direction out of u; what remains moves in its
 modes. For the laws at ports the drive is a coordinate of its own, so heavy that the laws do not
-move it (`HEAVY`), and it is corrected at every step. The wing, a structure on springs and a lumped
-rig are such systems.
+move it (`HEAVY_RATIO`), and it is corrected at every step. The wing, a structure on springs and a
+lumped rig are such systems.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import static_solution
 from fe.runtime.port_laws import NO_LAWS, PortLaws
 
-HEAVY = 1e12
+HEAVY_RATIO = 1e12
 """Mass of a prescribed coordinate, relative to the largest entry of the mass matrix."""
 LEAST_PIVOT = 1e-9
 """Relative singular value below which nothing restores a motion (`rcond` of the least squares)."""
@@ -88,10 +88,10 @@ class StaticPath(NamedTuple):
     memory: FloatArray | None
 
 
-def _differs(matrix: FloatArray, other: FloatArray) -> bool:
+def _differ_beyond_rounding(matrix: FloatArray, other_matrix: FloatArray) -> bool:
     """Return whether two matrices differ by more than rounding."""
     largest = np.abs(matrix).max(initial=1e-300)
-    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * largest)
+    return bool(np.abs(matrix - other_matrix).max(initial=0.0) > ROUNDING * largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +138,14 @@ class LinearSystem:
     solved: SolvedStructure | None = None
 
     @property
-    def size(self) -> int:
+    def unknown_count(self) -> int:
         """Number N of unknowns."""
         return len(self.mass)
 
     @property
     def displacement_count(self) -> int:
         """Number n of displacements."""
-        return self.size - self.state_count
+        return self.unknown_count - self.state_count
 
     @property
     def law_directions(self) -> Mapping[str, FloatArray]:
@@ -157,7 +157,7 @@ class LinearSystem:
     @cached_property
     def drive_shapes(self) -> FloatArray:
         """Displacements (N, P) under a unit motion of each drive."""
-        shapes = np.zeros((self.size, len(self.drives)))
+        shapes = np.zeros((self.unknown_count, len(self.drives)))
         if len(self.drives):
             n = self.displacement_count
             shapes[:n] = np.linalg.pinv(self.drives[:, :n])
@@ -172,7 +172,7 @@ class LinearSystem:
         squares, displacement_shapes = self._displacement_modes()
         n = self.displacement_count
         count = len(squares)
-        shapes = np.zeros((self.size, count + self.state_count))
+        shapes = np.zeros((self.unknown_count, count + self.state_count))
         shapes[:n, :count] = displacement_shapes
         if self.state_count:
             capacity, axes = np.linalg.eigh(self.mass[n:, n:])
@@ -224,34 +224,34 @@ class LinearSystem:
         return self.modes.shapes
 
     @property
-    def displacement_modes(self) -> int:
+    def displacement_mode_count(self) -> int:
         """Number of the modes that are of displacements; the others are states."""
         return self.modes.displacement_count
 
     @property
     def is_truncated(self) -> bool:
         """Whether some modes have no inertia."""
-        return self.mode_count is not None and self.mode_count < self.size
+        return self.mode_count is not None and self.mode_count < self.unknown_count
 
     @cached_property
     def root_drive_mass(self) -> float:
         """Square root of the mass of the drives, which normalises their shapes."""
-        return float(np.sqrt(HEAVY * np.max(np.abs(self.mass))))
+        return float(np.sqrt(HEAVY_RATIO * np.max(np.abs(self.mass))))
 
     @cached_property
-    def all_shapes(self) -> FloatArray:
+    def shapes_with_drives(self) -> FloatArray:
         """Mass-normalised shapes (N, M + P) of the modes and of the drives."""
         if not len(self.drives):
             return self.shapes
         return np.hstack((self.shapes, self.drive_shapes / self.root_drive_mass))
 
     @cached_property
-    def modal(self) -> ModalSystem:
+    def modal_system(self) -> ModalSystem:
         """Modes and drives as a modal system with ports; coupling that is rounding is left out."""
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
         frequency = np.pad(self.angular_frequency, (0, drive_count))
-        shapes = self.all_shapes
+        shapes = self.shapes_with_drives
         damping = shapes.T @ self.damping @ shapes
         stiffness = shapes.T @ self.stiffness @ shapes
         # the motion of a drive is prescribed: no damping or stiffness acts on it
@@ -259,9 +259,9 @@ class LinearSystem:
         stiffness[mode_count:] = 0.0
         # an exact diagonal if only rounding errors couple the modes
         diagonal = np.diag(np.diag(damping))
-        if not drive_count and not _differs(damping, diagonal):
+        if not drive_count and not _differ_beyond_rounding(damping, diagonal):
             damping = diagonal
-        is_coupled = drive_count > 0 or _differs(stiffness, np.diag(frequency**2))
+        is_coupled = drive_count > 0 or _differ_beyond_rounding(stiffness, np.diag(frequency**2))
         return ModalSystem(
             frequency,
             damping,
@@ -277,8 +277,8 @@ class LinearSystem:
         if not self.is_truncated or not self.ports:
             return None
         rows = np.array(list(self.ports.values()))
-        residual_compliance = np.einsum("pn,np->p", rows, self.residual(rows.T))
-        compliance = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        residual_compliance = np.einsum("pn,np->p", rows, self.residual_displacements(rows.T))
+        compliance = np.einsum("pn,np->p", rows, self.apply_flexibility(rows.T))
         is_flexible = [name not in self.on_modes for name in self.ports]
         is_above_rounding = residual_compliance > 1e-9 * compliance
         return np.where(is_above_rounding & is_flexible, residual_compliance, 0.0)
@@ -290,7 +290,7 @@ class LinearSystem:
         mass times these shapes and the accelerations goes to the right-hand side. The force on a
         drive is the one that gives it the prescribed acceleration.
         """
-        forces = excitation.loads_at(time, self.all_shapes)
+        forces = excitation.loads_at(time, self.shapes_with_drives)
         if excitation.prescribed_motions:
             motions = excitation.prescribed_motions.values()
             accelerations = np.transpose([motion.values_at(time, 2) for motion in motions])
@@ -301,8 +301,8 @@ class LinearSystem:
         return forces
 
     def rows_of_laws(self, laws: PortLaws, time: float | None = None) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
-        return laws.port_rows(self.ports, self.size, time)
+        """Return the rows (J, N) of the laws' ports; see `PortLaws.port_rows`."""
+        return laws.port_rows(self.ports, self.unknown_count, time)
 
     # ------------------------------------------------------------ equilibrium
 
@@ -316,7 +316,7 @@ class LinearSystem:
                 f"The structure has no stiffness left in some direction ({cause})."
             ) from cause
 
-    def flexibility(self, loads: FloatArray) -> FloatArray:
+    def apply_flexibility(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (N,) or (N, k) on a structure that springs hold.
 
         Raises
@@ -329,16 +329,16 @@ class LinearSystem:
         inverse = self._inverse_cholesky
         return np.asarray(inverse.T @ (inverse @ loads))
 
-    def residual(self, loads: FloatArray) -> FloatArray:
+    def residual_displacements(self, loads: FloatArray) -> FloatArray:
         """Return the displacements of the modes without inertia under loads (N,) or (N, k).
 
         They are the residual flexibility times the loads: K^-1 loads minus the static displacements
         of the M modes with inertia, shapes / omega^2 (shapes^T loads).
         """
         in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
-        return self.flexibility(loads) - in_modes
+        return self.apply_flexibility(loads) - in_modes
 
-    def rest_under(self, loads: FloatArray) -> FloatArray:
+    def equilibrium_under(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) in equilibrium under constant loads (L, N).
 
         Raises
@@ -347,16 +347,16 @@ class LinearSystem:
             If nothing holds the system against a load.
         """
         if self.mode_count is not None:
-            return self.flexibility(loads.T).T
+            return self.apply_flexibility(loads.T).T
         # In equilibrium displacements q and states v are constant, so K q + D v = modal loads.
         # Least squares: rigid motions may be unrestored, if no load acts along them.
         mode_count = len(self.angular_frequency)
-        displacement_mode_count = self.displacement_modes
+        displacement_mode_count = self.displacement_mode_count
         modal_loads = loads @ self.shapes
         restoring = np.hstack(
             (
-                self.modal.full_stiffness[:mode_count, :displacement_mode_count],
-                self.modal.damping[:mode_count, displacement_mode_count:mode_count],
+                self.modal_system.full_stiffness[:mode_count, :displacement_mode_count],
+                self.modal_system.damping[:mode_count, displacement_mode_count:mode_count],
             )
         )
         amplitudes = np.linalg.lstsq(restoring, modal_loads.T, rcond=LEAST_PIVOT)[0]
@@ -423,11 +423,11 @@ class LinearSystem:
         if levels is None:
             levels = np.eye(len(directions))
         # displacements under unit loads, and under unit forces of the laws
-        displacements = self.rest_under(directions) + offset
-        flexibility = self.rest_under(law_rows)
+        displacements = self.equilibrium_under(directions) + offset
+        flexibility = self.equilibrium_under(law_rows)
         if fixed_row is not None:
             # subtract the displacements under the reaction that holds the point
-            point_force_displacement = self.rest_under(fixed_row[None])
+            point_force_displacement = self.equilibrium_under(fixed_row[None])
             flexibility = flexibility - np.outer(
                 flexibility @ fixed_row, point_force_displacement
             ) / float(point_force_displacement[0] @ fixed_row)

@@ -33,7 +33,7 @@ class LoadChange(NamedTuple):
     along_chord: float = 0.0
 
     @classmethod
-    def of_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
+    def from_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
         """Return the change of loads by all gains and places of a patch, applied in their order."""
         change = cls()
         for primitive in patch:
@@ -63,7 +63,7 @@ class LoadChange(NamedTuple):
 
 
 def choose_load_place(
-    places: Sequence[str], place: Place, model_name: str, where: str = "a trial"
+    places: Sequence[str], place: Place, model_name: str, trial_text: str = "a trial"
 ) -> str:
     """Return the load place of a trial; if the trial names none, the only one of the model.
 
@@ -73,7 +73,7 @@ def choose_load_place(
         The load places of the model.
     place : str or (float, float)
         The load place that the trial names.
-    model_name, where : str
+    model_name, trial_text : str
         Model and trial as they are called in a sentence.
 
     Raises
@@ -87,7 +87,7 @@ def choose_load_place(
         return place
     problem = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
     forces = f"forces at {', '.join(places)}: name one of these" if places else "no force"
-    raise ModelError(f"In {where} {problem}, and {model_name} takes {forces}.")
+    raise ModelError(f"In {trial_text} {problem}, and {model_name} takes {forces}.")
 
 
 def require_release(trial: Trial) -> Release:

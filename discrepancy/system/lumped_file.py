@@ -147,20 +147,20 @@ class LumpedDescription(ModelDescription):
         integrals = [controller for controller in self.controller if controller.integral != 0.0]
         return self.displacement_count + self.state_count + len(integrals)
 
-    def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
+    def pad_to_all_unknowns(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a vector of the file, extended by zeros for the integrals of controllers."""
         padded_row = np.zeros(self.unknown_count)
         padded_row[: len(row)] = row
         return padded_row
 
     @cached_property
-    def is_plain(self) -> bool:
+    def is_structure_on_springs(self) -> bool:
         """Whether it is a plain structure on springs, without states, drives or controllers."""
         if not self.input or self.free:
             return False
         if self.state_count or self.load or self.damping_part or self.controller:
             return False
-        prescribes_motion = any(section.quantity.moving for section in self.input)
+        prescribes_motion = any(section.quantity.motion_chain for section in self.input)
         acts_through_matrix = any(section.through for section in self.input)
         acts_elsewhere = any(port.acts for port in self.port)
         shows_more = any(output.reaction or output.constant for output in self.output)
@@ -218,14 +218,14 @@ class LumpedDescription(ModelDescription):
 
     def faults(self) -> Iterator[Fault]:
         """Yield the contradictions of the file."""
-        yield from self._missing_matrices()
-        yield from self._wrong_names()
-        yield from self._vanishing_matrices()
+        yield from self._missing_matrix_faults()
+        yield from self._name_faults()
+        yield from self._vanishing_matrix_faults()
         for kind in BLOCKS:
-            yield from self._wrong_matrices(kind)
+            yield from self._matrix_faults(kind)
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for section in getattr(self, kind):
-                yield from self._wrong_vectors(kind, section)
+                yield from self._vector_faults(kind, section)
         n = self.displacement_count
         if self.root is not None:
             is_wrong = len(self.root.lever) != n or not any(self.root.lever)
@@ -238,7 +238,7 @@ class LumpedDescription(ModelDescription):
                 f"{counted(count, 'value')} came",
             )
 
-    def _missing_matrices(self) -> Iterator[Fault]:
+    def _missing_matrix_faults(self) -> Iterator[Fault]:
         """Yield the faults of required matrices that are missing."""
         displacement_count = self.displacement_count
         state_count = self.state_count
@@ -255,7 +255,7 @@ class LumpedDescription(ModelDescription):
         yield lacks_conductance, "conductance is missing: give it, or [[conductance_part]]"
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
-    def _wrong_matrices(self, kind: str) -> Iterator[Fault]:
+    def _matrix_faults(self, kind: str) -> Iterator[Fault]:
         """Yield the matrices of a kind with a wrong size, symmetry or definiteness."""
         block = BLOCKS[kind]
         rows = self.state_count if block.rows_of_states else self.displacement_count
@@ -293,7 +293,7 @@ class LumpedDescription(ModelDescription):
             return "damping.matrix"
         return kind if kind in KINDS else f"coupling.{kind}"
 
-    def _vanishing_matrices(self) -> Iterator[Fault]:
+    def _vanishing_matrix_faults(self) -> Iterator[Fault]:
         """Yield parameters whose `low` of zero leaves no mass, capacity or stiffness."""
         needed = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
         for parameter in self.parameter:
@@ -315,7 +315,7 @@ class LumpedDescription(ModelDescription):
                     "some unknown: give a low above 0",
                 )
 
-    def _wrong_vectors(
+    def _vector_faults(
         self, kind: str, section: NamedVector | OutputSection | ControllerSection
     ) -> Iterator[Fault]:
         """Yield vectors of a wrong length, zero ones, and ones of displacements and states."""
@@ -339,7 +339,7 @@ class LumpedDescription(ModelDescription):
             f"the {kind} {section.name!r} sees displacements or states, not both",
         )
         if isinstance(section, PortSection) and section.acts is not None:
-            yield self._wrong_flow(section, row, np.array(section.acts))
+            yield self._flow_fault(section, row, np.array(section.acts))
         if isinstance(section, ControllerSection):
             order = section.quantity.order
             sees_speed = order > 0 or any(row[n:])
@@ -349,7 +349,7 @@ class LumpedDescription(ModelDescription):
                 "derivative of a speed or of a state: leave `derivative` out",
             )
 
-    def _wrong_flow(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
+    def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
         """Return the fault of a port whose `acts` takes nothing from the state that it sees."""
         n = self.displacement_count
         is_of_states = not any(row[:n]) and not any(acts[:n])
@@ -361,29 +361,29 @@ class LumpedDescription(ModelDescription):
             "sees",
         )
 
-    def _wrong_names(self) -> Iterator[Fault]:
+    def _name_faults(self) -> Iterator[Fault]:
         """Yield names that are there twice, and references to names that are not there."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [section.name for section in getattr(self, kind)] for kind in kinds}
         part_names: list[str] = []
         for kind in KINDS:
             part_names += [part.name for part in getattr(self, f"{kind}_part")]
-        references = [item.reference for item in self.controller if item.reference]
+        references = [table.reference for table in self.controller if table.reference]
         unique_names = names | {
             "part": [*KINDS, *part_names],
             "input or reference": [*names["input"], *references],
             "place station": [f"{place.station:g}" for place in self.place],
         }
         for kind, kind_names in unique_names.items():
-            yield from self.repeated(kind, kind_names)
+            yield from self.repeated_name_faults(kind, kind_names)
         # matrices that there are, and what parameters can scale
         kinds_there = [kind for kind in KINDS if self._has_unknowns_of(kind)]
         matrices = [*kinds_there, *part_names]
         scalable = [*matrices, *names["input"], *names["load"], *names["law"], *names["controller"]]
         for controller in names["controller"]:
             scalable += [f"{controller}.{gain}" for gain in GAINS]
-        prescribed = [section.name for section in self.input if section.quantity.moving]
-        for kind, key, verb, known in (
+        prescribed = [section.name for section in self.input if section.quantity.motion_chain]
+        for kind, key, verb, allowed_names in (
             ("input", "through", "acts through", matrices),
             ("load", "through", "acts through", matrices),
             ("law", "port", "acts on the port", names["port"]),
@@ -391,17 +391,17 @@ class LumpedDescription(ModelDescription):
             ("output", "controller", "is what a controller gives,", names["controller"]),
             ("parameter", "terms", "scales", scalable),
         ):
-            yield from self._unknown_references(kind, key, verb, known)
+            yield from self._reference_faults(kind, key, verb, allowed_names)
 
-    def _unknown_references(
-        self, kind: str, key: str, verb: str, known: Sequence[str]
+    def _reference_faults(
+        self, kind: str, key: str, verb: str, known_names: Sequence[str]
     ) -> Iterator[Fault]:
         """Yield what sections of a kind name by a key and what is not known."""
-        listed = ", ".join(known) or "none"
+        listed = ", ".join(known_names) or "none"
         for section in getattr(self, kind):
             for name in as_list(getattr(section, key)):
                 yield (
-                    name is not None and name not in known,
+                    name is not None and name not in known_names,
                     f"{kind} {section.name!r} {verb} {name!r}, but there are {listed}",
                 )
 

@@ -60,8 +60,10 @@ class LumpedModel(DescribedModel, SystemModel):
         self.port_rows = {}
         self.law_directions = {}
         for port in description.port:
-            self.port_rows[port.name] = description.padded(port.vector)
-            self.law_directions[port.name] = description.padded(port.acts or port.vector)
+            self.port_rows[port.name] = description.pad_to_all_unknowns(port.vector)
+            self.law_directions[port.name] = description.pad_to_all_unknowns(
+                port.acts or port.vector
+            )
         self._places = sorted(description.place, key=lambda place: place.station)
         if self._places:
             self.stations = (self._places[0].station, self._places[-1].station)
@@ -101,7 +103,7 @@ class LumpedModel(DescribedModel, SystemModel):
         }
         return carried.get(primitive, primitive in SENSORS)
 
-    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return one row without losses: health has no meaning here."""
         return [()]
 
@@ -109,13 +111,13 @@ class LumpedModel(DescribedModel, SystemModel):
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
-        return bool(np.any(self.system(mean_state).angular_frequency > 0.0))
+        return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+    def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws that the model itself has at ports, each times its factor."""
         if self.linear:
             return NO_PATCH
-        factors = self._factors(parameters.tolist())
+        factors = self._term_factors(parameters.tolist())
         return ModelPatch(
             tuple(law.scaled_force(factors.get(law.name, 1.0)) for law in self.description.law)
         )
@@ -126,41 +128,25 @@ class LumpedModel(DescribedModel, SystemModel):
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
         """Return the load (N,) of 1 N at a place, or of one unit of another input."""
-        load_change = LoadChange.of_patch(change)
-        return self._input_direction(self.rig(state), self._input_at(place), load_change)
+        load_change = LoadChange.from_patch(change)
+        return self._input_direction(self.rig_in_state(state), self._input_at(place), load_change)
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
-        """Return the loads and the prescribed motions in a trial.
-
-        An input may prescribe a motion that the trial does not record. That motion is held at zero
-        if an output measures its reaction force; otherwise it is free.
-        """
+        """Return the loads and the prescribed motions in a trial."""
         trial = case.trial
-        rig = self.rig(case.state)
-        description = self.description
-        zero_motion = RecordedHistory(
-            trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
-        )
-        motions = {
-            item.reaction: zero_motion for item in description.output if item.reaction is not None
-        }
-        # constant loads and references of controllers
-        constant_history = RecordedHistory(trial.time, np.ones(len(trial.time)))
-        constant_loads = [
-            Load(rig.load_direction(item, item.vector), constant_history)
-            for item in description.load
-        ]
+        rig = self.rig_in_state(case.state)
         inputs = self._offset_inputs(case)
-        loads = constant_loads + rig.loads_of_references(trial, inputs)
-        # recorded loads and motions
+        loads = self._constant_loads(rig, trial) + rig.loads_of_references(trial, inputs)
+        motions = self._motions_held_at_zero(trial)
+        # recorded loads and motions, without the references of controllers
         references = {loop.section.reference for loop in rig.loops.values()}
-        load_change = LoadChange.of_patch(case.patch)
+        load_change = LoadChange.from_patch(case.patch)
         for name, offset_input in inputs.items():
             if name in references:
                 continue
             section = self._section_of(trial, offset_input.recorded)
-            if section.quantity.moving:
-                motions[name] = _prescribed_motion(trial, offset_input, rig.factor(name))
+            if section.quantity.motion_chain:
+                motions[name] = _prescribed_motion(trial, offset_input, rig.term_factor(name))
             else:
                 direction = self._input_direction(rig, section, load_change)
                 loads.append(Load(direction, _load_history(trial, offset_input, load_change)))
@@ -170,8 +156,37 @@ class LumpedModel(DescribedModel, SystemModel):
                 loads.append(self._port_load(primitive))
         return LoadsAndMotions(loads, motions)
 
+    def _constant_loads(self, rig: Rig, trial: Trial) -> list[Load]:
+        """Return the loads of the tables `[[load]]`, which act throughout a trial."""
+        history = RecordedHistory(trial.time, np.ones(len(trial.time)))
+        return [
+            Load(rig.load_direction(section, section.vector), history)
+            for section in self.description.load
+        ]
+
+    def _motions_held_at_zero(self, trial: Trial) -> dict[str, RecordedHistory]:
+        """Return motions of zero for all inputs whose reaction force an output measures.
+
+        A motion that the trial records replaces the zero. A motion that it does not record is held
+        at zero, since the reaction of a free motion would be zero and nothing to measure.
+        """
+        zero_motion = RecordedHistory(
+            trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
+        )
+        motions = {}
+        for section in self.description.output:
+            if section.reaction is not None:
+                motions[section.reaction] = zero_motion
+        return motions
+
     def _port_load(self, primitive: PortLoad) -> Load:
-        """Return the load of a force by a formula; raises `ModelError` if there is no such port."""
+        """Return the load of a force by a formula in time.
+
+        Raises
+        ------
+        ModelError
+            If the model does not have the port at which the force acts.
+        """
         if primitive.port not in self.law_directions:
             raise ModelError(
                 f"A force acts at the port {primitive.port!r}, which {self.name!r} does not have; "
@@ -188,10 +203,13 @@ class LumpedModel(DescribedModel, SystemModel):
         if trial.kind is not TrialKind.DRIVEN:
             section = self._input_at(trial.load_place)
             recorded = (RecordedInput(section.name, section.quantity, trial.force, trial.hold),)
+        # the conditions may state no offsets: those that are missing are zero
         missing_offsets = (0.0,) * len(recorded)
         offsets = (*case.conditions.offset, *missing_offsets)
-        pairs = zip(recorded, offsets, strict=False)
-        return {item.name: OffsetInput(item, offset) for item, offset in pairs}
+        offset_inputs = {}
+        for recorded_input, offset in zip(recorded, offsets, strict=False):
+            offset_inputs[recorded_input.name] = OffsetInput(recorded_input, offset)
+        return offset_inputs
 
     def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
         """Return the input of the model that a trial records.
@@ -205,16 +223,16 @@ class LumpedModel(DescribedModel, SystemModel):
         section = self._inputs.get(recorded.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {recorded.name!r}, which {self.what} "
-                f"does not have; it has {comma_list(self._inputs)}."
+                f"The trial {trial.name!r} records the input {recorded.name!r}, which "
+                f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
-        moving = section.quantity.moving
-        if recorded.quantity is not section.quantity and recorded.quantity not in moving:
+        motion_chain = section.quantity.motion_chain
+        if recorded.quantity is not section.quantity and recorded.quantity not in motion_chain:
             raise ModelError(
-                f"The input {recorded.name!r} of {self.what} is {section.quantity.value}, but the "
-                f"trial {trial.name!r} records {recorded.quantity.value}."
+                f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
+                f"but the trial {trial.name!r} records {recorded.quantity.value}."
             )
-        if moving and recorded.hold not in (None, Hold.SMOOTH):
+        if motion_chain and recorded.hold not in (None, Hold.SMOOTH):
             raise ModelError(
                 f"The input {recorded.name!r} of the trial {trial.name!r} is a motion that "
                 f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
@@ -227,9 +245,9 @@ class LumpedModel(DescribedModel, SystemModel):
         candidates = [
             name
             for name, section in self._inputs.items()
-            if name == place or not section.quantity.moving
+            if name == place or not section.quantity.motion_chain
         ]
-        return self._inputs[choose_load_place(candidates, place, self.what)]
+        return self._inputs[choose_load_place(candidates, place, self.quoted_name)]
 
     def _input_direction(self, rig: Rig, section: InputSection, change: LoadChange) -> FloatArray:
         """Return the load (N,) of one unit of an input whose place may have been moved."""
@@ -269,8 +287,8 @@ class LumpedModel(DescribedModel, SystemModel):
         if quantity is not section.quantity:
             derivatives = quantity.derivatives_of(section.quantity)
         description = self.description
-        equation = OutputEquation.of_row(
-            description.padded(vector),
+        equation = OutputEquation.from_row(
+            description.pad_to_all_unknowns(vector),
             displacement_derivative=section.quantity.order + derivatives,
             state_derivative=derivatives,
             state_count=description.unknown_count - description.displacement_count,
@@ -282,7 +300,7 @@ class LumpedModel(DescribedModel, SystemModel):
         self, controller: str, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
         """Return the equation of an output that is the output of a controller."""
-        loop = self.rig(case.state).loops[controller]
+        loop = self.rig_in_state(case.state).loops[controller]
         # gives the factor x of a load x direction (pseudo-inverse of a vector)
         inverse_direction = loop.direction / float(loop.direction @ loop.direction)
         references: list[Load] = []
@@ -307,7 +325,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"The output {section.name!r} of {self.name!r} is the reaction of "
                 f"{section.reaction!r}, whose motion this trial does not prescribe."
             )
-        system = self.system(case.state._replace(drives=tuple(drive_names)))
+        system = self.system_in_state(case.state._replace(drives=tuple(drive_names)))
         drive_shape = system.drive_shapes[:, drive_names.index(section.reaction)]
         rows = [
             drive_shape @ system.stiffness,
@@ -362,7 +380,7 @@ class LumpedModel(DescribedModel, SystemModel):
         sections += self.description.input
         for section in sections:
             vector = section.vector or ()
-            moving = section.quantity.moving
+            moving = section.quantity.motion_chain
             if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
                 unit = TURNS if Quantity.ANGLE in moving else MOVES
                 units.setdefault(vector.index(1.0), set()).add(unit)
@@ -370,7 +388,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     # ------------------------------------------------------------ matrices
 
-    def _factors(self, parameters: Sequence[float]) -> dict[str, float]:
+    def _term_factors(self, parameters: Sequence[float]) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
         factors: dict[str, float] = {}
         for section, value in zip(self.description.parameter, parameters, strict=True):
@@ -379,11 +397,11 @@ class LumpedModel(DescribedModel, SystemModel):
         return factors
 
     @cached_property
-    def rig(self) -> Callable[[SystemState], Rig]:
+    def rig_in_state(self) -> Callable[[SystemState], Rig]:
         """The function that returns the matrices and controllers in a state, with a cache."""
 
         def build(state: SystemState) -> Rig:
-            factors = self._factors(state.parameters)
+            factors = self._term_factors(state.parameters)
             return build_rig(self.description, factors, state, self._places)
 
         return lru_cache(self.cache_size)(build)
@@ -397,7 +415,7 @@ class LumpedModel(DescribedModel, SystemModel):
         quantity goes to the left with a plus.
         """
         description = self.description
-        rig = self.rig(state)
+        rig = self.rig_in_state(state)
         count = description.unknown_count
         # stiffness, damping and mass, by the derivative that they multiply
         matrices = np.zeros((3, count, count))
@@ -415,14 +433,16 @@ class LumpedModel(DescribedModel, SystemModel):
                     ) - np.outer(loop.direction, output_rows[derivative])
         stiffness, damping, mass = matrices
         beta = None if description.damping is None else description.damping.beta
-        drives = [description.padded(self._inputs[name].vector) for name in state.drives]
+        drives = [
+            description.pad_to_all_unknowns(self._inputs[name].vector) for name in state.drives
+        ]
         return LinearSystem(
             mass,
             damping,
             stiffness,
             self.port_rows,
-            mode_count=MOST_MODES if description.is_plain else None,
-            relaxation=rig.factor("damping") * (beta or 0.0),
+            mode_count=MOST_MODES if description.is_structure_on_springs else None,
+            relaxation=rig.term_factor("damping") * (beta or 0.0),
             state_count=count - description.displacement_count,
             drives=np.array(drives),
             actions=self.law_directions,
@@ -432,7 +452,7 @@ class LumpedModel(DescribedModel, SystemModel):
 def _trial_kinds(description: LumpedDescription) -> frozenset[TrialKind]:
     """Return the kinds of trials that a lumped model can follow."""
     kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
-    if not description.is_plain:
+    if not description.is_structure_on_springs:
         kinds -= {TrialKind.RINGDOWN}
     if description.free:
         # nothing holds it at rest

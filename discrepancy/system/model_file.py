@@ -72,7 +72,7 @@ class ModelDescription(Section):
         return cls.parse(read_toml(path, ModelError, what=noun), str(path))
 
     @staticmethod
-    def repeated(kind: str, names: list[str]) -> Iterator[Fault]:
+    def repeated_name_faults(kind: str, names: list[str]) -> Iterator[Fault]:
         """Yield a fault for each name that occurs twice."""
         for name in names:
             yield names.count(name) > 1, f"there are two of {kind} {name!r}"

@@ -26,7 +26,7 @@ from fe.runtime.port_laws import PortLaws
 from fe.runtime.time_steps import Boundaries, loaded_steps, step_boundaries
 
 LEAST_LEAD = 1e-9
-"""A first sample counts as taken at the begin of the motion if it is later by no more than this
+"""A first sample counts as taken at the start of the motion if it is later by no more than this
 fraction of the mean sampling interval."""
 FADING_LAGS = 40.0
 """Number of relaxation times after which a released deflection of the modes without inertia is zero
@@ -43,10 +43,10 @@ class Motion:
         The system that moves.
     excitation : Excitation
         Its loads, prescribed motions and release.
-    laws : Laws
+    laws : PortLaws
         J internal forces.
     time : (N,) ndarray
-        Times of the motion since the release or the begin of the record [s].
+        Times of the motion since the release or the start of the record [s].
     q, velocity : (N, M + P) ndarray
         Modal coordinates and their rates, mass-normalised; the drives come last.
     port_forces : (N, J) ndarray
@@ -74,7 +74,7 @@ class Motion:
     @cached_property
     def acceleration(self) -> FloatArray:
         """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
-        modal = self.system.modal
+        modal = self.system.modal_system
         restoring = self.q @ modal.full_stiffness.T
         if self.laws.stiffness_rate != 0.0:
             restoring *= 1.0 + self.laws.stiffness_rate * (
@@ -87,24 +87,26 @@ class Motion:
         acceleration[: self.held_samples] = 0.0
         return acceleration
 
-    def at_rows(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def displacements_and_speeds_at(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the displacements and speeds (N, P) of row . u at all samples, for rows (P, n).
 
         A state (such as a temperature) is a speed in this system: the speed that is returned for
         it is the state, and the position is its integral over time.
         """
-        shapes = (rows @ self.system.all_shapes).T
-        without_inertia = self._without_inertia(rows) if self.system.is_truncated else 0.0
+        shapes = (rows @ self.system.shapes_with_drives).T
+        without_inertia = (
+            self._displacements_without_inertia(rows) if self.system.is_truncated else 0.0
+        )
         return self.q @ shapes + without_inertia, self.velocity @ shapes
 
-    def _without_inertia(self, rows: FloatArray) -> FloatArray:
+    def _displacements_without_inertia(self, rows: FloatArray) -> FloatArray:
         """Return the displacements row . u in the modes without inertia, as (N, C) for rows (C, n).
 
         These high modes deform without inertia: applied forces deform them at once, internal forces
         and the end of a holding force with the first-order lag of their damping.
         """
         system = self.system
-        residual_flexibility = system.residual(rows.T)
+        residual_flexibility = system.residual_displacements(rows.T)
         displacement = np.zeros((len(self.time), len(rows)))
         if self.excitation.loads:
             displacement += self.excitation.loads_at(self.time, residual_flexibility)
@@ -126,9 +128,11 @@ class Motion:
 
         Modes without inertia contribute only to outputs that are not differentiated.
         """
-        values, rates = self._of_derivatives(equations)
+        values, rates = self._part_of_derivatives(equations)
         if self.system.is_truncated:
-            values += self._without_inertia(np.array([equation.rows[0] for equation in equations]))
+            values += self._displacements_without_inertia(
+                np.array([equation.rows[0] for equation in equations])
+            )
         for column, equation in enumerate(equations):
             values[:, column] += equation.constant
             for factor, load in equation.feedthrough or ():
@@ -141,7 +145,9 @@ class Motion:
                 rates[:, column] = np.gradient(values[:, column], self.time)
         return Response(values, rates)
 
-    def _of_derivatives(self, equations: Sequence[OutputEquation]) -> tuple[FloatArray, FloatArray]:
+    def _part_of_derivatives(
+        self, equations: Sequence[OutputEquation]
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the part of outputs that depends on the modal coordinates and their derivatives.
 
         Returns
@@ -150,7 +156,7 @@ class Motion:
             That part of each output, and its time derivative. The derivative of the third
             derivative of the coordinates is left out of the rates.
         """
-        rows_by_derivative = rows_in_coordinates(equations, self.system.all_shapes)
+        rows_by_derivative = rows_in_coordinates(equations, self.system.shapes_with_drives)
         is_needed = [bool(np.any(derivative_rows)) for derivative_rows in rows_by_derivative]
         derivatives = [self.q, self.velocity]
         if any(is_needed[1:]):
@@ -168,7 +174,7 @@ class Motion:
         return values, rates
 
 
-def motion_of(
+def simulate_motion(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int = 1
 ) -> Motion:
     """Return the motion of a system at the samples of a dynamic trial.
@@ -205,13 +211,13 @@ def _motion_from_record(
     times = excitation.sample_times
     first_stamp = float(excitation.time[0])
     begin = state_at_first_stamp(system, excitation, laws)
-    motion = _advance(system, excitation, laws, first_stamp, times, begin, refinement)
+    motion = _integrate_from(system, excitation, laws, first_stamp, times, begin, refinement)
     starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first_stamp
     if starts_at_sample and len(laws) and len(system.drives):
-        # A speed-dependent law at a port that only drives move has no force at the begin if the
+        # A speed-dependent law at a port that only drives move has no force at the start if the
         # drives begin at rest. The kernel instead computes the force that would hold the drive's
         # coordinate like a free mass, which no reading contains.
-        rows = laws.port_rows(system.modal.ports, len(begin.v))
+        rows = laws.port_rows(system.modal_system.ports, len(begin.v))
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
         is_still = rows @ begin.v == 0.0
         motion.port_forces[0, is_driven & is_still & (laws.depends_on_speed == 1)] = 0.0
@@ -248,7 +254,7 @@ def _motion_from_release(
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
     refinement : int
         Steps are this many times smaller.
@@ -264,9 +270,9 @@ def _motion_from_release(
         stamps = np.append(stamps, abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
         # the transition matrix of the linear system over a negative time step
-        transition_back = system.modal.exact_steps(stamps[:1])[0][0]
+        transition_back = system.modal_system.exact_steps(stamps[:1])[0][0]
         begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
-    motion = _advance(system, excitation, laws, 0.0, stamps, begin, refinement)
+    motion = _integrate_from(system, excitation, laws, 0.0, stamps, begin, refinement)
     if held_count:
         motion = _with_held_samples(motion, released.begin, held_count, len(times))
     return Motion(
@@ -284,9 +290,9 @@ def _motion_from_release(
 
 
 def _with_held_samples(
-    motion: ModalMotion, begin: InitialMotion, held: int, count: int
+    motion: ModalMotion, begin: InitialMotion, held_count: int, count: int
 ) -> ModalMotion:
-    """Return a motion of `count` samples, with the held shape in the first `held` of them.
+    """Return a motion of `count` samples, with the held shape in the first `held_count` of them.
 
     Parameters
     ----------
@@ -294,14 +300,14 @@ def _with_held_samples(
         The motion at the samples after the release.
     begin : InitialMotion
         The state at the release, which is that of the held shape.
-    held, count : int
+    held_count, count : int
         Number of samples before the release, and of all samples.
     """
     laws = motion.port_forces.shape[1]
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
-        return np.vstack((np.tile(before, (held, 1)), after))[:count]
+        return np.vstack((np.tile(before, (held_count, 1)), after))[:count]
 
     return ModalMotion(
         q=prepend(begin.q, motion.q),
@@ -315,7 +321,7 @@ def _with_held_samples(
 # ---------------------------------------------------------------- steps
 
 
-def _advance(
+def _integrate_from(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
@@ -345,16 +351,16 @@ def _advance(
     # a free linear motion has a closed form, without steps
     if not is_excited and laws.linear:
         since_begin = stamps - (first if is_late else stamps[0])
-        free_motion = system.modal.free_motion(begin.q, begin.v, since_begin)
+        free_motion = system.modal_system.free_motion(begin.q, begin.v, since_begin)
         if free_motion is not None:
             q, v = free_motion
             no_forces = np.zeros((len(stamps), 0))
             return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
-        return _advance_in_steps(system, excitation, laws, stamps, begin, refinement)
-    # integrate from the earlier begin, and leave out the begin itself
+        return _integrate_in_steps(system, excitation, laws, stamps, begin, refinement)
+    # integrate from the earlier begin, and leave out the start itself
     from_begin = np.append(first, stamps)
-    motion = _advance_in_steps(system, excitation, laws, from_begin, begin, refinement)
+    motion = _integrate_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(
         q=motion.q[1:],
         v=motion.v[1:],
@@ -363,7 +369,7 @@ def _advance(
     )
 
 
-def _advance_in_steps(
+def _integrate_in_steps(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
@@ -372,21 +378,21 @@ def _advance_in_steps(
     refinement: int,
 ) -> ModalMotion:
     """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
-    modal = system.modal
+    modal = system.modal_system
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
-    edges = np.concatenate((laws.switching_times, excitation.edges))
+    edges = np.concatenate((laws.switching_times, excitation.jump_times))
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
     # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
-        residual = system.residual(system.rows_of_laws(laws).T)
+        residual = system.residual_displacements(system.rows_of_laws(laws).T)
         port_displacements = excitation.loads_at(boundaries.time, residual)
-    steps = _steps(system, excitation, boundaries, port_displacements)
+    steps = _linear_steps(system, excitation, boundaries, port_displacements)
     return integrate_motion(modal, laws, steps, begin, compiled_kernel())
 
 
-def _steps(
+def _linear_steps(
     system: LinearSystem,
     excitation: Excitation,
     boundaries: Boundaries,
@@ -410,7 +416,9 @@ def _steps(
     begin_force, end_force = equivalent_ramps(
         lambda times: system.modal_forces(excitation, times), time
     )
-    steps = loaded_steps(system.modal, boundaries, begin_force, end_force, port_displacements)
+    steps = loaded_steps(
+        system.modal_system, boundaries, begin_force, end_force, port_displacements
+    )
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps

@@ -12,8 +12,10 @@ SMALLEST_SIZE = 1e-9
 """Magnitude [SI] of all states if nothing moves and all readings are zero."""
 
 
-def natural_state(motion: Motion, equations: Sequence[OutputEquation], trial: Trial) -> FloatArray:
-    """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
+def natural_state_magnitudes(
+    motion: Motion, equations: Sequence[OutputEquation], trial: Trial
+) -> FloatArray:
+    """Return typical magnitudes (L,) of the unknown state at the start of a trial.
 
     The magnitude of an amplitude is the larger of its largest value in the motion from rest, and
     of the value that could explain the largest reading of a channel.
@@ -34,7 +36,7 @@ def natural_state(motion: Motion, equations: Sequence[OutputEquation], trial: Tr
     """
     system = motion.system
     mode_count = len(system.angular_frequency)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     position_magnitudes = np.max(np.abs(motion.q[:, :mode_count]), axis=0)
     speed_magnitudes = np.max(np.abs(motion.velocity[:, :mode_count]), axis=0)
     duration = float(trial.time[-1] - trial.time[0])

@@ -42,7 +42,7 @@ class OutputEquation:
     law_direction: FloatArray | None = None
 
     @classmethod
-    def of_row(
+    def from_row(
         cls,
         row: FloatArray,
         displacement_derivative: int = 0,

@@ -14,7 +14,7 @@ FORCE_PER_RMS = 5.0
 """Ratio of the force scale of a port without stiffness to the rms of the forces that act there.
 With this ratio, a friction of 1 to 25 % of the acting force lies in the middle of its prior, and so
 does a drag of that size at the largest speed."""
-BOTH_WAYS = 1e-3
+LEAST_REVERSE_SPEED = 1e-3
 """A motion reverses if the speed exceeds this fraction of its largest value in both directions."""
 
 
@@ -26,12 +26,16 @@ class GlobalScales(NamedTuple):
     angular_frequency: float
 
 
-def moving_scales(
-    system: LinearSystem,
-    largest_displacement: float,
-    largest_speed: float,
-    largest_load: float,
-    duration: float,
+class LargestMotion(NamedTuple):
+    """Largest magnitudes of displacement [m], speed [m/s] and load [N]; zero without any."""
+
+    displacement: float
+    speed: float
+    load: float
+
+
+def scales_of_moving_structure(
+    system: LinearSystem, largest: LargestMotion, duration: float
 ) -> GlobalScales:
     """Return the scales of a whole structure from the loads and motions of the trials.
 
@@ -39,28 +43,28 @@ def moving_scales(
     ----------
     system : LinearSystem
         The system at the prior mean.
-    largest_displacement, largest_speed, largest_load : float
-        Largest absolute values in the trials [m, m/s, N]; zero if nothing moves or acts.
+    largest : LargestMotion
+        Largest displacement, speed and load in the trials.
     duration : float
         Longest dynamic record [s].
     """
     elastic = system.angular_frequency[system.angular_frequency > 0.0]
-    moves = largest_displacement > 0.0
+    moves = largest.displacement > 0.0
     if len(elastic):
         frequency = float(elastic[0])
-    elif moves and largest_speed > 0.0:
-        frequency = largest_speed / largest_displacement
+    elif moves and largest.speed > 0.0:
+        frequency = largest.speed / largest.displacement
     else:
         frequency = 1.0 / duration
-    mass = float(np.trace(system.mass)) / max(system.size, 1)
-    if moves and largest_load > 0.0:
-        stiffness = largest_load / largest_displacement
+    mass = float(np.trace(system.mass)) / max(system.unknown_count, 1)
+    if moves and largest.load > 0.0:
+        stiffness = largest.load / largest.displacement
     else:
         stiffness = mass * frequency**2
     return GlobalScales(stiffness, mass, frequency)
 
 
-def larger(largest: float, values: FloatArray) -> float:
+def larger_magnitude(largest: float, values: FloatArray) -> float:
     """Return the larger of a number and the largest absolute value of an array."""
     return float(np.maximum(largest, np.max(np.abs(values), initial=0.0)))
 
@@ -135,17 +139,17 @@ class PortScaleEstimator:
         (T, N) array
             The loads on all unknowns in the motion [N].
         """
-        position, speed = motion.at_rows(self.rows)
+        position, speed = motion.displacements_and_speeds_at(self.rows)
         largest_position = np.max(np.abs(position), axis=0, initial=0.0)
         largest_speed = np.max(np.abs(speed), axis=0, initial=0.0)
         self._add_largest(largest_position, largest_speed, fitted=fitted)
-        least_speed = BOTH_WAYS * np.max(np.abs(speed), axis=0)
+        least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speed), axis=0)
         self.turns |= (np.min(speed, axis=0) < -least_speed) & (np.max(speed, axis=0) > least_speed)
         # inertia, damping and loads (N unknowns)
         system = motion.system
         shapes = system.shapes
         modes = shapes.shape[1]
-        loads = motion.excitation.loads_at(motion.time, np.eye(system.size))
+        loads = motion.excitation.loads_at(motion.time, np.eye(system.unknown_count))
         forces = (
             motion.acceleration[:, :modes] @ (system.mass @ shapes).T,
             motion.velocity[:, :modes] @ (self.system.damping @ shapes).T,
@@ -206,7 +210,7 @@ class PortScaleEstimator:
         return scales
 
     def _port_scale(
-        self, number: int, static_stiffness: float, force: float, *, only_driven: bool
+        self, port_index: int, static_stiffness: float, force: float, *, only_driven: bool
     ) -> PortScale:
         """Return the scale of one port.
 
@@ -216,7 +220,7 @@ class PortScaleEstimator:
 
         Parameters
         ----------
-        number : int
+        port_index : int
             Number of the port.
         static_stiffness : float
             Its static stiffness [N/m or N m/rad]; zero if it has to be computed from the modes.
@@ -224,15 +228,15 @@ class PortScaleEstimator:
             Its force scale from the trials [N or N m]; zero if nothing acted there.
         """
         system = self.system
-        fitted = float(self.fitted_displacement[number])
-        largest = float(self.largest_displacement[number])
-        speed = float(self.largest_speed[number])
-        displacement = fitted or largest or 1.0
+        fitted_displacement = float(self.fitted_displacement[port_index])
+        largest_displacement = float(self.largest_displacement[port_index])
+        largest_speed = float(self.largest_speed[port_index])
+        displacement = fitted_displacement or largest_displacement or 1.0
         # modes that move the port
-        frequency = system.angular_frequency[: system.displacement_modes]
-        row = self.rows[number]
+        frequency = system.angular_frequency[: system.displacement_mode_count]
+        row = self.rows[port_index]
         # squared amplitude of the port per unit of each mode (shapes have a modal mass of one)
-        participation = (row @ system.shapes)[: system.displacement_modes] ** 2
+        participation = (row @ system.shapes)[: system.displacement_mode_count] ** 2
         moves = participation > 1e-6 * float(participation.sum())
         is_free = not np.any(frequency[moves] > 0.0)
         is_held = np.any(moves) and np.all(frequency[moves] > 0.0)
@@ -241,23 +245,23 @@ class PortScaleEstimator:
             return PortScale(
                 displacement=displacement,
                 stiffness=(force or 1.0) / displacement,
-                angular_frequency=(speed or 1.0) / displacement,
-                largest_displacement=largest or displacement,
+                angular_frequency=(largest_speed or 1.0) / displacement,
+                largest_displacement=largest_displacement or displacement,
                 free=is_free,
-                turns=bool(self.turns[number]) or not is_known_not_to_turn,
+                turns=bool(self.turns[port_index]) or not is_known_not_to_turn,
                 of_state=not np.any(row[: system.displacement_count]),
             )
         # each mode adds (row @ shape)^2 / omega^2 to the static compliance of the port
         compliance = np.sum(participation[moves] / frequency[moves] ** 2)
         static_stiffness = static_stiffness or 1.0 / float(compliance)
-        is_driven = only_driven and self.follows_drives[number]
-        if is_driven and force > 0.0 and speed > 0.0:
+        is_driven = only_driven and self.follows_drives[port_index]
+        if is_driven and force > 0.0 and largest_speed > 0.0:
             return PortScale(
                 displacement=displacement,
                 stiffness=force / displacement,
-                angular_frequency=speed / displacement,
+                angular_frequency=largest_speed / displacement,
                 static_stiffness=static_stiffness,
-                largest_displacement=largest or displacement,
+                largest_displacement=largest_displacement or displacement,
                 driven=True,
             )
         first_frequency = float(frequency[moves][0])
@@ -269,5 +273,5 @@ class PortScaleEstimator:
             stiffness=first_frequency**2 / first_participation,
             angular_frequency=first_frequency,
             static_stiffness=static_stiffness,
-            largest_displacement=largest or 1.0,
+            largest_displacement=largest_displacement or 1.0,
         )

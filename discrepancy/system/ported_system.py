@@ -34,9 +34,11 @@ def ported_system(
         Its matrices; see there for signs.
     """
     names = tuple(system.ports)
-    port_rows = np.array([system.ports[name] for name in names]).reshape(len(names), system.size)
+    port_rows = np.array([system.ports[name] for name in names]).reshape(
+        len(names), system.unknown_count
+    )
     law_directions = np.array([system.law_directions[name] for name in names])
-    law_directions = law_directions.reshape(len(names), system.size)
+    law_directions = law_directions.reshape(len(names), system.unknown_count)
     direct_outputs = _direct_forces(system, equations, law_directions)
     # the system in the coordinates q
     mass = shapes.T @ system.mass @ shapes
@@ -49,7 +51,7 @@ def ported_system(
     by_stiffness = np.linalg.solve(mass, stiffness)
     # first order, s = (q, q'), without the integrals of states
     coordinate_count = len(mass)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     generator = np.zeros(
         (displacement_mode_count + coordinate_count, displacement_mode_count + coordinate_count)
     )
@@ -92,5 +94,5 @@ def _direct_forces(
         if equation.law_direction is not None:
             direct[:, column] = directions @ equation.law_direction
         elif system.is_truncated:
-            direct[:, column] = -directions @ system.residual(equation.rows[0])
+            direct[:, column] = -directions @ system.residual_displacements(equation.rows[0])
     return direct

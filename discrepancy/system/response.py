@@ -46,7 +46,7 @@ class Conditions:
     offset: tuple[float, ...] = ()
     refinement: int = 1
 
-    def stamps(self, time: FloatArray) -> FloatArray:
+    def motion_times(self, time: FloatArray) -> FloatArray:
         """Return the times at which samples with stamps (N,) show the motion [s]."""
         return (1.0 + self.clock[0]) * time + self.clock[1]
 

@@ -129,7 +129,7 @@ class Rig:
     matrices: Mapping[str, FloatArray]
     loops: Mapping[str, ControlLoop]
 
-    def factor(self, name: str) -> float:
+    def term_factor(self, name: str) -> float:
         """Return the factor of a term, one if no parameter scales it."""
         return self.factors.get(name, 1.0)
 
@@ -139,7 +139,7 @@ class Rig:
         direction[: len(row)] = row
         if section.through is not None:
             direction = self.matrices[section.through] @ direction
-        return np.asarray(self.factor(section.name) * direction)
+        return np.asarray(self.term_factor(section.name) * direction)
 
     def loads_of_references(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
         """Return the loads that follow from the recorded references of all controllers."""
@@ -275,8 +275,8 @@ def _control_loops(
         if section.integral:
             error_integral[next_integral] = 1.0
             next_integral += 1
-        measured = OutputEquation.of_row(
-            description.padded(section.vector),
+        measured = OutputEquation.from_row(
+            description.pad_to_all_unknowns(section.vector),
             displacement_derivative=section.quantity.order,
             state_count=unknown_count - displacement_count,
         )
@@ -286,7 +286,7 @@ def _control_loops(
             derivative=derivative,
             integral=integral,
             measured=measured.rows,
-            direction=description.padded(section.acts),
+            direction=description.pad_to_all_unknowns(section.acts),
             error_integral=error_integral,
         )
     return loops

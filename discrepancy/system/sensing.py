@@ -48,10 +48,10 @@ class TurnedGauges:
     outputs: Outputs
 
 
-def in_own_clock(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
+def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
     """Return a trial and its patch with time counted from the first sample, if stamps are far off.
 
-    Models count time from the begin of the trial, but stamps may count from an epoch, or from the
+    Models count time from the start of the trial, but stamps may count from an epoch, or from the
     start of a logger. Stamps that begin within the length of the record from zero are kept, since
     a release happens at zero.
 
@@ -70,15 +70,15 @@ def in_own_clock(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
         return trial, patch
     primitives = []
     for primitive in patch:
-        windows = tuple(_moved_window(window, first_stamp) for window in primitive.windows)
+        windows = tuple(_shift_window(window, first_stamp) for window in primitive.windows)
         primitives.append(replace(primitive, windows=windows) if windows else primitive)
     return replace(trial, time=trial.time - first_stamp), ModelPatch(tuple(primitives))
 
 
-def _moved_window(window: Window, first: float) -> Window:
-    """Return a window in a clock that is zero at a time `first` [s]."""
-    begin = None if window.begin is None else window.begin - first
-    end = None if window.end is None else window.end - first
+def _shift_window(window: Window, first_stamp: float) -> Window:
+    """Return a window in a clock that is zero at a time `first_stamp` [s]."""
+    begin = None if window.begin is None else window.begin - first_stamp
+    end = None if window.end is None else window.end - first_stamp
     return window._replace(begin=begin, end=end)
 
 
@@ -110,11 +110,11 @@ def observe(
         If a sensor primitive names a channel that does not exist or has values that no sensor can
         have.
     """
-    patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
-    trial, patch = in_own_clock(trial, patch)
+    patch = (_sensors_by_channel(model.built_in_sensors, campaign) + patch).in_trial(trial.name)
+    trial, patch = shift_clock_to_first_sample(trial, patch)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, campaign.outputs(trial), patch, conditions)
-    gauges = _turned_gauges(model, campaign, trial, patch)
+    gauges = _find_turned_gauges(model, campaign, trial, patch)
     response = _response_in_clocks(model, campaign, trial, patch, conditions, gauges)
     # columns: the C channels, transverse strains of strain channels, their shear strains
     channel_count = len(trial.channels)
@@ -131,7 +131,7 @@ def observe(
     )
 
 
-def _turned_gauges(
+def _find_turned_gauges(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch
 ) -> TurnedGauges:
     """Return the strain channels, if a patch turns gauges, and the outputs the model has to give.
@@ -249,7 +249,7 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
     return tuple(campaign.loggers[logger])
 
 
-def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
+def _sensors_by_channel(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
     """Return sensor primitives by channels: one that names an output, for each of its channels."""
     primitives: list[Primitive] = []
     for primitive in sensors:
@@ -291,7 +291,7 @@ def observe_response(
         If a sensor primitive names a channel that does not exist or has values that no sensor can
         have.
     """
-    trial, patch = in_own_clock(trial, patch)
+    trial, patch = shift_clock_to_first_sample(trial, patch)
     strains = tuple(across)
     transverse, shear = strains if strains else (None, None)
     record = SensorRecord(

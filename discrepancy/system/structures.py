@@ -126,7 +126,7 @@ class StructureModel(SystemModel):
         # ports
         self.port_rows = self._ports_of_loads(displacements)
         for port, row in self._ports_of_file().items():
-            self._check_moves_otherwise(port, row)
+            self._check_direction_is_new(port, row)
             self.port_rows[port] = row
         self.ports = tuple(self.port_rows)
 
@@ -149,7 +149,7 @@ class StructureModel(SystemModel):
             if _is_at_port(name)
         }
 
-    def _check_moves_otherwise(self, port: str, row: FloatArray) -> None:
+    def _check_direction_is_new(self, port: str, row: FloatArray) -> None:
         """Refuse a port of the file that has the same direction (n,) as another port.
 
         Raises
@@ -157,37 +157,39 @@ class StructureModel(SystemModel):
         ModelError
             If there is such a port: readings could not distinguish the forces at both.
         """
-        for other, other_row in self.port_rows.items():
+        for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} "
-                    "does, so that no reading tells their forces apart: take this [[port]] out of "
-                    "the file."
+                    f"The port {port!r} of the structure {self.name} moves as its port "
+                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
+                    "[[port]] out of the file."
                 )
 
-    def _values(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
+    def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the input vector of the reduced model; controls that are missing are nominal."""
         names = (*self.model.parameters, *self.model.masses)
         parameters = dict(zip(names, state.parameters, strict=True))
         return self.model.vector({**parameters, **controls}, state.losses)
 
-    def _load_under(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
+    def _load_of_controls(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
-        coefficients = self.model.load_coefficients(self._values(state, controls))
+        coefficients = self.model.load_coefficients(self._input_vector(state, controls))
         return np.asarray(self.model.unit_loads @ coefficients)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
         """Return the load (n,) per unit of a control."""
         no_controls = dict.fromkeys(self.model.controls, 0.0)
         unit_control = no_controls | {control: 1.0}
-        return self._load_under(state, unit_control) - self._load_under(state, no_controls)
+        return self._load_of_controls(state, unit_control) - self._load_of_controls(
+            state, no_controls
+        )
 
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
         """Return the equations of outputs, which are rows of the reduced model."""
         return [
-            OutputEquation.of_row(self._rows[output], quantity.order)
+            OutputEquation.from_row(self._rows[output], quantity.order)
             for output, quantity in outputs
         ]
 
@@ -213,7 +215,7 @@ class StructureModel(SystemModel):
             If there is no such force, or none is named of several.
         """
         places = self.forces or (LOAD_FACTOR,)
-        return self._unit_load(state, choose_load_place(places, place, self.what))
+        return self._unit_load(state, choose_load_place(places, place, self.quoted_name))
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
@@ -223,7 +225,7 @@ class StructureModel(SystemModel):
         """Return what acts in a trial, with constant loads and controls that no trial records."""
         excitation = super().excitation(case)
         recorded = [name for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls]
-        constant_load = self._load_under(case.state, dict.fromkeys(recorded, 0.0))
+        constant_load = self._load_of_controls(case.state, dict.fromkeys(recorded, 0.0))
         if not constant_load.any():
             return excitation
         always = RecordedHistory(excitation.time, np.ones(len(excitation.time)))
@@ -237,7 +239,7 @@ class StructureModel(SystemModel):
         OutsideModelError
             If a value lies outside the validity box of the reduced model.
         """
-        structure = self.model.structure_at(self._values(state, {}))
+        structure = self.model.structure_at(self._input_vector(state, {}))
         return _linear_system(structure, self.model.damping, self.port_rows)
 
 
@@ -298,7 +300,7 @@ def _linear_system(
     )
 
 
-def _solver_of(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def _cholesky_solver(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Return the function that solves K x = b by a Cholesky factor of K."""
     return partial(cho_solve, cho_factor(stiffness, check_finite=False), check_finite=False)
 
@@ -337,7 +339,7 @@ class WingModel(SystemModel):
         self.name = name
         self.design = design
         self.wing = PatchedWing(arrays)
-        self.wing.solver = _solver_of
+        self.wing.solver = _cholesky_solver
         names = wing_input_names(arrays.regions)
         validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
         self.parameters = wing_priors(validity, **prior)
@@ -406,11 +408,11 @@ class WingModel(SystemModel):
             rows = rows * np.where(is_strain, factors[gauges], 1.0)[:, None]
         equations = []
         for row, (_, quantity) in zip(rows, outputs, strict=True):
-            equations.append(OutputEquation.of_row(row, quantity.order))
+            equations.append(OutputEquation.from_row(row, quantity.order))
         return equations
 
     @property
-    def shown_outputs(self) -> tuple[str, ...]:
+    def outputs_with_quantities(self) -> tuple[str, ...]:
         """The outputs as they are listed in a sentence."""
         return (
             f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]",
@@ -427,7 +429,7 @@ class WingModel(SystemModel):
         """Return the units of force and motion at a port: the root turns, others move."""
         return TURNS if port == ROTATING_PORT else MOVES
 
-    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+    def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
         return self.wing.internal_forces(forces)
 

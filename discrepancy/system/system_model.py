@@ -14,15 +14,16 @@ from discrepancy.system.excitation import Excitation, Load, ReleasePoint
 from discrepancy.system.interface import NO_PATCH, Model
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.load_change import LoadChange, require_release
-from discrepancy.system.motion import Motion, motion_of
-from discrepancy.system.natural_state import natural_state
+from discrepancy.system.motion import Motion, simulate_motion
+from discrepancy.system.natural_state import natural_state_magnitudes
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.port_scales import (
     GlobalScales,
+    LargestMotion,
     PortScaleEstimator,
-    larger,
+    larger_magnitude,
     largest_measured_force,
-    moving_scales,
+    scales_of_moving_structure,
 )
 from discrepancy.system.ported_system import ported_system
 from discrepancy.system.response import Conditions, Outputs, Place, PortedSystem, Response
@@ -61,7 +62,7 @@ class SystemModel(Model):
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
 
     @cached_property
-    def system(self) -> Callable[[SystemState], LinearSystem]:
+    def system_in_state(self) -> Callable[[SystemState], LinearSystem]:
         """The function that returns the system in a state: `build_system` with a cache."""
         return lru_cache(self.cache_size)(self.build_system)
 
@@ -108,7 +109,7 @@ class SystemModel(Model):
         trial = case.trial
         primitives = case.patch.of(*LOADS)
         direction = self.force_row(trial.load_place, case.state, primitives)
-        force = LoadChange.of_patch(primitives).apply_to(trial.force, trial.force)
+        force = LoadChange.from_patch(primitives).apply_to(trial.force, trial.force)
         load = Load(direction, RecordedHistory(trial.time, force, trial.hold))
         return LoadsAndMotions([load], {})
 
@@ -156,15 +157,15 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ trials
 
-    def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
+    def laws_at_ports(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
         """Return the laws at the ports, those of the model and those of a patch."""
-        forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
+        forces = self.forces_at_ports(self.built_in_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 
     def patched_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> PatchedTrial:
-        """Return a trial with its patch and conditions, and the state of the matrices at its begin.
+        """Return a trial with its patch and conditions, and the state of the matrices at its start.
 
         Parameters
         ----------
@@ -178,7 +179,7 @@ class SystemModel(Model):
         temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
             parameters=tuple(conditions.parameters.tolist()),
-            losses=self.losses(trial, conditions.health)[0],
+            losses=self.region_losses(trial, conditions.health)[0],
             structure=patch.of(*STRUCTURE),
             temperature_rise=temperature_rise,
         )
@@ -188,7 +189,9 @@ class SystemModel(Model):
         """Return what acts in a trial."""
         trial = case.trial
         initial = case.conditions.initial
-        excitation = Excitation(trial.time, case.conditions.stamps(trial.time), begins=trial.begins)
+        excitation = Excitation(
+            trial.time, case.conditions.motion_times(trial.time), begins=trial.begins
+        )
         if trial.kind is TrialKind.RINGDOWN:
             if len(case.patch.of(PortLoad)):
                 raise ModelError(
@@ -211,9 +214,9 @@ class SystemModel(Model):
         """Return the system that moves in a dynamic trial, and what acts on it."""
         excitation = self.excitation(case)
         drives = tuple(excitation.prescribed_motions)
-        return ExcitedSystem(self.system(case.state._replace(drives=drives)), excitation)
+        return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
 
-    def motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
+    def simulate_motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
         """Return the motion in a dynamic trial.
 
         Raises
@@ -222,9 +225,9 @@ class SystemModel(Model):
             If the motion cannot begin as the trial says, or the model lacks one of its inputs.
         """
         system, excitation = self.excited_system(case)
-        where = f"The trial {case.trial.name!r} of {self.name!r}: "
-        with ModelError.instead_of(ModelError, FiniteElementError, before=where):
-            return motion_of(system, excitation, laws, case.conditions.refinement)
+        trial_text = f"The trial {case.trial.name!r} of {self.name!r}: "
+        with ModelError.instead_of(ModelError, FiniteElementError, before=trial_text):
+            return simulate_motion(system, excitation, laws, case.conditions.refinement)
 
     # ------------------------------------------------------------ response
 
@@ -237,14 +240,14 @@ class SystemModel(Model):
         recorded force is not zero. In a dynamic trial the structure has the temperature of the
         first sample throughout.
         """
-        laws = self.laws(conditions.parameters, patch)
+        laws = self.laws_at_ports(conditions.parameters, patch)
         case = self.patched_trial(trial, conditions, patch)
         if not trial.is_dynamic:
-            return Response(self._values_at_rest(case, outputs, laws))
-        motion = self.motion(case, laws)
+            return Response(self._outputs_at_rest(case, outputs, laws))
+        motion = self.simulate_motion(case, laws)
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
-    def _values_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
+    def _outputs_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
         """Return what outputs show (N, C) in a static trial, row by row along its load path.
 
         The order matters: dry friction remembers how the present load was reached.
@@ -260,9 +263,9 @@ class SystemModel(Model):
         for rows, state in self._rows_by_state(case):
             rows_case = case._replace(state=state)
             equations = self.output_equations(rows_case, outputs, None)
-            directions, all_levels = self.excitation(rows_case).levels
+            directions, all_levels = self.excitation(rows_case).load_levels
             levels = all_levels[rows]
-            system = self.system(state)
+            system = self.system_in_state(state)
             n = system.displacement_count
             for (_, quantity), equation in zip(outputs, equations, strict=True):
                 shows_state_rate = np.any(equation.rows[2:, n:])
@@ -273,9 +276,12 @@ class SystemModel(Model):
                         "acceleration."
                     )
             # at rest an output shows displacements (row 0) and the values of states (row 1)
-            output_rows = [np.append(item.rows[0, :n], item.rows[1, n:]) for item in equations]
-            where = f"The trial {trial.name!r} is at rest, but "
-            with ModelError.instead_of(ModelError, FiniteElementError, before=where):
+            output_rows = [
+                np.append(output_equation.rows[0, :n], output_equation.rows[1, n:])
+                for output_equation in equations
+            ]
+            trial_text = f"The trial {trial.name!r} is at rest, but "
+            with ModelError.instead_of(ModelError, FiniteElementError, before=trial_text):
                 values[rows], memory = system.static_path(
                     directions,
                     laws,
@@ -300,7 +306,7 @@ class SystemModel(Model):
             A slice of rows, and the state of the structure in all of them.
         """
         row_count = len(case.trial.force)
-        losses_of_rows = self.losses(case.trial, case.conditions.health)
+        losses_of_rows = self.region_losses(case.trial, case.conditions.health)
         # a single entry holds for all rows
         if len(losses_of_rows) == 1:
             losses_of_rows = losses_of_rows * row_count
@@ -318,7 +324,9 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ ports
 
-    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    def _ported_system(
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray
+    ) -> PortedSystem:
         """Return the linear system from missing forces to outputs, in the modes at the prior mean.
 
         These modes are the same for all parameters, so that systems at several parameters have the
@@ -329,10 +337,10 @@ class SystemModel(Model):
         mean_conditions = Conditions(self.prior_mean(), health=health)
         mean_case = self.patched_trial(trial, mean_conditions, patch)
         case = self.patched_trial(trial, Conditions(parameters, health=health), patch)
-        at_mean = self.excited_system(mean_case)
+        mean_system = self.excited_system(mean_case)
         system, excitation = self.excited_system(case)
         equations = self.output_equations(case, outputs, excitation)
-        return ported_system(system, equations, at_mean.system.shapes)
+        return ported_system(system, equations, mean_system.system.shapes)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
@@ -343,7 +351,7 @@ class SystemModel(Model):
         denser_excitation = replace(
             excitation, sample_times=subdivide(excitation.sample_times, parts)
         )
-        return motion_of(system, denser_excitation, NO_LAWS).at_rows(
+        return simulate_motion(system, denser_excitation, NO_LAWS).displacements_and_speeds_at(
             self._rows_of_ports(tuple(self.port_rows))
         )
 
@@ -353,18 +361,18 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ natural sizes and scales
 
-    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
+    def initial_state_magnitudes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+        """Return typical magnitudes (L,) of the unknown state at the start of a trial.
 
-        See `natural_state`; the motion from rest is that of the prior mean.
+        See `natural_state_magnitudes`; the motion from rest is that of the prior mean.
         """
         parameters = self.prior_mean(campaign)
         case = self.patched_trial(replace(trial, begins=Start.STILL), Conditions(parameters))
-        motion = self.motion(case, self.laws(parameters))
+        motion = self.simulate_motion(case, self.laws_at_ports(parameters))
         outputs = campaign.outputs(trial)
         self.check_outputs(outputs)
         equations = self.output_equations(case, outputs, motion.excitation)
-        return natural_state(motion, equations, trial)
+        return natural_state_magnitudes(motion, equations, trial)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, at the prior mean and without a patch.
@@ -375,49 +383,27 @@ class SystemModel(Model):
         trials = campaign.trials
         parameters = self.prior_mean(campaign)
         state = SystemState(tuple(parameters.tolist()), losses=(0.0,) * len(self.regions))
-        system = self.system(state)
-        uncontrolled = self.system(state._replace(controlled=False))
-        port_rows = self._rows_of_ports(self.ports).reshape(len(self.ports), uncontrolled.size)
+        system = self.system_in_state(state)
+        uncontrolled = self.system_in_state(state._replace(controlled=False))
+        port_rows = self._rows_of_ports(self.ports).reshape(
+            len(self.ports), uncontrolled.unknown_count
+        )
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)
-        # loads and motions of the trials
         estimator = PortScaleEstimator(uncontrolled, port_rows)
-        largest_displacement = 0.0
-        largest_speed = 0.0
-        largest_load = 0.0
-        only_driven = True
-        for trial in trials:
-            is_fitted = trial.is_dynamic and not trial.held_out
-            if trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN:
-                motion = self._motion_under_inputs(campaign, trial)
-                measured_force = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
-                shapes = motion.system.all_shapes[: motion.system.displacement_count].T
-                largest_displacement = larger(largest_displacement, motion.q @ shapes)
-                largest_speed = larger(largest_speed, motion.velocity @ shapes)
-                largest_load = larger(largest_load, loads)
-            else:
-                only_driven = False
-                if is_held:
-                    case = self.patched_trial(trial, Conditions(parameters))
-                    estimator.add_displacements(self._held_displacements(case), fitted=is_fitted)
+        largest = self._add_trials(estimator, campaign, is_held=is_held)
         # scales of the whole structure
-        campaign_sizes = campaign.sizes
+        campaign_sizes = campaign.largest_magnitudes
         if is_held:
-            global_scales = self._held_scales(system, state, campaign)
+            global_scales = self._scales_of_held_structure(system, state, campaign)
             first_shape = system.shapes[:, 0]
             static_stiffness = [
-                1.0 / float(row @ system.rest_under(row[None])[0]) for row in port_rows
+                1.0 / float(row @ system.equilibrium_under(row[None])[0]) for row in port_rows
             ]
         else:
-            global_scales = moving_scales(
-                system,
-                largest_displacement,
-                largest_speed,
-                largest_load,
-                campaign_sizes["duration"],
-            )
+            global_scales = scales_of_moving_structure(system, largest, campaign_sizes["duration"])
             first_shape = np.zeros(0)
             static_stiffness = [0.0] * len(self.ports)
+        only_driven = all(_is_moved_by_inputs(trial) for trial in trials)
         port_scales = estimator.port_scales(static_stiffness, only_driven=only_driven)
         ports = dict(zip(self.ports, port_scales, strict=True))
         farthest_station = max(map(abs, self.stations or (0.0,)))
@@ -426,14 +412,47 @@ class SystemModel(Model):
             tip_stiffness=global_scales.stiffness,
             modal_mass=global_scales.mass,
             angular_frequency=global_scales.angular_frequency,
-            force=campaign_sizes["force"] or largest_load,
+            force=campaign_sizes["force"] or largest.load,
             load_factor=campaign_sizes["load_factor"],
             duration=campaign_sizes["duration"],
             campaign_time=campaign_sizes["campaign_time"],
             ports=ports | self.distributed_scales(ports, first_shape),
         )
 
-    def _held_scales(
+    def _add_trials(
+        self, estimator: PortScaleEstimator, campaign: Campaign, *, is_held: bool
+    ) -> LargestMotion:
+        """Add the motions of all trials to an estimator, and return the largest of them.
+
+        Parameters
+        ----------
+        estimator : PortScaleEstimator
+            What collects the motions of the ports.
+        campaign : Campaign
+            The campaign.
+        is_held : bool
+            Whether springs hold the structure, so that it has displacements at rest.
+        """
+        parameters = self.prior_mean(campaign)
+        largest = LargestMotion(0.0, 0.0, 0.0)
+        for trial in campaign.trials:
+            is_fitted = trial.is_dynamic and not trial.held_out
+            if _is_moved_by_inputs(trial):
+                motion = self._motion_under_inputs(campaign, trial)
+                measured_force = largest_measured_force(campaign, trial)
+                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
+                largest = LargestMotion(
+                    displacement=larger_magnitude(largest.displacement, motion.q @ shapes),
+                    speed=larger_magnitude(largest.speed, motion.velocity @ shapes),
+                    load=larger_magnitude(largest.load, loads),
+                )
+            elif is_held:
+                case = self.patched_trial(trial, Conditions(parameters))
+                estimator.add_displacements(self._static_displacements(case), fitted=is_fitted)
+        return largest
+
+    def _scales_of_held_structure(
         self, system: LinearSystem, state: SystemState, campaign: Campaign
     ) -> GlobalScales:
         """Return the scales of a structure that springs hold, at its reference load place."""
@@ -443,7 +462,7 @@ class SystemModel(Model):
         # mass of the first mode, referred to the load point
         modal_mass = 1.0 / participation if participation else float(np.trace(system.mass))
         return GlobalScales(
-            stiffness=1.0 / float(load_row @ system.rest_under(load_row[None])[0]),
+            stiffness=1.0 / float(load_row @ system.equilibrium_under(load_row[None])[0]),
             mass=modal_mass,
             angular_frequency=float(system.angular_frequency[0]),
         )
@@ -451,32 +470,33 @@ class SystemModel(Model):
     def _motion_under_inputs(self, campaign: Campaign, trial: Trial) -> Motion:
         """Return the motion of a trial under its recorded inputs, at the prior mean.
 
-        The trial begins at rest if its own begin has no equilibrium. If the inputs cause no motion
-        at all, it begins with the typical magnitudes of an unknown initial state.
+        If the inputs cause no motion at all, the structure was released, and the motion begins with
+        the typical magnitudes of an unknown initial state.
         """
         conditions = Conditions(self.prior_mean(campaign))
-        laws = self.laws(conditions.parameters)
+        laws = self.laws_at_ports(conditions.parameters)
         try:
-            motion = self.motion(self.patched_trial(trial, conditions), laws)
+            motion = self.simulate_motion(self.patched_trial(trial, conditions), laws)
         except ModelError:
-            from_rest = replace(trial, begins=Start.STILL)
-            motion = self.motion(self.patched_trial(from_rest, conditions), laws)
+            # the trial cannot begin as it states, such as in an equilibrium of a free structure:
+            # its scales are then those of a motion from rest
+            trial_from_rest = replace(trial, begins=Start.STILL)
+            motion = self.simulate_motion(self.patched_trial(trial_from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
-            # no input moves it: the structure was released
-            initial = self.initial_sizes(campaign, trial)
-            let_go = self.patched_trial(trial, replace(conditions, initial=initial))
-            motion = self.motion(let_go, laws)
+            magnitudes = self.initial_state_magnitudes(campaign, trial)
+            released_trial = self.patched_trial(trial, replace(conditions, initial=magnitudes))
+            motion = self.simulate_motion(released_trial, laws)
         return motion
 
-    def _held_displacements(self, case: PatchedTrial) -> FloatArray:
+    def _static_displacements(self, case: PatchedTrial) -> FloatArray:
         """Return the displacements (L, N) at rest, or from which a ring-down is released."""
-        system = self.system(case.state)
+        system = self.system_in_state(case.state)
         excitation = self.excitation(case)
         if excitation.release is None:
-            directions, levels = excitation.levels
-            return np.asarray(levels @ system.rest_under(directions))
+            directions, levels = excitation.load_levels
+            return np.asarray(levels @ system.equilibrium_under(directions))
         row = excitation.release.row
-        shape = system.rest_under(row[None])
+        shape = system.equilibrium_under(row[None])
         displacement = excitation.release.release.displacement
         return np.asarray(displacement / float(row @ shape[0]) * shape)
 
@@ -484,6 +504,11 @@ class SystemModel(Model):
 def _depends_on_temperature(patch: ModelPatch) -> bool:
     """Return whether a patch makes the structure depend on temperature."""
     return len(patch.of(changes.ModulusTemperature)) > 0
+
+
+def _is_moved_by_inputs(trial: Trial) -> bool:
+    """Return whether a trial is a motion under recorded inputs, and no release or rest."""
+    return trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN
 
 
 def _begins_at_rest(trial: Trial) -> bool:

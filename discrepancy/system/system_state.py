@@ -40,7 +40,7 @@ class SystemState(NamedTuple):
 
 
 class PatchedTrial(NamedTuple):
-    """A trial under a patch and in conditions, and the state of the matrices at its begin."""
+    """A trial under a patch and in conditions, and the state of the matrices at its start."""
 
     trial: Trial
     conditions: Conditions

@@ -25,7 +25,7 @@ class LoadHistory(Protocol):
         """How the load is interpolated between samples."""
 
     @property
-    def edges(self) -> FloatArray:
+    def jump_times(self) -> FloatArray:
         """Times at which the load jumps, begins or ends, (J,) [s]."""
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
@@ -55,7 +55,7 @@ class RecordedHistory:
     motion_order: int | None = None
 
     @property
-    def edges(self) -> FloatArray:
+    def jump_times(self) -> FloatArray:
         """Times at which the history jumps or has a corner, (J,) [s]."""
         if self.hold is Hold.SMOOTH:
             return np.zeros(0)
@@ -107,7 +107,7 @@ class FormulaHistory:
     hold: ClassVar[Hold | None] = Hold.SMOOTH
 
     @property
-    def edges(self) -> FloatArray:
+    def jump_times(self) -> FloatArray:
         """Times at which the load begins or ends, (J,) [s]."""
         return np.array([edge for span in self.spans for edge in span if isfinite(edge)])
 
@@ -121,7 +121,7 @@ class FormulaHistory:
 def equivalent_ramps(
     values_at: Callable[[FloatArray], FloatArray], time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return begin and end values of straight lines that replace a function in each step.
+    """Return start and end values of straight lines that replace a function in each step.
 
     Each line goes through the function at the two Gauss-Legendre points of its step, so that it has
     the same mean effect to fourth order in the step.
@@ -136,14 +136,14 @@ def equivalent_ramps(
     Returns
     -------
     begin, end : (K, ...) arrays
-        The values of the lines at the begin and at the end of each step.
+        The values of the lines at the start and at the end of each step.
     """
     middle = 0.5 * (time[1:] + time[:-1])
     half_step = 0.5 * np.diff(time)
-    # The two points lie at a distance of half / sqrt(3) from the middle, so that a line rises over
-    # half a step by sqrt(3) / 2 times its rise between them.
-    at_first_point = values_at(middle + -1.0 * half_step / sqrt(3.0))
-    at_second_point = values_at(middle + 1.0 * half_step / sqrt(3.0))
+    # The two points lie at a distance of half_step / sqrt(3) from the middle, so that a line rises
+    # over half a step by sqrt(3) / 2 times its rise between them.
+    at_first_point = values_at(middle - half_step / sqrt(3.0))
+    at_second_point = values_at(middle + half_step / sqrt(3.0))
     mean = 0.5 * (at_first_point + at_second_point)
     half_rise = 0.5 * sqrt(3.0) * (at_second_point - at_first_point)
     return mean - half_rise, mean + half_rise

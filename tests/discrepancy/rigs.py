@@ -15,7 +15,7 @@ from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
-from discrepancy.sources.examples import example_campaign, plan_of, write_example
+from discrepancy.sources.examples import example_campaign, usual_plan, write_example
 from discrepancy.system.interface import Model
 from discrepancy.system.lumped_file import LumpedDescription
 from discrepancy.system.lumped_model import LumpedModel
@@ -105,7 +105,7 @@ def hiding(
 
 def simulated(model: Model, kind: Any, seed: int, hidden: Any = None, folder: Path | None = None) -> Campaign:
     """Return an example that hides a patch, or an effect by name, values and place; half as long as usual."""
-    plan = plan_of(model)
+    plan = usual_plan(model)
     plan = replace(plan, duration=0.5 * plan.duration)
     if isinstance(hidden, tuple):
         hidden = hiding(example_campaign(model, kind, seed, plan), model, *hidden)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from discrepancy.application import _command_with_model, apply_verdict, gives
+from discrepancy.application import _command_with_model, apply_verdict, has_applicable_effects
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
@@ -21,7 +21,7 @@ from discrepancy.fits.fitting import fit
 from discrepancy.model_choice import choose_model
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.whole_search import search
-from discrepancy.sources.examples import example_campaign, plan_of
+from discrepancy.sources.examples import example_campaign, usual_plan
 from discrepancy.system.lumped_file import SHIPPED_MODELS
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -203,10 +203,10 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     campaign = simulated(choice.model, "laboratory", 4, hidden, tmp_path / "campaign")
     found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
-    assert gives(found.verdict, found.proof)
-    assert not gives(found.verdict, None)
+    assert has_applicable_effects(found.verdict, found.proof)
+    assert not has_applicable_effects(found.verdict, None)
     larger = replace(found.proof.closed, value=-0.3)
-    assert not gives(found.verdict, replace(found.proof, closed=larger))
+    assert not has_applicable_effects(found.verdict, replace(found.proof, closed=larger))
     applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
     assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
     stored = read_patch(applied.path)
@@ -304,8 +304,8 @@ def test_a_built_in_sensor_is_that_of_its_channel():
     channels = tuple(
         Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
     )
-    campaign = example_campaign(model, "static", 0, replace(plan_of(model), channels=channels))
-    patched, given = model.patched(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
+    campaign = example_campaign(model, "static", 0, replace(usual_plan(model), channels=channels))
+    patched, given = model.with_patch(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
     seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), given).values
     np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
     assert np.abs(seen[:, 1]).max() > 0.0
@@ -316,7 +316,7 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     model = uav_twin.load_model("single_mass_rig")
     friction = "coulomb_friction", {"friction_ratio": 0.04}, "slide"
     campaign = simulated(model, "ringdown", 1, friction)
-    patched = model.patched(hiding(campaign, model, *friction))
+    patched = model.with_patch(hiding(campaign, model, *friction))
     problem = problem_of(campaign, patched)
     count = problem.sample_counts.sum()
     assert fit(problem, Candidate(), problem.prior_mean_point(Candidate())).chi_square > 10.0 * count

@@ -17,7 +17,7 @@ from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.model_choice import choose_model
 from discrepancy.search.strategy import Search
-from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.sources.examples import example_campaign, plan_from_scales
 from tests import command_line
 from tests.command_line import Terminal, command, refused, said
 
@@ -39,7 +39,7 @@ IMPORT = ("discrepancy", "import")
 def laboratory(folder: Path) -> Campaign:
     """Return a simulated campaign, its trials written as a laboratory's programme writes them."""
     model = choose_model(MODEL).model
-    plan = plan_for(model, ("displacement", "leaf_strain"), model.description.input[0].name)  # type: ignore[attr-defined]
+    plan = plan_from_scales(model, ("displacement", "leaf_strain"), model.description.input[0].name)  # type: ignore[attr-defined]
     campaign = example_campaign(model, "laboratory", 1, plan)
 
     def german(values: np.ndarray, power: int) -> list[str]:

@@ -23,7 +23,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.watch.opening import begun_watch
+from twin_master.watch.opening import begin_watch
 from uav_twin import fly, load_calibration, open_run, structure_files
 
 INPUTS = Inputs(__file__)
@@ -200,7 +200,7 @@ def test_the_twin_flies_with_it(calibrated, tmp_path, monkeypatch):
     np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
 
     told.clear()
-    with begun_watch(
+    with begin_watch(
         resolve_scenario(mission(), given), mission().file, tmp_path / "watch", SilentProgress()
     ):
         pass

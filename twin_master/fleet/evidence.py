@@ -14,7 +14,7 @@ import numpy as np
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.fleet.posterior import GRID_POINTS
-from twin_master.network.kernels import Lists, apply_blocks
+from twin_master.network.kernels import PredecessorLists, apply_blocks
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
@@ -26,7 +26,7 @@ _LEARNABLE_KIND = "independent_worsening"
 @compiled
 def _evidence_at_points(
     prior: Float,
-    lists: Lists,
+    lists: PredecessorLists,
     probability: Float,
     control: Index,
     likelihood: Float,
@@ -41,7 +41,7 @@ def _evidence_at_points(
     ----------
     prior : (S,) array
         The belief before the first step.
-    lists : Lists
+    lists : PredecessorLists
         The predecessors of the levels of each factor; their probabilities are not used.
     probability : (P, non-zeros) array
         The probabilities of the transitions in the lists at each point.
@@ -116,19 +116,13 @@ def _assumed_probabilities(scenario: Scenario) -> dict[_Cause, float]:
     return probabilities
 
 
-def _predecessors(scenario: Scenario) -> Lists:
+def _predecessors(scenario: Scenario) -> PredecessorLists:
     """Return the predecessors of the levels of each factor of the state of a scenario."""
     tables_of_controls = factor_tables(scenario).values()
     blocks = []
     for name in scenario.state_names:
         blocks.append(np.stack([tables[name] for tables in tables_of_controls]))
     return predecessor_lists(blocks)
-
-
-def _entry_probabilities(lists: Lists) -> Float:
-    """Return the probabilities in lists of predecessors, a (non-zeros,) array."""
-    _, _, _, _, probability, _ = lists
-    return probability
 
 
 @dataclass(frozen=True)
@@ -144,7 +138,7 @@ class TransitionFamily:
         The names of the probabilities: the control, and the factor if each has its own.
     assumed : (K,) array
         The probabilities that the scenario assumes.
-    lists : Lists
+    lists : PredecessorLists
         The predecessors of the levels of each factor of the state.
     parameter_index : (non-zeros,) array
         The index of the probability on which each entry of the lists depends.
@@ -158,7 +152,7 @@ class TransitionFamily:
 
     names: tuple[str, ...]
     assumed: Float
-    lists: Lists
+    lists: PredecessorLists
     parameter_index: Index
     entries_at_zero: Float
     entries_at_one: Float
@@ -169,7 +163,7 @@ class TransitionFamily:
     def fixed(cls, scenario: Scenario, reason: str) -> "TransitionFamily":
         """Return the transitions of a scenario that are not learnt, for a reason."""
         lists = _predecessors(scenario)
-        entries = _entry_probabilities(lists)
+        entries = lists.probability
         return cls(
             names=(),
             assumed=np.empty(0),
@@ -188,8 +182,8 @@ class TransitionFamily:
         # Entries are linear in their probability, so that two values of it give all others. At
         # 0 and 1 themselves some entries would vanish from the lists.
         lists = _predecessors_at(scenario, 0.25)
-        entries = _entry_probabilities(lists)
-        slope = 2.0 * (_entry_probabilities(_predecessors_at(scenario, 0.75)) - entries)
+        entries = lists.probability
+        slope = 2.0 * (_predecessors_at(scenario, 0.75).probability - entries)
         return cls(
             names=tuple(cause.name for cause in probabilities),
             assumed=np.array(list(probabilities.values())),
@@ -210,14 +204,14 @@ class TransitionFamily:
         )
 
 
-def _predecessors_at(scenario: Scenario, probability: float) -> Lists:
+def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists:
     """Return the predecessors of a scenario in which all probabilities to worsen are equal."""
     equal = {"probability": dict.fromkeys(scenario.control_names, probability)}
     transition = scenario.transition.model_copy(update=equal)
     return _predecessors(scenario.model_copy(update={"transition": transition}))
 
 
-def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: Lists) -> Index:
+def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
     """Return the index of the probability on which each entry of lists depends, (non-zeros,).
 
     Rows of the lists are ordered by factor, then by control, then by level.

@@ -422,7 +422,7 @@ def with_noise_factor(
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
         interval=model.interval,
-        **model.beside,
+        **model.extra_arguments,
     )
 
 

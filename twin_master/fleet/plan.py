@@ -27,8 +27,8 @@ from twin_master.scenario.section import (
     repeated_name_fault,
 )
 from twin_master.seeds import generator
-from twin_master.watch.feeds import is_broker
-from twin_master.watch.message import Fed
+from twin_master.watch.broker_address import is_broker
+from twin_master.watch.message import FeedItem
 
 SHARD = 256
 """Twins that are flown in one piece, unless the fleet file says otherwise."""
@@ -136,7 +136,7 @@ class Member:
         The number of its scenario in the group.
     file : Path or None
         The file that sets it apart: its FMU, its calibration, or the recording of a real asset.
-    recording : tuple of Fed or None
+    recording : tuple of FeedItem or None
         The observations of a real asset, as they are sent to a worker.
     """
 
@@ -146,7 +146,7 @@ class Member:
     parameters: Mapping[str, float]
     scenario_number: int = 0
     file: Path | None = None
-    recording: tuple[Fed, ...] | None = None
+    recording: tuple[FeedItem, ...] | None = None
 
 
 @dataclass(frozen=True)

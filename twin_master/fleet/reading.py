@@ -20,8 +20,8 @@ from twin_master.fleet.store import (
     open_group,
 )
 from twin_master.mission.preparation import Knowledge, load_knowledge
-from twin_master.network.belief_planning import leaving_probability
 from twin_master.network.estimator import BELIEVED
+from twin_master.network.simulated_missions import leaving_probability
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -223,9 +223,9 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
     keeps_control = (knowledge.plan.control_index == control).astype(np.float64)
     probability_kept = keeps_control.copy()
     for _ in range(steps - 1):
-        probability_kept = keeps_control * transition.expected(control, probability_kept)
+        probability_kept = keeps_control * transition.expected_value(control, probability_kept)
     if scenario.planner.decide_on == "predicted":  # the state after the next transition decides
-        probability_kept = transition.expected(control, probability_kept)
+        probability_kept = transition.expected_value(control, probability_kept)
     return np.asarray(np.maximum(1.0 - belief @ probability_kept, 0.0))
 
 

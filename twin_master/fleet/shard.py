@@ -38,11 +38,14 @@ from twin_master.mission.side_by_side import (
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.intake import Feed, Intake
-from twin_master.watch.message import Fed
+from twin_master.watch.feed import Feed
+from twin_master.watch.intake import Intake
+from twin_master.watch.message import FeedItem
 
 
-def flights_of_recordings(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
+def flights_of_recordings(
+    knowledge: Knowledge, recordings: Sequence[Sequence[FeedItem]]
+) -> Flights:
     """Return the beliefs and controls of B twins given recordings of real assets.
 
     They are those of a watch of each asset.
@@ -51,7 +54,7 @@ def flights_of_recordings(knowledge: Knowledge, recordings: Sequence[Sequence[Fe
     ----------
     knowledge : Knowledge
         What the twins know.
-    recordings : sequence of sequence of Fed
+    recordings : sequence of sequence of FeedItem
         The messages of each of the B assets.
     """
     flights = Flights.empty(knowledge, len(recordings))
@@ -75,7 +78,7 @@ def flights_of_recordings(knowledge: Knowledge, recordings: Sequence[Sequence[Fe
     return flights
 
 
-def _history_of_recording(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
+def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
     """Return what a twin concludes from the messages of one real asset.
 
     If any message comes late and revises a former step, all steps are filtered again at the end.

@@ -12,7 +12,7 @@ from twin_master.fleet.report import fleet_page
 from twin_master.fleet.watched_asset import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import find_config
-from twin_master.viewer.server import serve_page, text_of
+from twin_master.viewer.server import ServedText, package_text, serve_texts
 
 ATTENTION_ROWS = 50
 """Rows of the table of assets that need attention next, in the browser."""
@@ -49,11 +49,11 @@ def serve_fleet(
     """
     page = _CurrentPage(folder)
     texts = {
-        "/": (page.html, "text/html"),
-        "/version": (page.version, "text/plain"),
-        "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
+        "/": ServedText(page.html, "text/html"),
+        "/version": ServedText(page.version, "text/plain"),
+        "/view.js": package_text("twin_master.fleet", "view.js", "text/javascript"),
     }
-    serve_page(texts, port, ready, wanted)
+    serve_texts(texts, port, ready, wanted)
 
 
 class _CurrentPage:

@@ -11,9 +11,11 @@ from twin_master.errors import FleetError
 from twin_master.fleet.plan import Group, asset_name, recording_files
 from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.watch.feeds import broker_of, file_feed
-from twin_master.watch.intake import Feed
-from twin_master.watch.mqtt import Session, Topic
+from twin_master.watch.broker_address import parse_broker
+from twin_master.watch.feed import Feed
+from twin_master.watch.feeds import file_feed
+from twin_master.watch.mqtt import Topic
+from twin_master.watch.mqtt_session import Session
 
 STEPS_AT_ONCE = 64
 """Steps of one asset before the next asset is looked at."""
@@ -28,8 +30,13 @@ _LONGEST_HEADER = 100_000
 class BrokerMessage(Protocol):
     """A message of a broker."""
 
-    topic: str
-    payload: bytes
+    @property
+    def topic(self) -> str:
+        """The topic of the message."""
+
+    @property
+    def payload(self) -> bytes | bytearray:
+        """The content of the message."""
 
 
 class Watcher(Protocol):
@@ -124,7 +131,7 @@ class FileSource:
 
     def _is_read(self, asset: WatchedAsset) -> bool:
         """Return whether the file of an asset is read to its end, or as far as was wanted."""
-        return asset.watch.intake.ended or self._watcher.has_all_steps(asset)
+        return asset.watch.intake.has_ended or self._watcher.has_all_steps(asset)
 
     def look(self, *, for_new_assets: bool) -> int:
         """Take in what is new in the files; return the number of steps.
@@ -179,13 +186,13 @@ class TopicSource:
     has_ended = False  # a broker may send more at any time
 
     def __init__(self, watcher: Watcher, group: Group, authority: Path | None) -> None:
-        broker = broker_of(group.observations, authority, many=True)
+        broker = parse_broker(group.observations, authority, many=True)
         self._watcher = watcher
         self._group = group
         self._topic_prefix = broker.topic.removesuffix("+")
         self._session = Session(broker, group.name, watcher.folder, watcher.note, self._heartbeat)
         watcher.final_actions.callback(self._session.close)
-        self._messages: Iterator[BrokerMessage | None] = self._session.messages(0.0)
+        self._messages: Iterator[BrokerMessage | None] = self._session.receive(0.0)
         self._topics: dict[str, Topic] = {}
 
     def look(self, *, for_new_assets: bool) -> int:
@@ -229,7 +236,7 @@ class TopicSource:
         topic = self._find_topic(name)
         if topic is None or (asset is not None and self._watcher.has_all_steps(asset)):
             return 0
-        topic.came.append(message.payload)
+        topic.payloads.append(bytes(message.payload))
         return self._advance(name)
 
     def _find_topic(self, name: str) -> Topic | None:
@@ -253,6 +260,6 @@ class TopicSource:
             "assets": len(watches),
             "steps": sum(watch.twin.steps for watch in watches),
             "quiet": sum(watch.is_quiet for watch in watches),
-            "lag": len(self._session.came),
+            "lag": len(self._session.unread),
             "refused": sum(watch.intake.counts.rejected for watch in watches),
         }

@@ -10,8 +10,9 @@ from reporting.former_names import with_present_names
 from reporting.json_file import read_json
 from twin_master.errors import FleetError
 from twin_master.fleet.reading import probability_of_leaving, severity
+from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Feed
+from twin_master.watch.result import notices_since
 
 STATE_NAME = "watched.json"
 """The file in the folder of a watched fleet with the state of its assets, for its view."""
@@ -114,7 +115,7 @@ class WatchedAsset:
             self._previous_alarms = previous_record["alarms"]
         self.alarms: set[str] = set()
         if self.decision is not None:
-            for _step, notice in watch.told(self.first_new_step):
+            for _step, notice in notices_since(watch, self.first_new_step):
                 if notice.kind == "alarm":
                     self.alarms.add(notice.sentence)
             last_carried = watch.twin.carried[-1:]

@@ -20,11 +20,11 @@ from twin_master.fleet.watch_sources import LARGEST_FLEET, FileSource, Source, T
 from twin_master.fleet.watched_asset import STATE_NAME, WatchedAsset, read_standing
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.watch.feeds import is_broker
+from twin_master.watch.broker_address import is_broker
+from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Feed
 from twin_master.watch.mqtt import Topic
-from twin_master.watch.opening import begun_watch, resumed_watch
+from twin_master.watch.opening import begin_watch, resume_watch
 
 SEARCH_SECONDS = 2.0
 """Time between two searches for new assets [s]."""
@@ -243,8 +243,8 @@ class FleetWatch:
                 steps += 1
                 if steps == most_steps or self.has_all_steps(asset) or self.is_end_requested:
                     break
-            if steps == 0 and not asset.watch.intake.ended:
-                asset.watch.quiet(partial(self._hand_on, asset))
+            if steps == 0 and not asset.watch.intake.has_ended:
+                asset.watch.report_silence(partial(self._hand_on, asset))
         except Exception as error:  # noqa: BLE001 - whatever happens to one asset, the others go on
             self.lose(key, error)
         return steps
@@ -277,18 +277,18 @@ class FleetWatch:
         folder = self.folder / group.name / name
         sibling = self._sibling.get(group.name)
         if (folder / CONFIG_NAME).is_file():
-            watch_context = resumed_watch(folder, None, SilentProgress(), sibling)
+            watch_context = resume_watch(folder, None, SilentProgress(), sibling)
         else:
             with explained_write_errors(folder):
                 folder.parent.mkdir(exist_ok=True)
-            watch_context = begun_watch(
-                group.scenarios[0], group.scenario_file, folder, SilentProgress(), like=sibling
+            watch_context = begin_watch(
+                group.scenarios[0], group.scenario_file, folder, SilentProgress(), sibling=sibling
             )
         with ExitStack() as closing:
             watch = closing.enter_context(watch_context)
-            closing.enter_context(watch.begun(feed))
+            closing.enter_context(watch.begin(feed))
             if isinstance(feed, Topic):
-                feed.begun(watch)
+                feed.attach(watch)
             asset = WatchedAsset(key, watch, feed, self._records_of_lost.get(key))
             asset.close = closing.pop_all().close
         return asset
@@ -298,7 +298,7 @@ class FleetWatch:
         if "control" in decision:
             asset.decision = decision
         self._tell(asset, decision)
-        asset.feed.decide(decision)
+        asset.feed.send_decision(decision)
         for notice in decision["notices"]:
             if notice["kind"] == "alarm":
                 asset.alarms.add(notice["sentence"])

@@ -1,1 +1,1 @@
-"""What does not change in time is learnt during operation, and what no state explains is noticed."""
+"""Learning of what does not change in time, and the watch over gauges and model."""

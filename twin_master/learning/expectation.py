@@ -1,39 +1,40 @@
-"""What the sensors are expected to show, and the rewards, under the belief of a learning filter.
+"""Expected sensor values and rewards, under the belief of a learning filter.
 
-The belief is that over states and static hypotheses together, so that what the data tell of a parameter and
-of the damage in common stays in it. Moments are exact; quantiles take what a sensor shows for normal given
-the state.
+The belief is that over states and static hypotheses together. So the correlation of the parameter
+and the damage, which the data cause, stays in it. Means and standard deviations are exact.
+Quantiles take a sensor value to be normally distributed given the state.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.learning.learning_filter import Hypotheses, LearningFilter, quantiles_of
+from twin_master.learning.learning_filter import LearningFilter, StaticHypotheses
+from twin_master.learning.mixture_quantiles import mixture_quantiles
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEVELS = np.array([0.025, 0.975])
-_NEGLIGIBLE = 1e-9
-"""Share of a belief below which a state tells nothing of the quantiles."""
+_NEGLIGIBLE_PROBABILITY = 1e-9
+"""A state of smaller probability does not change the quantiles."""
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What beliefs say of the G sensors and of the rewards; the leading axes are those of the beliefs.
+class Expectation:
+    """Expected values of the G sensors and of the rewards; the leading axes are those of beliefs.
 
     Attributes
     ----------
-    mean, standard_deviation, lower, upper : (..., G)
-        Of what is shown without noise, SI; the last two are the quantiles of 2.5 and 97.5 %.
-    noise : (..., G)
-        Standard deviation of noise and model error, SI.
-    reward_mean, reward_standard_deviation : (..., 3)
-        In the order of `REWARD_NAMES`.
+    mean, standard_deviation, lower, upper : (..., G) array
+        Moments of the values without noise, and their quantiles of 2.5 and 97.5 %, SI.
+    noise : (..., G) array
+        The standard deviation of noise and model error, SI.
+    reward_mean, reward_standard_deviation : (..., 3) array
+        Moments of the rewards, in the order of `REWARD_NAMES`.
     """
 
     mean: Float
@@ -45,178 +46,353 @@ class Expected:
     reward_standard_deviation: Float
 
 
-def expected_of(
-    sensor_model: GaussianSensorModel, rewards: RewardModel, joint: Float, rows: Float | None,
-    *, quantiles: bool = True,
-) -> Expected:  # fmt: skip
-    """Return what beliefs (..., S, U) say where nothing is learnt; without quantiles those are NaN.
+def expectation_of_draws(
+    sensor_model: GaussianSensorModel,
+    rewards: RewardModel,
+    joint: Float,
+    rows: Float | None,
+    *,
+    quantiles: bool = True,
+) -> Expectation:
+    """Return the expectation under beliefs, if nothing is learnt and the draws keep their weights.
 
-    Rows that were observed are (..., G + I); None where they are predicted.
+    Parameters
+    ----------
+    sensor_model : GaussianSensorModel
+        S states, U controls, G sensors.
+    rewards : RewardModel
+        The rewards of the asset.
+    joint : (..., S, U) array
+        The joint belief over states and controls.
+    rows : (..., G + I) array or None
+        What was observed: the sensors, and further readings; None for a prediction.
+    quantiles : bool
+        Whether quantiles are computed; else they are NaN.
     """
-    mean, deviation = sensor_model.moments(joint)
+    mean, standard_deviation = sensor_model.moments(joint)
     lower = upper = np.full_like(mean, np.nan)
     if quantiles:
         lower, upper = np.moveaxis(sensor_model.quantiles(joint, _LEVELS), -2, 0)
-    observed = None if rows is None else rows[..., : sensor_model.sensor_count]
-    noise = sensor_model.noise(joint, rows)
-    return Expected(mean, deviation, lower, upper, noise, *rewards.expectation(joint, observed))
+    observation = None if rows is None else rows[..., : sensor_model.sensor_count]
+    reward_mean, reward_standard_deviation = rewards.expectation(joint, observation)
+    return Expectation(
+        mean=mean,
+        standard_deviation=standard_deviation,
+        lower=lower,
+        upper=upper,
+        noise=sensor_model.noise(joint, rows),
+        reward_mean=reward_mean,
+        reward_standard_deviation=reward_standard_deviation,
+    )
 
 
 @dataclass(frozen=True)
 class LearntExpectation:
-    """Expectations of a learning filter.
+    """Computes expectations under the beliefs of a learning filter.
 
     Attributes
     ----------
     learning : LearningFilter
+        The filter whose beliefs are used.
     rewards : RewardModel
-    policy : (S, U)
-        p(U | D), which is predicted through.
+        The rewards of the asset.
+    policy : (S, U) array
+        p(U | D), by which controls are predicted.
     """
 
     learning: LearningFilter
     rewards: RewardModel
     policy: Float
 
-    def filtered(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
-        """Return what is expected of T steps given the observations up to each.
+    def filtered(
+        self, carried: Sequence[Carried], beliefs: Float, observations: Float
+    ) -> Expectation:
+        """Return the expectation in T steps, each given the observations up to it.
 
         Parameters
         ----------
         carried : sequence of Carried
-            Of each step.
-        beliefs : (T, S)
-            About the state, which may be those of more than the model alone.
-        observed : (T, G)
-            What the sensors say, SI.
+            What the filter carried on from each step.
+        beliefs : (T, S) array
+            The beliefs about the state. They may differ from those of the filter, if other
+            hypotheses than the model are believed, too.
+        observations : (T, G) array
+            The observed sensor values, SI.
         """
-        rows = zip(carried, beliefs, observed, strict=True)
-        known = (self._known(self.learning.hypotheses(step), step, *row) for step, *row in rows)
-        return joined(known, np.array)
+        parts = []
+        for step, belief, observation in zip(carried, beliefs, observations, strict=True):
+            hypotheses = self.learning.hypotheses(step)
+            parts.append(self._expect_step(hypotheses, step.control_index, belief, observation))
+        return stack_expectations(parts)
 
-    def smoothed(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
-        """Return what is expected of T steps given all observations, see `filtered`."""
-        rows, own = zip(carried, beliefs, observed, strict=True), self.learning.smoothed_hypotheses(carried)
-        last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
-        return joined((self._known(found, *row) for found, row in zip(last, rows, strict=True)), np.array)
+    def smoothed(
+        self, carried: Sequence[Carried], beliefs: Float, observations: Float
+    ) -> Expectation:
+        """Return the expectation in T steps given all observations; parameters as of `filtered`."""
+        joint_beliefs = self.learning.smoothed_hypotheses(carried)
+        steps = zip(carried, joint_beliefs, beliefs, observations, strict=True)
+        parts = []
+        for step, joint_belief, belief, observation in steps:
+            hypotheses = self.learning.hypotheses(carried[-1], joint_belief)
+            parts.append(self._expect_step(hypotheses, step.control_index, belief, observation))
+        return stack_expectations(parts)
 
-    def predicted(self, carried: Sequence[Carried], beliefs: Float, asked: Float, horizon: int) -> Expected:
-        """Return what is expected after each of T steps of given filtered beliefs, of the H to come.
+    def predicted(
+        self, carried: Sequence[Carried], beliefs: Float, policies: Float, horizon: int
+    ) -> Expectation:
+        """Return the expectation in the H steps after each of T steps.
 
-        Controls are asked for with the probabilities p(U | D) (T, S, U).
+        Parameters
+        ----------
+        carried : sequence of Carried
+            What the filter carried on from each of the T steps.
+        beliefs : (T, S) array
+            The filtered beliefs about the state.
+        policies : (T, S, U) array
+            For each of the T steps the probabilities p(U | D) of the later controls.
+        horizon : int
+            The number H of steps.
         """
-        rows = zip(carried, beliefs, asked, strict=True)
-        return joined((self._ahead(*row, horizon) for row in rows), np.array)
+        steps = zip(carried, beliefs, policies, strict=True)
+        parts = [
+            self._expect_ahead(step, belief, policy, horizon) for step, belief, policy in steps
+        ]
+        return stack_expectations(parts)
 
-    def of_marginals(
-        self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
-    ) -> Expected:
-        """Return what is expected under B beliefs (B, S, U') where no more is known than what was learnt.
+    def from_marginals(
+        self,
+        learnt: Mapping[str, Learnt],
+        joint: Float,
+        controls: slice,
+        observation: Float | None,
+    ) -> Expectation:
+        """Return the expectation under B beliefs, if only the marginals of a filter are known.
 
-        Each quantity is taken for independent of the others and of the state; the parameter stands a standard
-        deviation to either side of its mean, between the draws around it.
+        The learnt quantities are taken to be independent of each other and of the state. The
+        parameter has two values, one standard deviation on either side of its mean, which are
+        interpolated between the draws.
 
         Parameters
         ----------
         learnt : dict of str to Learnt
-            Posterior of each quantity, as a step tells it.
-        joint : (B, S, U')
-            Belief over states and controls.
+            The posterior of each quantity by name, as `Estimate.learnt` has it.
+        joint : (B, S, U') array
+            The joint belief over states and controls.
         controls : slice
-            Which of the controls the U' are.
-        seen : (G,) or None
-            What the sensors say, SI.
+            The U' controls among all.
+        observation : (G,) array or None
+            The observed sensor values, SI; None for a prediction.
         """
-        model, (name, values) = self.learning.sensor_model, self.learning.draws or ("", ())
-        share = model.draw_weight
-        if (parameter := learnt.get(name)) is not None:
-            draws = np.asarray(values, dtype=np.float64)
-            order = np.argsort(draws)
-            at = parameter.mean + np.array([-1.0, 1.0]) * parameter.standard_deviation
-            near = np.eye(len(draws))[:, order]
-            share = np.array([np.interp(at, draws[order], own).mean() for own in near])
-        draw = np.flatnonzero(share)
-
-        def of_sensors(name: str, otherwise: float) -> Float:
-            plain = Learnt(otherwise, 0.0, otherwise, otherwise)
-            known = [learnt.get(f"{name}[{number}]", plain) for number in range(1, model.sensor_count + 1)]
-            return np.array([own.figures[:2] for own in known]).T
-
-        (gain, gain_spread), (offset, offset_spread), (scale, scale_spread) = (
-            of_sensors(name, otherwise)
-            for name, otherwise in (("gauge_gain", 0.0), ("gauge_offset", 0.0), ("noise_scale", 1.0))
+        draw_weight = self._draw_weight(learnt)
+        draw = np.flatnonzero(draw_weight)
+        gain, gain_deviation = self._gauge_moments(learnt, "gauge_gain", 0.0)
+        offset, offset_deviation = self._gauge_moments(learnt, "gauge_offset", 0.0)
+        scale, scale_deviation = self._gauge_moments(learnt, "noise_scale", 1.0)
+        hypotheses = StaticHypotheses(  # a first axis of length 1 stands for all draws
+            weight=np.empty(0),
+            draw=draw,
+            offset=offset[None],
+            gain=gain[None],
+            offset_variance=offset_deviation[None] ** 2,
+            covariance=np.zeros_like(gain)[None],
+            gain_variance=gain_deviation[None] ** 2,
+            squared_noise_scale=(scale**2 + scale_deviation**2)[None],
         )
-        spread = np.stack([offset_spread**2, np.zeros(model.sensor_count), gain_spread**2], axis=-1)
-        scale2 = scale**2 + scale_spread**2
-        alike = (part[None] for part in (offset, gain, spread, scale2))  # for all draws
-        hypotheses = Hypotheses(np.empty(0), draw, *alike)
-        weight = share[draw][None, :, None, None] * joint[:, None]
-        return self._of(hypotheses, np.ascontiguousarray(weight), controls, seen)
+        weight = draw_weight[draw][None, :, None, None] * joint[:, None]
+        return self._expect(hypotheses, np.ascontiguousarray(weight), controls, observation)
+
+    def _draw_weight(self, learnt: Mapping[str, Learnt]) -> Float:
+        """Return weights (E,) of the draws with the learnt mean and deviation of the parameter."""
+        prior_weight = self.learning.sensor_model.draw_weight
+        parameter = self.learning.parameter
+        if parameter is None or parameter.name not in learnt:
+            return prior_weight
+        posterior = learnt[parameter.name]
+        draws = np.asarray(parameter.values, dtype=np.float64)
+        order = np.argsort(draws)
+        deviations = np.array([-1.0, 1.0]) * posterior.standard_deviation
+        values = posterior.mean + deviations
+        # The weight of a draw in a linear interpolation is that of its hat function.
+        hat_functions = np.eye(len(draws))[:, order]
+        return np.array([np.interp(values, draws[order], hat).mean() for hat in hat_functions])
+
+    def _gauge_moments(
+        self, learnt: Mapping[str, Learnt], name: str, default: float
+    ) -> tuple[Float, Float]:
+        """Return mean and standard deviation (G,) of a quantity that each gauge may have learnt.
+
+        A gauge that did not learn it has the default value for certain.
+        """
+        certain = Learnt(default, 0.0, default, default)
+        numbers = range(1, self.learning.sensor_model.sensor_count + 1)
+        posteriors = [learnt.get(f"{name}[{number}]", certain) for number in numbers]
+        means = np.array([posterior.mean for posterior in posteriors])
+        deviations = np.array([posterior.standard_deviation for posterior in posteriors])
+        return means, deviations
 
     @cached_property
     def _closed_loop(self) -> Float:
-        """p(D' | D) under the policy: (S, S)."""
+        """The transitions p(D' | D) under the policy: (S, S)."""
         matrix = self.learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
-    def _known(self, hypotheses: Hypotheses, step: Carried, belief: Float, seen: Float) -> Expected:
-        u = slice(step.control_index, step.control_index + 1)
-        found = self._of(hypotheses, _believing(hypotheses.weight, belief)[None, :, :, None], u, seen)
-        return Expected(**{name: values[0] for name, values in vars(found).items()})
+    def _expect_step(
+        self, hypotheses: StaticHypotheses, control_index: int, belief: Float, observation: Float
+    ) -> Expectation:
+        """Return the expectation in one step under a known control, without a leading axis."""
+        controls = slice(control_index, control_index + 1)
+        weight = _joint_with_marginal(hypotheses.weight, belief)[None, :, :, None]
+        expectation = self._expect(hypotheses, weight, controls, observation)
+        only_belief = {name: values[0] for name, values in vars(expectation).items()}
+        return Expectation(**only_belief)
 
-    def _ahead(self, step: Carried, belief: Float, asked: Float, horizon: int) -> Expected:
+    def _expect_ahead(
+        self, step: Carried, belief: Float, policy: Float, horizon: int
+    ) -> Expectation:
+        """Return the expectation in the H steps after a step, under a policy (S, U)."""
         hypotheses = self.learning.hypotheses(step)
-        rows, coming = _believing(hypotheses.weight, belief), np.empty((horizon, *hypotheses.weight.shape))
+        joint = _joint_with_marginal(hypotheses.weight, belief)
+        predicted = np.empty((horizon, *hypotheses.weight.shape))  # (H, K, S)
         transition = self.learning.model.transition.matrix[step.control_index]
         for h in range(horizon):
-            rows, transition = rows @ transition, self._closed_loop
-            coming[h] = rows
-        return self._of(hypotheses, coming[..., None] * asked, slice(None), None)
+            joint = joint @ transition
+            predicted[h] = joint
+            transition = self._closed_loop  # after the first step the policy decides
+        return self._expect(hypotheses, predicted[..., None] * policy, slice(None), None)
 
-    def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
-        """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""
+    def _expect(
+        self,
+        hypotheses: StaticHypotheses,
+        weight: Float,
+        controls: slice,
+        observation: Float | None,
+    ) -> Expectation:
+        """Return the expectation under B beliefs over hypotheses, states and controls.
+
+        Parameters
+        ----------
+        hypotheses : StaticHypotheses
+            K hypotheses; their own weights are not used.
+        weight : (B, K, S, U') array
+            The beliefs, up to a factor of each.
+        controls : slice
+            The U' controls among all.
+        observation : (G,) array or None
+            The observed sensor values, SI; None for a prediction.
+        """
         weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
-        model = self.learning.sensor_model
-        own = model.value_per_draw[:, :, controls][hypotheses.draw]
-        gain, offset, wide, scale2 = (
-            part[:, None, None]
-            for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
-        )
-        shown = own * (1.0 + gain) + offset  # (K, S, U', G), normally distributed
-        shown_variance = wide[..., 0] + own * (2.0 * wide[..., 1] + own * wide[..., 2])
-        noise2 = np.broadcast_to(scale2 * model.total_standard_deviation[:, controls] ** 2, shown.shape)
-        beliefs, count = len(weight), shown.shape[-1]
-        flat = weight.reshape(beliefs, -1)
-        center = shown[0].mean(axis=(0, 1))  # near enough that squares do not cancel
-        first = shown - center
-        second = shown_variance + first**2
+        value, value_variance = self._sensor_moments(hypotheses, controls)
+        sensors = value.shape[-1]
+        beliefs = len(weight)
+
+        # Moments about a point near the mean, so that squares do not cancel.
+        center = value[0].mean(axis=(0, 1))
+        first_moment = value - center
+        second_moment = value_variance + first_moment**2
         by_state = weight.sum(axis=1).reshape(beliefs, -1)
-        means = np.einsum("bksu,ksug->bsug", weight, first).reshape(beliefs, -1, count)
-        squares = np.einsum("bksu,ksug->bsug", weight, second).reshape(beliefs, -1, count)
-        mean = means.sum(axis=1)
-        deviation = np.sqrt(np.maximum(squares.sum(axis=1) - mean**2, 0.0))
-        noise = np.sqrt(flat @ noise2.reshape(-1, count))
-        quantiles = np.empty((beliefs, 2, count))
-        for b in range(beliefs):
-            kept = np.flatnonzero(by_state[b] > _NEGLIGIBLE)
-            share = by_state[b, kept]
-            own = means[b, kept] / share[:, None]
-            wide = np.sqrt(np.maximum(squares[b, kept] / share[:, None] - own**2, 0.0))
-            quantiles[b] = quantiles_of(share / share.sum(), own, wide, _LEVELS)
-        rewards = self.rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
-        return Expected(
-            mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
-            *rewards,
-        )  # fmt: skip
+        first_by_state = np.einsum("bksu,ksug->bsug", weight, first_moment).reshape(
+            beliefs, -1, sensors
+        )
+        second_by_state = np.einsum("bksu,ksug->bsug", weight, second_moment).reshape(
+            beliefs, -1, sensors
+        )
+        mean = first_by_state.sum(axis=1)
+        variance = np.maximum(second_by_state.sum(axis=1) - mean**2, 0.0)
+        quantiles = _quantiles_by_state(by_state, first_by_state, second_by_state)
+
+        reward_mean, reward_standard_deviation = self.rewards.expectation_of(
+            weight, hypotheses.draw, controls, value, value_variance, observation
+        )
+        return Expectation(
+            mean=mean + center,
+            standard_deviation=np.sqrt(variance),
+            lower=quantiles[:, 0] + center,
+            upper=quantiles[:, 1] + center,
+            noise=self._expected_noise(hypotheses, weight, controls),
+            reward_mean=reward_mean,
+            reward_standard_deviation=reward_standard_deviation,
+        )
+
+    def _sensor_moments(self, hypotheses: StaticHypotheses, controls: slice) -> tuple[Float, Float]:
+        """Return mean and variance of each sensor's value without noise: (K, S, U', G), SI."""
+        sensor_model = self.learning.sensor_model
+        predicted = sensor_model.value_per_draw[:, :, controls][hypotheses.draw]
+        gain = _insert_state_and_control(hypotheses.gain)
+        offset = _insert_state_and_control(hypotheses.offset)
+        offset_variance = _insert_state_and_control(hypotheses.offset_variance)
+        covariance = _insert_state_and_control(hypotheses.covariance)
+        gain_variance = _insert_state_and_control(hypotheses.gain_variance)
+        value = predicted * (1.0 + gain) + offset
+        variance = offset_variance + predicted * (2.0 * covariance + predicted * gain_variance)
+        return value, variance
+
+    def _expected_noise(
+        self, hypotheses: StaticHypotheses, weight: Float, controls: slice
+    ) -> Float:
+        """Return the standard deviation (B, G) of noise and model error, SI."""
+        scale2 = _insert_state_and_control(hypotheses.squared_noise_scale)
+        deviation = self.learning.sensor_model.total_standard_deviation[:, controls]
+        beliefs, hypothesis_count, states, control_count = weight.shape
+        sensors = deviation.shape[-1]
+        variance = np.broadcast_to(
+            scale2 * deviation**2, (hypothesis_count, states, control_count, sensors)
+        )
+        return np.asarray(np.sqrt(weight.reshape(beliefs, -1) @ variance.reshape(-1, sensors)))
 
 
-def _believing(weight: Float, belief: Float) -> Float:
-    """Return p(k | D) of a joint belief (K, S) under another belief about the state (S,): (K, S)."""
-    own, apart = weight.sum(axis=0), np.tile(weight.sum(axis=1, keepdims=True), len(belief))
-    return np.asarray(belief * np.divide(weight, own, out=apart, where=own > 0.0))
+def _insert_state_and_control(values: Float) -> Float:
+    """Return values (K, G) as (K, 1, 1, G), beside states and controls."""
+    return values[:, None, None]
 
 
-def joined(parts: Iterable[Expected], by: Callable[[list[Float]], Float] = np.concatenate) -> Expected:
-    """Return what is expected of steps one after the other; by `np.array` each is a row of a leading axis."""
-    found = [vars(part) for part in parts]
-    return Expected(**{name: by([part[name] for part in found]) for name in found[0]})
+def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: Float) -> Float:
+    """Return quantiles (B, 2, G) of mixtures that are normal given state and control.
+
+    Parameters
+    ----------
+    probability : (B, N) array
+        The probability of each pair of a state and a control.
+    first_moment, second_moment : (B, N, G) array
+        Moments of each sensor, times that probability.
+    """
+    quantiles = np.empty((len(probability), len(_LEVELS), first_moment.shape[-1]))
+    for b in range(len(probability)):
+        considered = np.flatnonzero(probability[b] > _NEGLIGIBLE_PROBABILITY)
+        weight = probability[b, considered]
+        mean = first_moment[b, considered] / weight[:, None]
+        variance = np.maximum(second_moment[b, considered] / weight[:, None] - mean**2, 0.0)
+        quantiles[b] = mixture_quantiles(weight / weight.sum(), mean, np.sqrt(variance), _LEVELS)
+    return quantiles
+
+
+def _joint_with_marginal(joint: Float, belief: Float) -> Float:
+    """Return p(k | D) of a joint belief (K, S) times another belief about the state (S,): (K, S).
+
+    In a state that the joint belief rules out the hypotheses have their total weights.
+    """
+    marginal = joint.sum(axis=0)
+    hypothesis_given_state = np.tile(joint.sum(axis=1, keepdims=True), len(belief))
+    np.divide(joint, marginal, out=hypothesis_given_state, where=marginal > 0.0)
+    return np.asarray(belief * hypothesis_given_state)
+
+
+def concatenate_expectations(parts: Iterable[Expectation]) -> Expectation:
+    """Return the expectations of parts of a mission as one, along their leading axis."""
+    return _join_expectations(parts, np.concatenate)
+
+
+def stack_expectations(parts: Iterable[Expectation]) -> Expectation:
+    """Return expectations as the rows of a new leading axis."""
+    return _join_expectations(parts, np.array)
+
+
+def _join_expectations(
+    parts: Iterable[Expectation], join: Callable[[list[Float]], Float]
+) -> Expectation:
+    """Return one expectation with each array joined from those of the parts."""
+    parts = list(parts)
+    arrays = {
+        field.name: join([getattr(part, field.name) for part in parts])
+        for field in fields(Expectation)
+    }
+    return Expectation(**arrays)

@@ -1,23 +1,28 @@
-"""The filter that learns: static hypotheses as an axis of the belief, gauges by conjugate regression.
+"""The filter that learns: static hypotheses as an axis of the belief, gauges by regression.
 
-A static hypothesis k is a draw of the calibrated parameter and a factor on the transition probabilities; both
-stay what they are. Each has a filter of its own over the states, and its weight is its evidence:
+A static hypothesis k is a draw of the calibrated parameter and a factor on the transition
+probabilities; neither changes in time. Each hypothesis has a filter of its own over the states, and
+its weight is its evidence:
 
-    p(D_t, k | o_0..o_t) ~ p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
+    p(D_t, k | o_0..o_t) ~
+        p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
 
-which is exact. What a gauge has of its own, given the hypothesis, is a `GaugeRegression`.
+which is exact. The offset, gain and noise scale of a gauge, given the hypothesis, are learnt by a
+`GaugeRegression`.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv, gammaln, logsumexp, ndtr
+from scipy.special import gammaincinv, gammaln, logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation
-from twin_master.learning.regression import GaugeRegression
+from twin_master.learning.draw_posterior import INTERVAL, posterior_of_draws
+from twin_master.learning.regression import SUM_COUNT, GaugeFit, GaugeReadings, GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
@@ -25,135 +30,74 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
 from twin_master.scenario.tables import Learning
 
-INTERVAL = (0.05, 0.95)
-_POINTS = 801
-_REACH = 60.0
-"""Draws whose evidence lies this many nats below the best tell the spline nothing that counts."""
+_NEGLIGIBLE_WEIGHT = 1e-9
+"""A hypothesis with a smaller part of the belief is left out of predictions."""
+_NORMAL_HALF_WIDTH = 1.6448536269514722
+"""Half-width of the central 90 % of a normal distribution, in standard deviations."""
 
 
-def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -> Learnt:
-    """Return the posterior of a parameter whose draws have weights.
+class ParameterDraws(NamedTuple):
+    """The calibrated parameter: its name, and the value of each draw (E,)."""
 
-    The evidence of a draw is a smooth function of the parameter, and its logarithm nearly a parabola. When it
-    is narrower than the distance of the draws, their weights alone would give a point; so the log evidence is
-    interpolated between them by a cubic spline, and the prior by the straight lines of its distribution
-    function.
-
-    Parameters
-    ----------
-    values : (E,)
-        Draws.
-    prior, weight : (E,)
-        Their probabilities before and after the observations.
-    """
-    distinct, place = np.unique(np.asarray(values, dtype=np.float64), return_inverse=True)
-    before, after = (np.bincount(place, np.asarray(given, dtype=np.float64)) for given in (prior, weight))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        evidence = np.log(after) - np.log(before)
-    near = np.flatnonzero(evidence >= np.max(evidence[np.isfinite(evidence)]) - _REACH)
-    count = len(distinct)
-    if count < 4 or len(near) < 2:
-        mean, reached = float(after @ distinct), np.cumsum(after)
-        lower, upper = (float(distinct[np.searchsorted(reached, level * (1 - 1e-12))]) for level in INTERVAL)
-        return Learnt(mean, float(np.sqrt(after @ (distinct - mean) ** 2)), lower, upper)
-    first, end = max(int(near[0]) - 1, 0), min(int(near[-1]) + 2, count)
-    from scipy.interpolate import CubicSpline  # takes a while to load; only a twin that learns needs it
-
-    floor = np.min(evidence[near]) - _REACH
-    edges = np.concatenate([[distinct[0]], 0.5 * (distinct[1:] + distinct[:-1]), [distinct[-1]]])
-    edges[0] -= edges[1] - distinct[0]
-    edges[-1] += distinct[-1] - edges[-2]
-    grid = np.linspace(edges[first], edges[end], _POINTS)
-    middle = 0.5 * (grid[1:] + grid[:-1])
-    mass = np.diff(np.interp(grid, edges, np.concatenate([[0.0], np.cumsum(before)])))
-    # With fewer than four draws that count it is one polynomial.
-    log_evidence = CubicSpline(distinct[first:end], np.maximum(evidence[first:end], floor))(middle)
-    share = mass * np.exp(log_evidence - log_evidence.max())
-    share /= share.sum()
-    mean = float(share @ middle)
-    lower, upper = np.interp(INTERVAL, np.concatenate([[0.0], np.cumsum(share)]), grid)
-    deviation = float(np.sqrt(share @ (middle - mean) ** 2))
-    return Learnt(mean, deviation, float(lower), float(upper))
-
-
-_NEGLIGIBLE = 1e-9
-"""Share of a belief below which a hypothesis tells nothing."""
-HALVINGS = 18
-REACH = 6.5
-"""Standard deviations from the mean within which a quantile between 2.5 and 97.5 % lies, by Cantelli."""
+    name: str
+    values: ArrayLike
 
 
 @dataclass(frozen=True)
-class Hypotheses:
-    """Belief over state and static hypotheses, and what each hypothesis says of the G sensors.
+class StaticHypotheses:
+    """Joint belief over states and static hypotheses, and what each hypothesis says of the gauges.
 
     Attributes
     ----------
-    weight : (K, S)
-        p(D, k | observations).
-    draw : (K,)
-        Draw of the parameter of each hypothesis.
-    offset, gain : (K, G)
-        Posterior mean of offset [SI] and gain error [1] given the hypothesis.
-    covariance : (K, G, 3)
-        Variance of the offset, covariance, and variance of the gain error, the noise scale averaged.
-    scale2 : (K, G)
-        Posterior mean of the squared noise scale.
+    weight : (K, S) array
+        The belief p(D, k | observations).
+    draw : (K,) array
+        The index of the draw of each hypothesis.
+    offset : (K, G) array
+        The posterior mean of each offset given the hypothesis, SI.
+    gain : (K, G) array
+        The posterior mean of each gain error given the hypothesis, dimensionless.
+    offset_variance, covariance, gain_variance : (K, G) array
+        The posterior covariance of offset and gain error, averaged over the noise scale.
+    squared_noise_scale : (K, G) array
+        The posterior mean of the squared noise scale.
     """
 
     weight: Float
     draw: Index
     offset: Float
     gain: Float
+    offset_variance: Float
     covariance: Float
-    scale2: Float
-
-
-def quantiles_of(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:
-    """Return quantiles (P, G) of mixtures of N normal distributions.
-
-    weight is (N,), mean and deviation (N, G). Levels lie between 2.5 and 97.5 %.
-    """
-    center = weight @ mean
-    spread = np.sqrt(weight @ (deviation**2 + (mean - center) ** 2))
-    low, high = (np.tile(center + side * REACH * spread, (len(levels), 1)) for side in (-1.0, 1.0))
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        distance = middle[:, None] - mean
-        below = ndtr(np.divide(distance, deviation, out=np.copysign(np.inf, distance), where=deviation > 0.0))
-        over = np.einsum("n,png->pg", weight, below) >= levels[:, None]
-        low, high = np.where(over, low, middle), np.where(over, middle, high)
-    return high
-
-
-_NORMAL = 1.6448536269514722
-"""Half-width of the central 90 % of a normal distribution, in standard deviations."""
+    gain_variance: Float
+    squared_noise_scale: Float
 
 
 class LearningFilter:
     """Exact filter over states and static hypotheses, with a conjugate regression for each gauge.
 
-    It carries `log_belief` (K, S), the log of p(D_t, k | o_0..o_t), `statistics` (K, G, 6), the sums of the
-    regressions in units of the assumed noise, and `count` (G,), the observations of each sensor.
+    It carries `log_belief` (K, S), the log of p(D_t, k | o_0..o_t); `statistics` (K, G, 6), the
+    sums of the regressions (`RegressionSums`); and `count` (G,), the number of observations of each
+    sensor.
 
     Parameters
     ----------
     model : GraphicalModel
-        S states, U controls; its transitions are what the twin predicts and plans with.
+        S states, U controls; the twin predicts and plans with its transitions.
     sensor_model : GaussianSensorModel
-        Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
+        Predictions (E, S, U, G), weights of the draws, and the assumed noise.
     settings : Learning
-        The priors; of the transitions it is what is given here.
-    draws : (str, (E,)), optional
-        Name of the parameter of the draws, and its values in the order of the sensor model; without it the
-        draws are averaged anew in each step.
+        The priors of the gauges; the factors on transitions are those of `transitions`.
+    draws : (str, (E,) array), optional
+        The name of the calibrated parameter, and its values in the order of the sensor model. If
+        left out, the draws are averaged anew in each step.
     transitions : mapping of float to TransitionModel, optional
-        Those of each factor on the probabilities to leave a state, equally probable at first; those of the
-        model if left out.
+        For each factor on the probabilities to leave a state its transitions, equally probable at
+        first; only those of the model if left out.
     name : str
-        Name of the twin, for messages.
+        The name of the twin, for messages.
     sensor_units : sequence of str, optional
-        Of each sensor; "1" if left out.
+        The unit of each sensor; "1" if left out.
     """
 
     def __init__(
@@ -166,95 +110,151 @@ class LearningFilter:
         name: str = "twin",
         sensor_units: Sequence[str] = (),
     ) -> None:
-        moves = transitions or {1.0: model.transition}
-        self.model, self.sensor_model, self._name = model, sensor_model, name
-        self.draws, self._factors = draws, np.array([*moves])
-        count, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
-        self._units = sensor_units or ("1",) * sensors
-        blocks = zip(*(move.blocks for move in moves.values()), strict=True)
-        self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
-        self._draw: Index = np.tile(np.arange(count), factors)
-        self._first_control: Index = np.repeat(np.arange(factors), count) * len(model.controls)
-        with np.errstate(divide="ignore"):
-            self._log_weight: Float = np.log(np.tile(sensor_model.draw_weight / factors, factors))
-        self._inverse = 1.0 / sensor_model.independent_standard_deviation
-        offset, gain = (
-            np.broadcast_to(np.asarray(prior, np.float64), (sensors,)).copy()
-            for prior in (settings.gauge_offset, settings.gauge_gain)
+        transitions = transitions or {1.0: model.transition}
+        self.model = model
+        self.sensor_model = sensor_model
+        self.parameter = None if draws is None else ParameterDraws(*draws)
+        self._name = name
+        self._units = sensor_units or ("1",) * sensor_model.sensor_count
+        self._factors = np.array(list(transitions))
+
+        # Hypothesis k is draw k % E with factor k // E. The transitions of all factors stand one
+        # after the other as further controls, so that one loop advances all hypotheses.
+        factor_count = len(transitions)
+        blocks_by_factor = [transition.blocks for transition in transitions.values()]
+        stacked_blocks = tuple(
+            np.concatenate(blocks) for blocks in zip(*blocks_by_factor, strict=True)
         )
-        self._gauges = GaugeRegression(offset, gain, settings.noise_degrees if settings.noise else 0.0)
+        self._transition = TransitionModel(stacked_blocks)
+        self._draw: Index = np.tile(np.arange(sensor_model.draw_count), factor_count)
+        factor_index: Index = np.repeat(np.arange(factor_count), sensor_model.draw_count)
+        self._first_control = factor_index * len(model.controls)
+
+        prior_weight = np.tile(sensor_model.draw_weight / factor_count, factor_count)
+        with np.errstate(divide="ignore"):
+            self._log_weight: Float = np.log(prior_weight)
+        self._inverse_deviation = 1.0 / sensor_model.independent_standard_deviation
+        self._gauges = GaugeRegression(
+            offset_deviation=np.full(sensor_model.sensor_count, settings.gauge_offset, np.float64),
+            gain_deviation=np.full(sensor_model.sensor_count, settings.gauge_gain, np.float64),
+            degrees=settings.noise_degrees if settings.noise else 0.0,
+        )
 
     @property
     def prior(self) -> Mapping[str, Learnt]:
-        """What is believed of all that is learnt before the first observation, by name."""
+        """The prior of each learnt quantity, by name."""
         sensors = self.sensor_model.sensor_count
-        weight = np.exp(self._log_weight)[:, None]
-        return self._learnt(weight, np.zeros((len(weight), sensors, 6)), np.zeros(sensors))
+        weight = np.exp(self._log_weight)
+        statistics = np.zeros((len(weight), sensors, SUM_COUNT))
+        return self._learnt_quantities(weight, statistics, np.zeros(sensors))
 
-    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
-        """Advance belief and what is learnt to step t, and correct them by an observation.
+    def step(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
+        """Advance the joint belief to step t, and correct it by an observation.
 
-        See `Estimator.step`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
-        and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
+        Parameters and errors are those of `Estimator.step`. `learnt` of the estimate holds by name
+        the parameter, `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]` and
+        `gauge_offset[g]` for the sensors g from 1.
         """
-        seen, told = self.sensor_model.apart(observation)
+        sensor_values, log_density_beside = self.sensor_model.split_observation(observation)
         forecast, statistics, count = self._forecast(before)
-        value = self.sensor_model.value_per_draw[:, :, control_index]
-        inverse = self._inverse[:, control_index]
-        near = self.sensor_model.nearest(seen, control_index, value)
-        log_belief = forecast + told + near.log_density[self._draw]
-        log_belief += self._gauges.log_density(seen, self._draw, near.value, inverse, statistics, count)
+
+        # Correct the belief.
+        inverse_deviation = self._inverse_deviation[:, control_index]
+        best_fit = self.sensor_model.fit_within_interval(
+            sensor_values,
+            control_index,
+            self.sensor_model.value_per_draw[:, :, control_index],
+        )
+        readings = GaugeReadings(sensor_values, self._draw, best_fit.value, inverse_deviation)
+        log_belief = forecast + log_density_beside + best_fit.log_density[self._draw]
+        log_belief += self._gauges.log_density(readings, statistics, count)
+
+        # Normalise it.
         best = float(log_belief.max())
         if best == -np.inf:
-            worst = self.sensor_model.worst_residuals(seen, control_index)
+            worst = self.sensor_model.worst_residuals(sensor_values, control_index)
             raise ImpossibleObservation(self._name, step, worst)
         filtered = np.exp(log_belief - best)
-        evidence = best + float(np.log(filtered.sum()))
+        log_evidence = best + float(np.log(filtered.sum()))
         filtered /= filtered.sum()
-        log_belief -= evidence
+        log_belief -= log_evidence
+
+        # Update the regressions. Each gauge is compared with the fit by all other gauges, so that
+        # its own noise does not seem smaller than it is.
         if self._gauges.learns:
-            scale = inverse * np.sqrt(near.left)
-            statistics = statistics + self._gauges.told(seen, self._draw, near.alone, scale, log_belief)
-        count = count + ~np.isnan(seen)
+            predictive_scale = inverse_deviation * np.sqrt(best_fit.one_minus_leverage)
+            readings = GaugeReadings(
+                sensor_values, self._draw, best_fit.value_by_others, predictive_scale
+            )
+            statistics = statistics + self._gauges.expected_products(readings, log_belief)
+        count = count + ~np.isnan(sensor_values)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
             filtered=filtered.sum(axis=0),
-            log_evidence=evidence,
+            log_evidence=log_evidence,
             carried=Carried(control_index, arrays),
-            learnt=self._learnt(filtered, statistics, count),
+            learnt=self._learnt_quantities(filtered.sum(axis=1), statistics, count),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
-        """Return log p(D_t, k | o_0..o_t-1) (K, S), and statistics (K, G, 6) and counts (G,) until then."""
-        hypotheses, sensors = len(self._draw), self.sensor_model.sensor_count
+        """Return what is known before the observation of a step.
+
+        Returns
+        -------
+        log_forecast : (K, S) array
+            The log of p(D_t, k | o_0..o_t-1).
+        statistics : (K, G, 6) array
+            The sums of the regressions.
+        count : (G,) array
+            The number of observations of each sensor.
+        """
         if before is None:
-            forecast = self._log_weight[:, None] + self.model.log_prior
-            return forecast, np.zeros((hypotheses, sensors, 6)), np.zeros(sensors)
-        log_before = before.arrays["log_belief"]
-        forecast = log_forecast(self._transition, self._first_control + before.control_index, log_before)
-        if self.draws is None:
-            forecast = self._averaged_anew(forecast)
+            sensors = self.sensor_model.sensor_count
+            statistics = np.zeros((len(self._draw), sensors, SUM_COUNT))
+            return self._log_weight[:, None] + self.model.log_prior, statistics, np.zeros(sensors)
+        control = self._first_control + before.control_index
+        forecast = log_forecast(self._transition, control, before.arrays["log_belief"])
+        if self.parameter is None:
+            forecast = self._restore_draw_weights(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
-    def hypotheses(self, carried: Carried, weight: Float | None = None) -> Hypotheses:
-        """Return what is believed after a step of each hypothesis that tells something.
+    def hypotheses(self, carried: Carried, weight: Float | None = None) -> StaticHypotheses:
+        """Return the hypotheses after a step, without those of negligible weight.
 
-        Of other beliefs the weight (K, S) is given.
+        Parameters
+        ----------
+        carried : Carried
+            What the filter carried on from the step.
+        weight : (K, S) array, optional
+            Another joint belief, such as a smoothed one, in the place of the filtered one.
         """
-        weight = np.exp(carried.arrays["log_belief"]) if weight is None else weight
-        share = weight.sum(axis=1)
-        kept = np.flatnonzero(share > _NEGLIGIBLE * share.sum())
-        fitted = self._gauges.fitted(carried.arrays["statistics"][kept])
-        offset, gain = self._gauges.offset, self._gauges.gain
-        scale2 = self._gauges.scale2(fitted, carried.arrays["count"])
-        covariance = np.stack(
-            [offset**2 * fitted[..., 2], offset * gain * fitted[..., 3], gain**2 * fitted[..., 4]], axis=-1
+        if weight is None:
+            weight = np.exp(carried.arrays["log_belief"])
+        hypothesis_weight = weight.sum(axis=1)
+        is_considered = hypothesis_weight > _NEGLIGIBLE_WEIGHT * hypothesis_weight.sum()
+        considered = np.flatnonzero(is_considered)
+
+        fit = self._gauges.fit(carried.arrays["statistics"][considered])
+        offset_deviation = self._gauges.offset_deviation
+        gain_deviation = self._gauges.gain_deviation
+        scale2 = self._gauges.squared_noise_scale(fit, carried.arrays["count"])
+        # From prior standard deviations to SI.
+        offset_variance = offset_deviation**2 * fit.offset_variance
+        covariance = offset_deviation * gain_deviation * fit.covariance
+        gain_variance = gain_deviation**2 * fit.gain_variance
+        return StaticHypotheses(
+            weight=weight[considered],
+            draw=self._draw[considered],
+            offset=offset_deviation * fit.offset,
+            gain=gain_deviation * fit.gain,
+            offset_variance=scale2 * offset_variance,
+            covariance=scale2 * covariance,
+            gain_variance=scale2 * gain_variance,
+            squared_noise_scale=scale2,
         )
-        return Hypotheses(
-            weight[kept], self._draw[kept], offset * fitted[..., 0], gain * fitted[..., 1],
-            scale2[..., None] * covariance, scale2,
-        )  # fmt: skip
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
@@ -265,64 +265,138 @@ class LearningFilter:
         result = np.zeros((len(carried), len(self._draw), self.model.states.size))
         if not len(carried):
             return result
-        rows = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
-        if self.draws is None and len(self._draw) > 1:
-            rows = np.stack([self._averaged_anew(row) for row in rows])
-        weight = np.exp(rows[-1]).sum(axis=1)
-        held = np.flatnonzero(weight > 0.0)
-        own = rows[:, held] - logsumexp(rows[:, held], axis=2, keepdims=True)
-        control = self._first_control[held, None] + np.array([step.control_index for step in carried])
-        own = np.ascontiguousarray(own.swapaxes(0, 1))
-        parts = smooth_many(self._transition, control, np.exp(own), own)
-        result[:, held] = weight[held, None] * parts.swapaxes(0, 1)
+        log_belief = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
+        if self.parameter is None and len(self._draw) > 1:
+            log_belief = np.stack([self._restore_draw_weights(row) for row in log_belief])
+
+        # Given its hypothesis each filter is smoothed by itself; the weights are those of the end.
+        weight = np.exp(log_belief[-1]).sum(axis=1)
+        possible = np.flatnonzero(weight > 0.0)
+        log_given_hypothesis = log_belief[:, possible] - logsumexp(
+            log_belief[:, possible], axis=2, keepdims=True
+        )
+        step_controls = np.array([step.control_index for step in carried])
+        control = self._first_control[possible, None] + step_controls
+        log_given_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
+        smoothed = smooth_many(
+            self._transition, control, np.exp(log_given_hypothesis), log_given_hypothesis
+        )
+        result[:, possible] = weight[possible, None] * smoothed.swapaxes(0, 1)
         return result
 
-    def _averaged_anew(self, log_belief: Float) -> Float:
-        """Return a belief (K, S) in which the draws have their first weights again, whatever the state."""
-        factors = len(self._factors)
-        by_factor = log_belief.reshape(factors, -1, log_belief.shape[1])
-        merged = np.repeat(np.logaddexp.reduce(by_factor, axis=1), by_factor.shape[1], axis=0)
-        return np.asarray(merged + self._log_weight[:, None] + np.log(factors))
+    def _restore_draw_weights(self, log_belief: Float) -> Float:
+        """Give the draws of a log belief (K, S) their prior weights again, in every state.
 
-    def _learnt(self, filtered: Float, statistics: Float, count: Float) -> Mapping[str, Learnt]:
-        """Return the posterior of everything that is learnt."""
-        weight = filtered.sum(axis=1)  # of each hypothesis
+        The weights of the transition factors stay as they are.
+        """
+        factor_count = len(self._factors)
+        by_factor = log_belief.reshape(factor_count, -1, log_belief.shape[1])  # (factors, E, S)
+        draw_count = by_factor.shape[1]
+        log_factor_belief = np.repeat(np.logaddexp.reduce(by_factor, axis=1), draw_count, axis=0)
+        # The prior weights are those of draw and factor; times the factors they are of the draw.
+        return np.asarray(log_factor_belief + self._log_weight[:, None] + np.log(factor_count))
+
+    def _learnt_quantities(
+        self, weight: Float, statistics: Float, count: Float
+    ) -> Mapping[str, Learnt]:
+        """Return the posterior of each learnt quantity by name.
+
+        Parameters
+        ----------
+        weight : (K,) array
+            The probability of each hypothesis.
+        statistics : (K, G, 6) array
+            The sums of the regressions.
+        count : (G,) array
+            The number of observations of each sensor.
+        """
+        factor_count = len(self._factors)
+        by_factor = weight.reshape(factor_count, -1)  # (factors, E)
         result: dict[str, Learnt] = {}
-        factors = self._factors
-        if self.draws is not None:
-            name, values = self.draws
-            own, prior = weight.reshape(len(factors), -1).sum(axis=0), self.sensor_model.draw_weight
-            result[name] = posterior_of_draws(values, prior, own)
-        if len(factors) > 1:
-            own = weight.reshape(len(factors), -1).sum(axis=1)
-            prior = np.full(len(factors), 1.0 / len(factors))
-            result["transition_factor"] = posterior_of_draws(factors, prior, own)
+        if self.parameter is not None:
+            result[self.parameter.name] = posterior_of_draws(
+                self.parameter.values, self.sensor_model.draw_weight, by_factor.sum(axis=0)
+            )
+        if factor_count > 1:
+            prior = np.full(factor_count, 1.0 / factor_count)
+            result["transition_factor"] = posterior_of_draws(
+                self._factors, prior, by_factor.sum(axis=1)
+            )
         if self._gauges.learns:
-            result |= self._learnt_of_gauges(weight, statistics, count)
+            fit = self._gauges.fit(statistics)
+            if self._gauges.degrees > 0.0:
+                result |= self._learnt_noise_scales(weight, fit, count)
+            result |= self._learnt_offsets_and_gains(weight, fit, count)
         return result
 
-    def _learnt_of_gauges(self, weight: Float, statistics: Float, count: Float) -> dict[str, Learnt]:
-        fitted, degrees = self._gauges.fitted(statistics), self._gauges.degrees
-        result: dict[str, Learnt] = {}
-        scale2 = self._gauges.scale2(fitted, count)
-        if degrees > 0.0:
-            shape, left = 0.5 * (degrees + count), 0.5 * (degrees + fitted[..., 5])
-            # The square is inverse gamma (shape, left) given a hypothesis: the moments of its root over all
-            # of them, and its quantiles as if they were one.
-            low, high = (np.sqrt(weight @ left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
-            mean = weight @ np.sqrt(left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
-            deviation = np.sqrt(np.maximum(weight @ left / (shape - 1.0) - mean**2, 0.0))
-            for g, figures in enumerate(np.column_stack([mean, deviation, low, high]).tolist(), 1):
-                result[f"noise_scale[{g}]"] = Learnt(*figures)
-        for column, prior, name, units in (
-            (0, self._gauges.offset, "gauge_offset", self._units),
-            (1, self._gauges.gain, "gauge_gain", ("1",) * len(self._units)),
-        ):
-            mean = weight @ fitted[..., column]
-            spread = weight @ (fitted[..., column] ** 2 + scale2 * fitted[..., 2 + 2 * column]) - mean**2
-            deviation = np.sqrt(np.maximum(spread, 0.0))
-            for g in np.flatnonzero(prior > 0.0).tolist():
-                own, wide = float(mean[g] * prior[g]), float(deviation[g] * prior[g])
-                low, high = own - _NORMAL * wide, own + _NORMAL * wide
-                result[f"{name}[{g + 1}]"] = Learnt(own, wide, low, high, units[g])
-        return result
+    def _learnt_noise_scales(self, weight: Float, fit: GaugeFit, count: Float) -> dict[str, Learnt]:
+        """Return the posterior of each noise scale, given the weights (K,) of the hypotheses.
+
+        The square of a scale is inverse gamma (shape, rate) given a hypothesis. The moments of the
+        scale are those over all hypotheses; its quantiles are those of the mean rate.
+        """
+        degrees = self._gauges.degrees
+        shape = 0.5 * (degrees + count)
+        rate = 0.5 * (degrees + fit.residual_squares)
+        low_level, high_level = INTERVAL
+        # A large gamma variate belongs to a small scale: the levels change places.
+        lower = np.sqrt(weight @ rate / gammaincinv(shape, high_level))
+        upper = np.sqrt(weight @ rate / gammaincinv(shape, low_level))
+        mean = weight @ np.sqrt(rate) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
+        variance = np.maximum(weight @ rate / (shape - 1.0) - mean**2, 0.0)
+        deviation = np.sqrt(variance)
+        return {
+            f"noise_scale[{g + 1}]": Learnt(
+                float(mean[g]), float(deviation[g]), float(lower[g]), float(upper[g])
+            )
+            for g in range(len(mean))
+        }
+
+    def _learnt_offsets_and_gains(
+        self, weight: Float, fit: GaugeFit, count: Float
+    ) -> dict[str, Learnt]:
+        """Return the posterior of each offset and gain error, given the weights (K,)."""
+        scale2 = self._gauges.squared_noise_scale(fit, count)
+        offsets = _learnt_coefficients(
+            "gauge_offset",
+            self._units,
+            self._gauges.offset_deviation,
+            mean=weight @ fit.offset,
+            mean_square=weight @ (fit.offset**2 + scale2 * fit.offset_variance),
+        )
+        gains = _learnt_coefficients(
+            "gauge_gain",
+            ("1",) * len(self._units),
+            self._gauges.gain_deviation,
+            mean=weight @ fit.gain,
+            mean_square=weight @ (fit.gain**2 + scale2 * fit.gain_variance),
+        )
+        return offsets | gains
+
+
+def _learnt_coefficients(
+    name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
+) -> dict[str, Learnt]:
+    """Return the posterior of one coefficient of each gauge that learns it, as `name[g]` from 1.
+
+    Parameters
+    ----------
+    name : str
+        The name of the coefficient.
+    units : sequence of str
+        The unit of each gauge's coefficient.
+    prior_deviation : (G,) array
+        The prior standard deviation, in that unit; a gauge with 0 does not learn it.
+    mean, mean_square : (G,) array
+        Posterior moments of the coefficient in prior standard deviations.
+    """
+    deviation = np.sqrt(np.maximum(mean_square - mean**2, 0.0))
+    result = {}
+    for g in np.flatnonzero(prior_deviation > 0.0).tolist():
+        center = float(mean[g] * prior_deviation[g])
+        standard_deviation = float(deviation[g] * prior_deviation[g])
+        half_width = _NORMAL_HALF_WIDTH * standard_deviation
+        result[f"{name}[{g + 1}]"] = Learnt(
+            center, standard_deviation, center - half_width, center + half_width, units[g]
+        )
+    return result

@@ -1,12 +1,20 @@
-"""What each gauge has of its own: offset, gain and noise scale by a conjugate regression.
+"""The conjugate regression of each gauge: its offset, its gain error and its noise scale.
 
     o_g = h_g(D_t, k) (1 + gain_g) + offset_g + lambda_g sigma_g noise,
     lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),
     offset_g, gain_g | lambda_g ~ N(0, lambda_g² times their prior variance),
 
-so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section 14.2).
-Its sums are exact given the path of the state; over the paths they are expected sums, under the filtered
-belief of each step given the hypothesis.
+so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section
+14.2). The sums of the regression are exact if the path of the state is known. It is not, so each
+step adds expected products, under the filtered belief of that step given the hypothesis.
+
+In all formulas of this module a gauge is measured in units of its assumed noise sigma_g:
+
+    x = (observation - prediction) / sigma,
+    a = prior standard deviation of the offset / sigma,
+    c = prior standard deviation of the gain error times the prediction / sigma,
+
+so that x = a u + c v + lambda noise, and the coefficients u and v have the prior N(0, lambda²).
 """
 
 from dataclasses import dataclass
@@ -18,168 +26,300 @@ from scipy.special import gammaln
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 
-LARGE = 1e100
-"""A product is taken to the logarithm above this."""
-NEGLIGIBLE = -70.0
-"""States this many nats below the best of a hypothesis add nothing that doubles can hold."""
+LARGEST_PRODUCT = 1e100
+"""A larger product of factors is replaced by its logarithm, so that it cannot overflow."""
+NEGLIGIBLE_LOG_WEIGHT = -70.0
+"""A state this far below the best one of its hypothesis adds nothing that a double holds."""
+SUM_COUNT = 6
+"""Number of sums that a regression of two coefficients keeps."""
 
 
-class Compared(NamedTuple):
-    """One observation beside what each draw predicts in each state, and what may be learnt of the gauges.
+class GaugeReadings(NamedTuple):
+    """One observation beside its predictions by each draw in each state.
 
     Attributes
     ----------
-    seen : (G,)
-        SI; NaN where a sensor is lost.
-    draw : (K,)
-        Of each hypothesis.
-    value : (E, S, G)
-        Predictions of each draw, SI.
-    inverse : (S, G)
-        Of the assumed standard deviation.
-    offset, gain : (G,)
-        Those of `GaugeRegression`.
+    observation : (G,) array
+        Sensor values, SI; NaN where a sensor is lost.
+    draw : (K,) array
+        The index of the draw of each hypothesis.
+    prediction : (E, S, G) array
+        Predicted values of each draw in each state, SI.
+    inverse_deviation : (S, G) array
+        One over the assumed standard deviation of the noise, 1/SI.
     """
 
-    seen: Float
+    observation: Float
     draw: Index
-    value: Float
-    inverse: Float
+    prediction: Float
+    inverse_deviation: Float
+
+
+class RegressionSums(NamedTuple):
+    """Sums of products over all observations, each (K, G).
+
+    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain: `cx` is the sum of c x.
+
+    An array (K, G, 6) holds them in this order along its last axis.
+    """
+
+    aa: Float
+    ac: Float
+    cc: Float
+    ax: Float
+    cx: Float
+    xx: Float
+
+    @classmethod
+    def view(cls, array: Float) -> "RegressionSums":
+        """Return the sums that an array (K, G, 6) holds, without a copy."""
+        return cls._make(np.moveaxis(array, -1, 0))
+
+
+class GaugeFit(NamedTuple):
+    """Posterior of the two coefficients of each gauge, each field (K, G).
+
+    Offset and gain are the coefficients u and v of the module: they are in prior standard
+    deviations, and their variances are those for a noise scale of one.
+
+    Attributes
+    ----------
+    offset, gain : (K, G) array
+        Posterior means.
+    offset_variance, covariance, gain_variance : (K, G) array
+        Posterior covariance of the two.
+    residual_squares : (K, G) array
+        Sum of the squares that the fitted coefficients leave unexplained.
+    """
+
     offset: Float
     gain: Float
+    offset_variance: Float
+    covariance: Float
+    gain_variance: Float
+    residual_squares: Float
 
 
 @dataclass(frozen=True)
 class GaugeRegression:
     """The priors of the regressions of G gauges.
 
-    Their sums over what was observed are `statistics` (K, G, 6) for each of K hypotheses: of a², ac, c², ax,
-    cx and x² in units of the assumed noise, where x is what a gauge shows beyond its prediction, and a and c
-    what it is changed by when offset and gain are one prior standard deviation.
-
     Attributes
     ----------
-    offset, gain : (G,)
-        Prior standard deviations, SI and dimensionless; 0 is not learnt.
+    offset_deviation : (G,) array
+        Prior standard deviation of the offset, SI; a gauge with 0 learns no offset.
+    gain_deviation : (G,) array
+        Prior standard deviation of the gain error, dimensionless; a gauge with 0 learns no gain.
     degrees : float
-        Degrees of freedom of the noise scale; 0 takes the assumed noise for known.
+        Degrees of freedom of the prior of the noise scale; with 0 the noise is as assumed.
     """
 
-    offset: Float
-    gain: Float
+    offset_deviation: Float
+    gain_deviation: Float
     degrees: float
 
     @property
     def learns(self) -> bool:
-        """Whether anything is learnt of the gauges."""
-        return self.degrees > 0.0 or bool(np.any(self.gain > 0.0) or np.any(self.offset > 0.0))
-
-    def fitted(self, statistics: Float) -> Float:
-        """Return coefficients (2), their covariance (3) and the squares that they leave: (K, G, 6)."""
-        aa, ac, cc, ax, cx, xx = np.moveaxis(statistics, -1, 0)
-        first, second = 1.0 + aa, 1.0 + cc
-        determinant = first * second - ac**2
-        offset, gain = (second * ax - ac * cx) / determinant, (first * cx - ac * ax) / determinant
-        left = np.maximum(xx - ax * offset - cx * gain, 0.0)
-        return np.stack(
-            [offset, gain, second / determinant, -ac / determinant, first / determinant, left], axis=-1
+        """Whether anything about the gauges is learnt."""
+        learns_coefficients = np.any(self.gain_deviation > 0.0) or np.any(
+            self.offset_deviation > 0.0
         )
+        return self.degrees > 0.0 or bool(learns_coefficients)
 
-    def scale2(self, fitted: Float, count: Float) -> Float:
-        """Return the posterior mean of the squared noise scale of each hypothesis and sensor: (K, G)."""
-        if not self.degrees > 0.0:
-            return np.ones_like(fitted[..., 5])
-        return np.asarray((self.degrees + fitted[..., 5]) / np.maximum(self.degrees + count - 2.0, 1.0))
+    def fit(self, statistics: Float) -> GaugeFit:
+        """Return the posterior of offset and gain, given the sums (K, G, 6) of a regression."""
+        sums = RegressionSums.view(statistics)
+        # Invert the precision matrix [[1 + aa, ac], [ac, 1 + cc]].
+        offset_precision = 1.0 + sums.aa
+        gain_precision = 1.0 + sums.cc
+        determinant = offset_precision * gain_precision - sums.ac**2
 
-    def log_density(
-        self, seen: Float, draw: Index, value: Float, inverse: Float, statistics: Float, count: Float
-    ) -> Float:
-        """Return log p(o | state, hypothesis, what was observed before): (K, S).
+        offset = (gain_precision * sums.ax - sums.ac * sums.cx) / determinant
+        gain = (offset_precision * sums.cx - sums.ac * sums.ax) / determinant
+        residual_squares = np.maximum(sums.xx - sums.ax * offset - sums.cx * gain, 0.0)
+        fields = [
+            offset,
+            gain,
+            gain_precision / determinant,
+            -sums.ac / determinant,
+            offset_precision / determinant,
+            residual_squares,
+        ]
+        # Views of one array, as the sums are. A mean over hypotheses of such a view does not depend
+        # on a library of linear algebra.
+        return GaugeFit._make(np.moveaxis(np.stack(fields, axis=-1), -1, 0))
+
+    def squared_noise_scale(self, fit: GaugeFit, count: Float) -> Float:
+        """Return the posterior mean of each squared noise scale lambda², (K, G).
 
         Parameters
         ----------
-        seen, draw, value, inverse
-            As `Compared` has them.
-        statistics : (K, G, 6)
-        count : (G,)
-            Of the observations before.
+        fit : GaugeFit
+            The posterior of the coefficients.
+        count : (G,) array
+            The number of observations of each gauge.
         """
-        there, fitted = ~np.isnan(seen), self.fitted(statistics)
-        density: Float = np.full(len(seen), -0.5 * np.log(2.0 * np.pi))
+        if not self.degrees > 0.0:
+            return np.ones_like(fit.residual_squares)
+        # The mean of an inverse gamma distribution exists above two degrees of freedom.
+        degrees_above_two = np.maximum(self.degrees + count - 2.0, 1.0)
+        return np.asarray((self.degrees + fit.residual_squares) / degrees_above_two)
+
+    def log_density(self, readings: GaugeReadings, statistics: Float, count: Float) -> Float:
+        """Return the log predictive density of an observation in each state: (K, S).
+
+        Parameters
+        ----------
+        readings : GaugeReadings
+            The observation and its predictions.
+        statistics : (K, G, 6) array
+            The sums of the regressions over earlier observations.
+        count : (G,) array
+            The number of earlier observations of each gauge.
+        """
+        present = ~np.isnan(readings.observation)
+        fit = self.fit(statistics)
+        # The factors of the density that do not depend on the state.
+        log_constant: Float = np.full(len(present), -0.5 * np.log(2.0 * np.pi))
         if self.degrees > 0.0:
             power = 0.5 * (self.degrees + count + 1.0)
-            density = gammaln(power) - gammaln(power - 0.5)
-            density = density - 0.5 * np.log(np.pi * (self.degrees + fitted[..., 5]))
-        result = np.empty((len(draw), value.shape[1]))
-        result[:] = np.sum(density, axis=-1, where=there)[..., None]
-        result += np.log(inverse[:, there]).sum(axis=1)
-        shown = Compared(seen, draw, value, inverse, self.offset, self.gain)
-        _add_densities(shown, fitted, self.degrees, count, result)
+            log_constant = gammaln(power) - gammaln(power - 0.5)
+            log_constant = log_constant - 0.5 * np.log(
+                np.pi * (self.degrees + fit.residual_squares)
+            )
+        result = np.empty((len(readings.draw), readings.prediction.shape[1]))
+        result[:] = np.sum(log_constant, axis=-1, where=present)[..., None]
+        result += np.log(readings.inverse_deviation[:, present]).sum(axis=1)
+        # The factors that do. The loop is faster on contiguous arrays.
+        contiguous_fit = GaugeFit._make(map(np.ascontiguousarray, fit))
+        _add_log_densities(
+            readings,
+            self.offset_deviation,
+            self.gain_deviation,
+            contiguous_fit,
+            self.degrees,
+            count,
+            result,
+        )
         return result
 
-    def told(self, seen: Float, draw: Index, value: Float, inverse: Float, log_weight: Float) -> Float:
-        """Return what an observation adds to the statistics (K, G, 6), expected over the state.
+    def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
+        """Return what an observation adds to the sums (K, G, 6), expected over the state.
 
-        Parameters are those of `log_density`; log_weight is (K, S), of a state given the hypothesis but for a
-        constant of it.
+        Parameters
+        ----------
+        readings : GaugeReadings
+            The observation and its predictions.
+        log_weight : (K, S) array
+            The log probability of each state given the hypothesis, up to a constant of the
+            hypothesis.
         """
-        result = np.zeros((len(draw), len(seen), 6))
-        _expect(Compared(seen, draw, value, inverse, self.offset, self.gain), log_weight, result)
-        return result
+        sums = np.zeros((SUM_COUNT, len(readings.draw), len(readings.observation)))
+        _add_expected_products(
+            readings,
+            self.offset_deviation,
+            self.gain_deviation,
+            log_weight,
+            RegressionSums._make(sums),
+        )
+        return np.ascontiguousarray(np.moveaxis(sums, 0, -1))
 
 
 @compiled
-def _add_densities(shown: Compared, fitted: Float, degrees: float, count: Float, result: Float) -> None:
-    """Add to result (K, S) what the densities of all gauges have of the state.
+def _add_log_densities(
+    readings: GaugeReadings,
+    offset_deviation: Float,
+    gain_deviation: Float,
+    fit: GaugeFit,
+    degrees: float,
+    count: Float,
+    result: Float,
+) -> None:
+    """Add the factors of the predictive density that depend on the state to result (K, S).
 
-    Factors are multiplied, those of Student's densities of the same degrees, before a logarithm is taken,
-    which is what costs.
+    Of a gauge, x is the standardised residual that the fitted offset and gain leave, and a and c
+    are the changes of its standardised value by one prior standard deviation of offset and gain.
+
+    A logarithm is what costs time here. So the factors of gauges whose densities have the same
+    power are multiplied, and the logarithm is taken of the product.
     """
-    seen, draw, value, inverse, offset, gain = shown
+    observation, draw, prediction, inverse_deviation = readings
     for k in range(result.shape[0]):
         for s in range(result.shape[1]):
-            total, product, half, wide = 0.0, 1.0, 0.0, 1.0
-            for g in range(len(seen)):
-                if np.isnan(seen[g]):
+            total = 0.0
+            # Products over gauges of the same power: Student's kernels, and predictive variances.
+            kernel_product = 1.0
+            variance_product = 1.0
+            product_power = 0.0
+            for g in range(len(observation)):
+                if np.isnan(observation[g]):
                     continue
-                scale, predicted = inverse[s, g], value[draw[k], s, g]
-                a, c = offset[g] * scale, gain[g] * predicted * scale
-                x = (seen[g] - predicted) * scale - a * fitted[k, g, 0] - c * fitted[k, g, 1]
-                spread = 1.0 + a * (a * fitted[k, g, 2] + 2.0 * c * fitted[k, g, 3]) + c * c * fitted[k, g, 4]
+                scale = inverse_deviation[s, g]
+                predicted = prediction[draw[k], s, g]
+                a = offset_deviation[g] * scale
+                c = gain_deviation[g] * predicted * scale
+                x = (observation[g] - predicted) * scale - a * fit.offset[k, g] - c * fit.gain[k, g]
+                variance = (
+                    1.0
+                    + a * (a * fit.offset_variance[k, g] + 2.0 * c * fit.covariance[k, g])
+                    + c * c * fit.gain_variance[k, g]
+                )
                 power = 0.5 * (degrees + count[g] + 1.0) if degrees > 0.0 else 0.0
-                if power != half or product > LARGE or wide > LARGE:
-                    total -= half * np.log(product) + 0.5 * np.log(wide)
-                    product, half, wide = 1.0, power, 1.0
-                wide *= spread
+                too_large = kernel_product > LARGEST_PRODUCT or variance_product > LARGEST_PRODUCT
+                if power != product_power or too_large:
+                    total -= product_power * np.log(kernel_product) + 0.5 * np.log(variance_product)
+                    kernel_product = 1.0
+                    variance_product = 1.0
+                    product_power = power
+                variance_product *= variance
                 if degrees > 0.0:
-                    product *= 1.0 + x * x / ((degrees + fitted[k, g, 5]) * spread)
+                    scaled_variance = (degrees + fit.residual_squares[k, g]) * variance
+                    kernel_product *= 1.0 + x * x / scaled_variance
                 else:
-                    total -= 0.5 * x * x / spread
-            result[k, s] += total - half * np.log(product) - 0.5 * np.log(wide)
+                    total -= 0.5 * x * x / variance
+            log_kernels = product_power * np.log(kernel_product)
+            result[k, s] += total - log_kernels - 0.5 * np.log(variance_product)
 
 
 @compiled
-def _expect(shown: Compared, log_weight: Float, result: Float) -> None:
-    """Add to result (K, G, 6) the products of a, c and x of each gauge, expected over the state."""
-    seen, draw, value, inverse, offset, gain = shown
+def _add_expected_products(
+    readings: GaugeReadings,
+    offset_deviation: Float,
+    gain_deviation: Float,
+    log_weight: Float,
+    sums: RegressionSums,
+) -> None:
+    """Add the products of a, c and x of each gauge, expected over the state, to sums (K, G).
+
+    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain.
+    """
+    observation, draw, prediction, inverse_deviation = readings
     weight = np.empty(log_weight.shape[1])
     for k in range(len(draw)):
         best = np.max(log_weight[k])
         if best == -np.inf:
             continue
+        # Probability of each state given the hypothesis.
         for s in range(len(weight)):
-            weight[s] = np.exp(max(log_weight[k, s] - best, NEGLIGIBLE))
+            weight[s] = np.exp(max(log_weight[k, s] - best, NEGLIGIBLE_LOG_WEIGHT))
         weight /= weight.sum()
+        # Sum of the products over states.
         for s in range(len(weight)):
-            if log_weight[k, s] - best <= NEGLIGIBLE:
+            if log_weight[k, s] - best <= NEGLIGIBLE_LOG_WEIGHT:
                 continue
-            for g in range(len(seen)):
-                if not np.isnan(seen[g]):
-                    predicted, scale = value[draw[k], s, g], inverse[s, g]
-                    a, c, x = offset[g] * scale, gain[g] * predicted * scale, (seen[g] - predicted) * scale
-                    result[k, g, 0] += weight[s] * a * a
-                    result[k, g, 1] += weight[s] * a * c
-                    result[k, g, 2] += weight[s] * c * c
-                    result[k, g, 3] += weight[s] * a * x
-                    result[k, g, 4] += weight[s] * c * x
-                    result[k, g, 5] += weight[s] * x * x
+            for g in range(len(observation)):
+                if np.isnan(observation[g]):
+                    continue
+                predicted = prediction[draw[k], s, g]
+                scale = inverse_deviation[s, g]
+                a = offset_deviation[g] * scale
+                c = gain_deviation[g] * predicted * scale
+                x = (observation[g] - predicted) * scale
+                sums.aa[k, g] += weight[s] * a * a
+                sums.ac[k, g] += weight[s] * a * c
+                sums.cc[k, g] += weight[s] * c * c
+                sums.ax[k, g] += weight[s] * a * x
+                sums.cx[k, g] += weight[s] * c * x
+                sums.xx[k, g] += weight[s] * x * x

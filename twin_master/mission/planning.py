@@ -12,16 +12,12 @@ from numpy.typing import ArrayLike
 from reporting.arrays import Float, Index
 from reporting.words import comma_list
 from twin_master.errors import PlanningError
-from twin_master.network.belief_planning import (
-    BeliefPlan,
-    Decide,
-    DecisionProblem,
-    plan_on_belief,
-    simulated_returns,
-)
+from twin_master.network.belief_planning import BeliefPlan, plan_on_belief
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.quantity import RewardModel
+from twin_master.network.simulated_missions import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -172,7 +168,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         if isinstance(content, np.ndarray):
             return model.policy(content)
         with content:
-            policy = BeliefPolicy.of(content)
+            policy = BeliefPolicy.from_arrays(content)
             controls = tuple(content["controls"].tolist())
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         reason: object = error

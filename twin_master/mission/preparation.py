@@ -27,13 +27,19 @@ from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.steps import Plant, Truth
-from twin_master.network.belief_planning import DecisionProblem
-from twin_master.network.estimator import Estimator, ExactFilter, Words
+from twin_master.network.decision_problem import DecisionProblem
+from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
+from twin_master.network.observation_classes import observation_classes
+from twin_master.network.planner import (
+    BeliefPolicy,
+    PlannedPolicy,
+    evaluate_policy,
+    value_iteration,
+)
 from twin_master.network.quantity import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel, check_noise, observation_classes
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
@@ -96,7 +102,7 @@ class Knowledge:
             make_sensor_model = _inspected_sensor_model(self.scenario, self.model)
         interval = None
         if section.between_levels:
-            interval = self.model.states.within_interval(self.predicted.mean(axis=0))
+            interval = self.model.states.change_within_interval(self.predicted.mean(axis=0))
         return make_sensor_model(
             self.predicted,
             section.standard_deviation,
@@ -138,7 +144,7 @@ class Knowledge:
         discount = discounts(self.scenario)
         if self.policy is not None and not isinstance(self.policy, BeliefPolicy):
             policy = self.model.policy(self.policy)
-            return given_policy(transition, self.planning_reward, discount, policy)
+            return evaluate_policy(transition, self.planning_reward, discount, policy)
         plan = value_iteration(transition, self.planning_reward, discount)
         return replace(plan, on_belief=self._belief_policy(plan))
 
@@ -226,7 +232,7 @@ class Knowledge:
             self.sensor_model,
             self.draws.values,
             scenario.notice,
-            Words.of(scenario),
+            NoticeWording.of(scenario),
         )
 
     @cached_property
@@ -336,7 +342,7 @@ def _inspected_sensor_model(
     if scenario.observation.between_levels:
         # The standard deviation of each factor inside the interval that its level stands for: the
         # last two axes of the changes are the factor that changes and the factor that is moved.
-        within_level = np.einsum("sff->sf", model.states.within_interval(coordinates))
+        within_level = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
     return partial(
         InspectedSensorModel,
         asked_by=controls,
@@ -514,7 +520,7 @@ def load_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
             if "true" in stored:
                 true_values = np.asarray(stored["true"], dtype=np.float64)
             if "belief_control" in stored:
-                policy = BeliefPolicy.of(stored, "belief_")
+                policy = BeliefPolicy.from_arrays(stored, "belief_")
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter,

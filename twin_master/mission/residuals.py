@@ -6,7 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.learning.expectation import Expected, expected_of, joined
+from twin_master.learning.expectation import (
+    Expectation,
+    concatenate_expectations,
+    expectation_of_draws,
+)
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, spans_of_models
 from twin_master.mission.steps import History
@@ -15,7 +19,7 @@ from twin_master.network.inference import known_control
 
 def expected_in_steps(
     history: History, knowledge: Knowledge, belief: Float, *, smoothed: bool
-) -> Expected:
+) -> Expectation:
     """Return the observations and rewards that are expected in the steps of a history.
 
     Parameters
@@ -32,7 +36,7 @@ def expected_in_steps(
     learnt_expectation = knowledge.expectation
     if learnt_expectation is None:
         joint = known_control(belief, history.control_index, len(knowledge.model.controls))
-        return expected_of(
+        return expectation_of_draws(
             knowledge.sensor_model, knowledge.rewards, joint, history.observation_rows
         )
     carried = [step.twin_step.carried for step in history.steps]
@@ -43,7 +47,7 @@ def expected_in_steps(
 
 def expected_ahead(
     history: History, knowledge: Knowledge, predicted: Float
-) -> tuple[Expected, Float]:
+) -> tuple[Expectation, Float]:
     """Return what is expected after each step of a history, in the H steps to come.
 
     Parameters
@@ -57,7 +61,7 @@ def expected_ahead(
 
     Returns
     -------
-    Expected
+    Expectation
         The observations and rewards; their leading axes are (T, H).
     (T, H, U) array
         The probability of each control.
@@ -67,7 +71,7 @@ def expected_ahead(
     control_probability = joint.sum(axis=-2)
     learnt_expectation = knowledge.expectation
     if learnt_expectation is None:
-        expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, None)
+        expected = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, None)
         return expected, control_probability
     carried = [step.twin_step.carried for step in history.steps]
     horizon = predicted.shape[1]
@@ -100,7 +104,7 @@ def residual_summary(
         part = replace(history, steps=history.steps[span])
         if part.steps:
             expected_parts.append(expected_in_steps(part, knowledge, part.filtered, smoothed=False))
-    expected = joined(expected_parts)
+    expected = concatenate_expectations(expected_parts)
     residual = (history.observed - expected.mean) / expected.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),

@@ -148,7 +148,7 @@ def _draw_under_control(
     else:
         drawn_states = random_numbers.permutation(states)[:SAMPLES]
     state = np.tile(drawn_states, round(SAMPLES / len(drawn_states)))
-    values = sensors.sampled(state, control, random_numbers)[:, : sensors.sensor_count]
+    values = sensors.draw_observations(state, control, random_numbers)[:, : sensors.sensor_count]
     deviation = sensors.independent_standard_deviation[:, control]
     loadings = np.concatenate(
         (sensors.interval[:, control], _loading_of_parameter(sensors, control)), axis=-1

@@ -22,7 +22,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import Filtered, filter_many
-from twin_master.network.planner import decision, rationed
+from twin_master.network.planner import decision_probability, ration_controls
 
 FLIGHT_ERRORS = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
 """Errors that end the flight of one asset, but not the flights of the others."""
@@ -320,7 +320,7 @@ class _Formation:
         knowledge = self._knowledge
         planner = knowledge.scenario.planner
         policy_on_belief = knowledge.plan.on_belief
-        probability = decision(
+        probability = decision_probability(
             knowledge.model.transition,
             filtered,
             self._previous_control,
@@ -331,7 +331,7 @@ class _Formation:
         control = np.argmax(probability, axis=1)
         if planner.inspections_per_step is not None and policy_on_belief is not None:
             flying = np.flatnonzero(self._is_flying)
-            control[flying] = rationed(
+            control[flying] = ration_controls(
                 knowledge.model.transition,
                 filtered[flying],
                 self._previous_control[flying],

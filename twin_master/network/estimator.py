@@ -1,8 +1,8 @@
-"""What holds the belief of a twin, and its notices: one protocol, the exact filter of the graphical model.
+"""What holds the belief of a twin: the estimator's protocol, and the exact filter as one.
 
-An estimator has no state of its own. What it carries from step to step are arrays that it hands out with each
-estimate and is given back for the next: a twin that keeps them can smooth over them, go back and take in what
-came late, and be stored and continued to the last bit.
+An estimator has no state of its own. What it needs of a step are arrays, which it returns with each
+estimate and receives for the next step. So a twin that keeps these arrays can smooth over them, go
+back and take in late observations, and be stored and continued to the last bit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,24 +19,35 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_sequence, smooth
 from twin_master.scenario.schema import Scenario
 
+CarriedArrays = Mapping[str, NDArray[Any]]
+"""Arrays of several types by name, which an estimator carries from step to step."""
 BELIEVED = 0.5
-"""Largest probability of "none of these" with which a state is still believed."""
+"""A state is believed up to this probability that no state explains the sensors."""
 
 
 def is_state_believed(none_of_these: float) -> bool:
-    """Return whether a state may be told, given the probability that none explains the sensors."""
+    """Return whether a state is believed, given the probability that none explains the sensors."""
     return none_of_these <= BELIEVED
 
 
 class SensorModel(Protocol):
-    """What the sensors say in each state: a `GaussianSensorModel`, or one of a user's own.
+    """The probability of observations in each state: a `GaussianSensorModel`, or a user's own.
 
-    It may have `worst_residuals(observation, control_index)`, a mapping of the sensors that fit worst to
-    their standardised residuals, for the message about an impossible observation.
+    It may have a method `worst_residuals(observation, control_index)`. That returns the
+    standardised residuals of the sensors that fit worst, by name, for the message about an
+    impossible observation.
     """
 
     def log_likelihood(self, observation: ArrayLike, control_index: int, /) -> Float:
-        """Return log p(o | D, u) for each state (S,); of an observation (G,), NaN where a sensor is lost."""
+        """Return log p(o | D, u) of an observation for each state: (S,).
+
+        Parameters
+        ----------
+        observation : (G,) array
+            The sensor values, SI; NaN where a sensor is lost.
+        control_index : int
+            The control u in force.
+        """
 
 
 @dataclass(frozen=True)
@@ -46,13 +57,13 @@ class Carried:
     Attributes
     ----------
     control_index : int
-        Control u_t in force in the step.
+        The control u_t in force in the step.
     arrays : dict of str to array
         All that the estimator needs of the step, to go on and to smooth.
     """
 
     control_index: int
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: CarriedArrays
 
 
 @dataclass(frozen=True)
@@ -61,9 +72,12 @@ class Learnt:
 
     Attributes
     ----------
-    mean, standard_deviation, lower, upper : float
-        Moments and the bounds of the central 90 % interval, in `unit`.
+    mean, standard_deviation : float
+        Its moments, in `unit`.
+    lower, upper : float
+        The bounds of its central 90 % interval, in `unit`.
     unit : str
+        Its unit.
     """
 
     mean: float
@@ -85,15 +99,15 @@ class Notice:
     Attributes
     ----------
     kind : str
-        What sort of notice, for programs: `alarm`, `gauge_left_out`, ...
+        The kind of notice, for programs: `alarm`, `gauge_left_out`, ...
     sentence : str
-        For people; an alarm ends with the command to type.
+        The notice in words. An alarm ends with the command that looks for its cause.
     sensors : tuple of int
-        Numbers of the sensors that it concerns, from 1.
+        The numbers of the sensors that it concerns, from 1.
     value : float or None
-        The figure that it rests on.
+        The number that it rests on.
     since : int or None
-        The step since about which it is so, of an alarm.
+        For an alarm, the step in which the fault is estimated to have begun.
     """
 
     kind: str
@@ -103,7 +117,7 @@ class Notice:
     since: int | None = None
 
     def as_record(self) -> dict[str, Any]:
-        """Return it as it stands in a journal, with lists in the place of tuples."""
+        """Return the notice as it stands in a journal, with lists in the place of tuples."""
         return vars(self) | {"sensors": list(self.sensors)}
 
 
@@ -111,25 +125,25 @@ class Notice:
 class Suspicion:
     """How well the model explains the sensors up to a step.
 
-    A log e-value is the logarithm of the evidence for a fault over that for the model; its exponential has a
-    mean of one where the model holds, at every step.
+    A log e-value is the logarithm of the evidence for a fault over that for the model. Its
+    exponential has a mean of one at every step if the model holds.
 
     Attributes
     ----------
     none_of_these : float
-        Posterior probability that no state of the model explains the sensors.
+        The posterior probability that no state of the model explains the sensors.
     gauge_off : float
-        Posterior probability that a single sensor does not show what is there.
+        The posterior probability that a single sensor is off.
     log_evidence_none, log_evidence_any_gauge : float
-        Log e-values of the two.
-    log_evidence_gauge : (G,)
-        Log e-value of each sensor.
-    left_out : (G,)
+        The log e-values of the two.
+    log_evidence_gauge : (G,) array
+        The log e-value of each sensor.
+    left_out : (G,) array of bool
         Whether the readings of a sensor are absurd and left out.
     hypotheses : dict of str to float
-        Probability of what may hold by name, see `Hypothesis`.
+        The probability of each hypothesis by name, see `Hypothesis`.
     decided_by : str
-        That of them which adds most to the probability of the control that is decided for.
+        The hypothesis that adds most to the probability of the chosen control.
     """
 
     none_of_these: float
@@ -144,15 +158,16 @@ class Suspicion:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may hold in a step.
+    """A hypothesis about the sensors in a step, and the belief about the state under it.
 
     Attributes
     ----------
     name : str
         `model`, `gauge 5 off`, ..., `none of these`.
     probability : float
-    belief : (S,) or None
-        p(D_t | hypothesis, o_0..o_t); None where no state is believed.
+        Its posterior probability.
+    belief : (S,) array or None
+        p(D_t | hypothesis, o_0..o_t); None if no state is believed under the hypothesis.
     """
 
     name: str
@@ -166,22 +181,22 @@ class Estimate:
 
     Attributes
     ----------
-    forecast : (S,)
-        p(D_t | o_0..o_{t-1}).
-    filtered : (S,)
-        p(D_t | o_0..o_t), under all hypotheses that believe in a state.
+    forecast : (S,) array
+        p(D_t | o_0..o_{t-1}), under the model.
+    filtered : (S,) array
+        p(D_t | o_0..o_t), averaged over all hypotheses under which a state is believed.
     log_evidence : float
-        log p(o_t | o_0..o_{t-1}), under the model, as the forecast.
+        log p(o_t | o_0..o_{t-1}), under the model.
     carried : Carried
-        For the step after.
+        What the next step needs.
     learnt : dict of str to Learnt
-        Posterior of what is learnt, by name.
+        The posterior of each learnt quantity, by name.
     notices : tuple of Notice
         What the operator should know of this step.
     suspicion : Suspicion or None
-        How well the model explains the sensors, where that is watched.
+        How well the model explains the sensors; None if that is not watched.
     hypotheses : tuple of Hypothesis
-        What may hold, where more than the model is compared; those that are very improbable are left out.
+        The hypotheses that are not very improbable; empty if only the model is considered.
     """
 
     forecast: Float
@@ -195,35 +210,41 @@ class Estimate:
 
     @property
     def unexplained(self) -> float:
-        """Probability of what believes in no state."""
-        return sum(one.probability for one in self.hypotheses if one.belief is None)
+        """Probability of the hypotheses under which no state is believed."""
+        return sum(
+            hypothesis.probability for hypothesis in self.hypotheses if hypothesis.belief is None
+        )
 
 
 class Estimator(Protocol):
-    """What holds the belief: the exact filter, or one that learns beside it."""
+    """Holds the belief of a twin: the exact filter, or one that learns or watches beside it."""
 
     @property
     def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions: what the twin predicts with."""
+        """States, controls, prior and transitions, with which the twin predicts."""
 
-    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+    def step(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
         """Advance the belief to step t and correct it by an observation.
 
         Parameters
         ----------
         before : Carried or None
-            Of step t - 1; None at the first step, which starts from the prior.
-        observation : (G,)
-            SI; NaN where a sensor is lost. With all of them lost the belief is predicted through.
+            What was carried on from step t - 1; None in the first step, which starts from the
+            prior.
+        observation : (G,) array
+            The sensor values, SI; NaN where a sensor is lost. If all are lost, the belief is
+            predicted through the step.
         control_index : int
-            Control u_t in force.
+            The control u_t in force.
         step : int
-            Number t of the step, for messages.
+            The number t of the step, for messages.
 
         Raises
         ------
         ImpossibleObservation
-            The observation has probability zero wherever the belief has support.
+            If the observation has probability zero in every state that the belief allows.
         """
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
@@ -238,51 +259,66 @@ class ExactFilter:
     Parameters
     ----------
     model : GraphicalModel
+        States, controls, prior and transitions.
     sensor_model : SensorModel
+        The probability of observations in each state.
     name : str
-        Name of the twin, for messages.
+        The name of the twin, for messages.
     """
 
-    def __init__(self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin") -> None:
+    def __init__(
+        self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin"
+    ) -> None:
         self.model = model
-        self._sensor_model, self._name = sensor_model, name
+        self._sensor_model = sensor_model
+        self._name = name
 
-    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+    def step(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
-        likelihood = self._sensor_model.log_likelihood(observation, control_index)
-        followed = None if before is None else (before.arrays["log_filtered"], before.control_index)
+        log_likelihood = self._sensor_model.log_likelihood(observation, control_index)
+        previous = None
+        if before is not None:
+            previous = (before.arrays["log_filtered"], before.control_index)
         try:
-            filtering = filter_sequence(self.model, [control_index], likelihood[None], followed)[0]
+            filtered = filter_sequence(self.model, [control_index], log_likelihood[None], previous)
         except ImpossibleObservation:
-            own = getattr(self._sensor_model, "worst_residuals", None)
-            worst = None if own is None else own(observation, control_index)
+            worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
+            worst = worst_residuals(observation, control_index) if worst_residuals else None
             raise ImpossibleObservation(self._name, step, worst) from None
-        carried = Carried(control_index, {"log_filtered": filtering.log_filtered})
-        return Estimate(filtering.forecast, filtering.filtered, float(filtering.log_evidence), carried)
+        this_step = filtered[0]
+        return Estimate(
+            forecast=this_step.forecast,
+            filtered=this_step.filtered,
+            log_evidence=float(this_step.log_evidence),
+            carried=Carried(control_index, {"log_filtered": this_step.log_filtered}),
+        )
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
-        size = self.model.states.size
-        rows = np.array([step.arrays["log_filtered"] for step in carried]).reshape(-1, size)
-        return smooth(self.model, [step.control_index for step in carried], rows)
+        controls = [step.control_index for step in carried]
+        log_filtered = np.array([step.arrays["log_filtered"] for step in carried])
+        # With no steps the array is still one of rows over the states.
+        return smooth(self.model, controls, log_filtered.reshape(-1, self.model.states.size))
 
 
 @dataclass(frozen=True)
-class Words:
-    """How sentences speak of steps and sensors.
+class NoticeWording:
+    """How the sentences of notices speak of steps and sensors.
 
     Attributes
     ----------
     step, sensor : str
-        What one is called.
+        The nouns for a step and for a sensor.
     factor : float
-        From the values of the sensors, SI, to what is printed.
+        The factor from a sensor value in SI to the printed number.
     units : tuple of str
-        Printed unit of each sensor; none where they are empty or "1".
+        The printed unit of each sensor; no unit is printed if it is empty or "1".
     names : tuple of str
-        What each sensor is called beside its number, if anything.
+        The name of each sensor, printed beside its number; empty if sensors have only numbers.
     command : str
-        What looks for the cause of an alarm; empty where nothing can.
+        The command that looks for the cause of an alarm; empty if none can.
     """
 
     step: str = "step"
@@ -293,18 +329,27 @@ class Words:
     command: str = "uav-twin discrepancy run --from-run DIR"
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "Words":
-        """Return how sentences speak of the steps and sensors of a scenario."""
+    def of(cls, scenario: Scenario) -> "NoticeWording":
+        """Return the wording that fits the steps and sensors of a scenario."""
         observation = scenario.observation
-        own = scenario.mission.step_name, observation.word, *observation.printed, observation.titles
-        return cls(*own) if scenario.searchable else cls(*own, command="")
+        factor, units = observation.printed
+        return cls(
+            step=scenario.mission.step_name,
+            sensor=observation.word,
+            factor=factor,
+            units=units,
+            names=observation.titles,
+            command=cls.command if scenario.searchable else "",
+        )
 
-    def value(self, sensor: int, *values: float) -> list[str]:
-        """Return values of a sensor as they are printed."""
+    def format_values(self, sensor: int, *values: float) -> list[str]:
+        """Return values of a sensor, which is counted from 0, as they are printed."""
         unit = self.units[sensor] if self.units else "1"
-        return [f"{self.factor * value:.4g}{'' if unit == '1' else f' {unit}'}" for value in values]
+        unit_text = "" if unit == "1" else f" {unit}"
+        return [f"{self.factor * value:.4g}{unit_text}" for value in values]
 
-    def sensors(self, numbers: Sequence[int]) -> str:
-        """Return sensors, counted from 0, in words."""
-        names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in numbers]
-        return f"{self.sensor}{'s' if len(names) > 1 else ''} {listing(names)}"
+    def name_sensors(self, sensors: Sequence[int]) -> str:
+        """Return sensors, which are counted from 0, in words: "gauges 1 (root) and 3 (tip)"."""
+        names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in sensors]
+        noun = f"{self.sensor}s" if len(sensors) > 1 else self.sensor
+        return f"{noun} {listing(names)}"

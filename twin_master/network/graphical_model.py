@@ -1,7 +1,7 @@
 """State space, controls, transitions and policies of the dynamic decision network.
 
-The factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Every stochastic matrix of the twin
-passes `stochastic_matrix`, which checks it.
+They are the factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Every stochastic matrix
+of the twin passes `stochastic_matrix`, which checks it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,21 +12,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
-from reporting.words import brief
-from twin_master.errors import InvalidModelError, said
-from twin_master.network.transition import TransitionModel, distribution, expect_shape, stochastic_matrix
+from reporting.words import brief, comma_list
+from twin_master.errors import InvalidModelError
+from twin_master.network.transition import (
+    TransitionModel,
+    check_shape,
+    distribution,
+    stochastic_matrix,
+)
 
 
 @dataclass(frozen=True)
 class Factor:
-    """One named component of the state and the levels that it can take.
+    """One named component of the state, and the levels that it can take.
 
     Attributes
     ----------
     name : str
-        For example the name of a region of the asset.
+        Its name, such as that of a region of the asset.
     levels : tuple of float
-        Strictly increasing values, SI (a stiffness loss is a fraction).
+        Its values, strictly increasing, SI (a stiffness loss is a fraction).
     """
 
     name: str
@@ -38,12 +43,32 @@ class Factor:
         if not self.name:
             raise InvalidModelError("a factor of the state space needs a name, got an empty one")
         if not levels or not np.all(np.isfinite(levels)) or np.any(np.diff(levels) <= 0.0):
-            raise InvalidModelError(said("network.levels", name=self.name, levels=levels))
+            raise InvalidModelError(
+                f"factor {self.name!r}: expected one or more finite, strictly increasing levels, "
+                f"got {comma_list(levels)}"
+            )
 
     @property
     def slack(self) -> float:
-        """By how much a value may miss a level by rounding: a billionth of the largest level."""
+        """Largest difference of a value from its level by rounding: 1e-9 of the largest level."""
         return 1e-9 * max(map(abs, self.levels))
+
+    def index(self, value: float) -> int:
+        """Return the index of the level that a value is, but for rounding (`slack`).
+
+        Raises
+        ------
+        InvalidModelError
+            If the value is none of the levels.
+        """
+        distance = np.abs(np.asarray(self.levels) - value)
+        nearest_level = int(distance.argmin())
+        if not distance[nearest_level] <= self.slack:
+            raise InvalidModelError(
+                f"{value} is no level of factor {self.name!r}; its levels are "
+                f"{comma_list(self.levels)}"
+            )
+        return nearest_level
 
 
 @dataclass(frozen=True)
@@ -62,7 +87,10 @@ class StateSpace:
         object.__setattr__(self, "factors", tuple(self.factors))
         names = [factor.name for factor in self.factors]
         if not names or len(set(names)) != len(names):
-            raise InvalidModelError(said("network.factors", names=names))
+            raise InvalidModelError(
+                "a state space needs one or more factors with different names, got "
+                f"{comma_list(names)}"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,7 +116,7 @@ class StateSpace:
         return table
 
     def index(self, levels: Sequence[float]) -> int:
-        """Return the joint index of the given levels, one per factor (matched to `Factor.slack`).
+        """Return the index of the joint state with the given levels, one for each factor.
 
         Raises
         ------
@@ -96,18 +124,15 @@ class StateSpace:
             If a value is no level of its factor.
         """
         if len(levels) != len(self.factors):
-            raise InvalidModelError(f"expected one level for each of {self.names}, got {tuple(levels)}")
-        indices = []
-        for factor, value in zip(self.factors, levels, strict=True):
-            distance = np.abs(np.asarray(factor.levels) - value)
-            best = int(distance.argmin())
-            if not distance[best] <= factor.slack:
-                raise InvalidModelError(said("network.no_level", value=value, factor=factor))
-            indices.append(best)
+            raise InvalidModelError(
+                f"expected one level for each of {self.names}, got {tuple(levels)}"
+            )
+        pairs = zip(self.factors, levels, strict=True)
+        indices = [factor.index(value) for factor, value in pairs]
         return int(np.ravel_multi_index(indices, self.shape))
 
     def certain(self, levels: Sequence[float]) -> Float:
-        """Return the distribution (S,) that is certain of the given levels."""
+        """Return the belief (S,) that is certain of the given levels."""
         belief = np.zeros(self.size)
         belief[self.index(levels)] = 1.0
         return belief
@@ -120,27 +145,34 @@ class StateSpace:
         """Return the standard deviation of each factor: (..., S) -> (..., factors)."""
         belief = np.asarray(belief, dtype=np.float64)
         deviation = self.coordinates - self.mean(belief)[..., None, :]
-        return np.asarray(np.sqrt(np.einsum("...s,...sf->...f", belief, deviation**2)))
+        variance = np.einsum("...s,...sf->...f", belief, deviation**2)
+        return np.asarray(np.sqrt(variance))
 
-    def within_interval(self, table: ArrayLike) -> Float:
-        """Return what a table over the states (S, ...) changes by inside each state's interval: (S, ..., F).
+    def change_within_interval(self, table: ArrayLike) -> Float:
+        """Return the change of a table within the interval that each state stands for.
 
-        A level stands for the values nearest to it: half way to its neighbours, and at the ends to one side.
-        The truth lies anywhere in there; between levels the table is taken for piecewise linear. The result
-        is what it changes by where each factor is one standard deviation off its level, by the straight line
-        that fits best; zero for a factor of one level.
+        A level stands for the values nearest to it: half way to its neighbours, and to one side
+        only at the ends. The true value lies anywhere in there. Between levels the table is taken
+        to be piecewise linear.
+
+        Parameters
+        ----------
+        table : (S, ...) array
+            A function of the state.
+
+        Returns
+        -------
+        (S, ..., F) array
+            The change of the table if each factor is one standard deviation off its level, by the
+            straight line that fits best; zero for a factor of one level.
         """
         table = np.asarray(table, dtype=np.float64)
-        grid, result = table.reshape(*self.shape, *table.shape[1:]), []
+        grid = table.reshape(*self.shape, *table.shape[1:])
+        changes = []
         for axis, factor in enumerate(self.factors):
-            along = np.moveaxis(grid, axis, -1)
-            step = np.pad(np.diff(factor.levels), 1)  # no neighbour beyond an end: no interval there
-            change = np.pad(np.diff(along), [(0, 0)] * (along.ndim - 1) + [(1, 1)])
-            moment = step**2 * change
-            scale = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
-            both = (moment[..., 1:] + moment[..., :-1]) / np.where(scale > 0.0, scale, 1.0)
-            result.append(np.moveaxis(both, -1, axis).reshape(table.shape))
-        return np.stack(result, axis=-1)
+            change = _change_within_interval(np.moveaxis(grid, axis, -1), factor.levels)
+            changes.append(np.moveaxis(change, -1, axis).reshape(table.shape))
+        return np.stack(changes, axis=-1)
 
     def marginal(self, belief: ArrayLike, name: str) -> Float:
         """Return the marginal of the factor `name`: (..., S) -> (..., levels of that factor).
@@ -151,28 +183,51 @@ class StateSpace:
             If there is no such factor.
         """
         if name not in self.names:
-            raise InvalidModelError(f"no factor is named {name!r}; there are {', '.join(self.names)}")
+            raise InvalidModelError(
+                f"no factor is named {name!r}; there are {', '.join(self.names)}"
+            )
         belief = np.asarray(belief, dtype=np.float64)
         joint = belief.reshape(*belief.shape[:-1], *self.shape)
-        keep = self.names.index(name)
-        others = tuple(axis - len(self.shape) for axis in range(len(self.shape)) if axis != keep)
-        return np.asarray(joint.sum(axis=others))
+        factor_count = len(self.shape)
+        factor_axis = self.names.index(name)
+        other_axes = tuple(
+            axis - factor_count for axis in range(factor_count) if axis != factor_axis
+        )
+        return np.asarray(joint.sum(axis=other_axes))
+
+
+def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
+    """Return the change (..., L) of values (..., L) if a factor is one deviation off each level.
+
+    The true value x is uniform between half a step below the level and half a step above it. With
+    the value v at the level and slopes on either side, the least-squares slope through the level is
+    the ratio of the integrals of x (v(x) - v) and of x². Times the root mean square of x that gives
+    the change.
+    """
+    step = np.pad(np.diff(levels), 1)  # no neighbour beyond an end: no interval there
+    no_padding = [(0, 0)] * (values.ndim - 1)
+    difference = np.pad(np.diff(values), [*no_padding, (1, 1)])
+    # Integral over a half step h/2 with slope d/h: d h² / 24; of x²: h³ / 24.
+    moment = step**2 * difference
+    scale = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
+    safe_scale = np.where(scale > 0.0, scale, 1.0)
+    return np.asarray((moment[..., 1:] + moment[..., :-1]) / safe_scale)
 
 
 @dataclass(frozen=True)
 class GraphicalModel:
-    """States, controls, prior and transitions: what inference needs beside the log-likelihoods.
+    """States, controls, prior and transitions: what inference needs beside log-likelihoods.
 
     Attributes
     ----------
     states : StateSpace
         S joint states.
     controls : tuple of str
-        Names of the U controls.
-    prior : (S,) dimensionless
+        The names of the U controls.
+    prior : (S,) array
         p(D_0).
     transition : TransitionModel
-        Of the U controls and S states.
+        The transitions between the S states under the U controls.
     """
 
     states: StateSpace
@@ -186,10 +241,13 @@ class GraphicalModel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "controls", tuple(self.controls))
         if not self.controls or len(set(self.controls)) != len(self.controls):
-            raise InvalidModelError(said("network.controls", controls=self.controls))
+            raise InvalidModelError(
+                "expected one or more controls with different names, got "
+                f"{comma_list(self.controls)}"
+            )
         size = self.states.size
         object.__setattr__(self, "prior", distribution(self.prior, size=size, name="prior"))
-        expect_shape("a transition", self.transition.shape, len(self.controls), size, size)
+        check_shape("a transition", self.transition.shape, len(self.controls), size, size)
 
     @classmethod
     def from_tables(
@@ -198,37 +256,44 @@ class GraphicalModel:
         tables: Mapping[str, Mapping[str, ArrayLike]],
         prior: Mapping[str, ArrayLike] | None = None,
     ) -> "GraphicalModel":
-        """Return the model of factors that move independently given the control, as plain tables say it.
+        """Return the model of factors that change independently, given the control.
 
         Kapteyn et al. 2021, eqs. (28)-(29).
 
         Parameters
         ----------
         levels : mapping of str to sequence of float
-            Factor of the state -> its L levels, strictly increasing, SI.
-        tables : mapping of str to mapping of str to (L, L) array, dimensionless
-            Control -> factor -> p(level of the next step | level), row-stochastic.
-        prior : mapping of str to (L,) array, dimensionless, optional
-            Factor -> p(level in step 0); certainly the lowest level if left out.
+            For each factor of the state its L levels, strictly increasing, SI.
+        tables : mapping of str to mapping of str to (L, L) array
+            For each control and factor p(level of the next step | level), row-stochastic.
+        prior : mapping of str to (L,) array, optional
+            For each factor p(level in step 0); if left out, it is certainly the lowest level.
 
         Raises
         ------
         InvalidModelError
-            If a factor, a level or a row of a table is no such thing, or a table of a factor is missing.
+            If levels do not increase, a row is no distribution, or the table of a factor is
+            missing.
         """
         states = StateSpace(tuple(Factor(name, tuple(values)) for name, values in levels.items()))
-        given = {"prior": prior, **tables} if prior is not None else dict(tables)
-        for control, rows in given.items():
-            if set(rows) != set(levels):
-                raise InvalidModelError(said("network.tables", control=control, levels=levels, rows=rows))
-        joint: Float = np.ones(1)
+        if prior is not None:
+            _check_factor_names("prior", prior, levels)
+        for control, table in tables.items():
+            _check_factor_names(control, table, levels)
+
+        joint_prior: Float = np.ones(1)
         for factor in states.factors:
             size = len(factor.levels)
-            first = np.eye(size)[0] if prior is None else prior[factor.name]
-            own = distribution(first, size=size, name=f"prior of {factor.name}")
-            joint = np.asarray(np.kron(joint, own), dtype=np.float64)
-        moves = [[tables[control][name] for name in levels] for control in tables]
-        return cls(states, tuple(tables), joint, TransitionModel.from_factors(moves))
+            certainly_lowest = np.eye(size)[0]
+            factor_prior = distribution(
+                certainly_lowest if prior is None else prior[factor.name],
+                size=size,
+                name=f"prior of {factor.name}",
+            )
+            joint_prior = np.asarray(np.kron(joint_prior, factor_prior), dtype=np.float64)
+        ordered_tables = [[tables[control][name] for name in levels] for control in tables]
+        transition = TransitionModel.from_factors(ordered_tables)
+        return cls(states, tuple(tables), joint_prior, transition)
 
     @cached_property
     def log_prior(self) -> Float:
@@ -246,22 +311,33 @@ class GraphicalModel:
             If a row is no distribution, or the shape is another one.
         """
         policy = stochastic_matrix(rows, name="policy[state]")
-        expect_shape("a policy", policy.shape, self.states.size, len(self.controls))
+        check_shape("a policy", policy.shape, self.states.size, len(self.controls))
         return policy
+
+
+def _check_factor_names(
+    table: str, rows: Mapping[str, ArrayLike], levels: Mapping[str, Sequence[float]]
+) -> None:
+    """Refuse a table that does not have one entry for each factor."""
+    if set(rows) != set(levels):
+        raise InvalidModelError(
+            f"{table}: expected one table for each of the factors {comma_list(levels)}, got "
+            f"{comma_list(rows)}"
+        )
 
 
 def worsening_table(level_count: int, probability: float) -> Float:
     """Return the transitions (n, n) of a factor that stays or worsens by one level.
 
-    The last level absorbs: the row at the limit sums to one, where the authors' published table leaves
-    the rows at a damage limit without the lost mass.
+    The last level absorbs: its row sums to one. In the authors' published table the rows at a
+    damage limit lack the probability to worsen.
 
     Parameters
     ----------
     level_count : int
-        Number n of levels.
+        The number n of levels.
     probability : float
-        Probability to worsen by one level in one step, in [0, 1].
+        The probability to worsen by one level in one step, in [0, 1].
     """
     table = np.diag(np.full(level_count, 1.0 - probability))
     table += np.diag(np.full(level_count - 1, probability), 1)
@@ -270,16 +346,22 @@ def worsening_table(level_count: int, probability: float) -> Float:
 
 
 def repaired_table(table: Float, success: float) -> Float:
-    """Return transitions (L, L) whose end is brought to the lowest level with a probability."""
+    """Return transitions (L, L) followed by a repair to the lowest level with a probability."""
     result = (1.0 - success) * table
     result[:, 0] += success
     return np.asarray(result / result.sum(axis=1, keepdims=True), dtype=np.float64)
 
 
 def leaving_table(table: Float, factor: float) -> Float:
-    """Return transitions (L, L) whose probabilities to leave a level are multiplied by a factor."""
-    result = factor * np.where(np.eye(len(table), dtype=bool), 0.0, table)
-    stay = 1.0 - result.sum(axis=1)
-    if np.any(stay < 0.0):
-        raise InvalidModelError(said("network.leaving", factor=factor, leaving=1.0 - float(stay.min())))
-    return np.asarray(result + np.diag(stay), dtype=np.float64)
+    """Return transitions (L, L) with the probabilities to leave a level multiplied by a factor."""
+    is_staying = np.eye(len(table), dtype=bool)
+    result = factor * np.where(is_staying, 0.0, table)
+    staying = 1.0 - result.sum(axis=1)
+    if np.any(staying < 0.0):
+        leaving = 1.0 - float(staying.min())
+        raise InvalidModelError(
+            f"a factor of {factor:g} on the transition probabilities makes the probability to "
+            f"leave a level {leaving:g}, and at most 1 is possible: take smaller "
+            "`learning.transition_factors`"
+        )
+    return np.asarray(result + np.diag(staying), dtype=np.float64)

@@ -1,14 +1,13 @@
 """Exact inference in the dynamic decision network: filter, smooth over the whole history, predict.
 
-Pure functions on arrays, in the log domain: beliefs whose linear value underflows come back later when the
-data call for it. No floor is added anywhere; what is impossible stays impossible.
+Pure functions of arrays, with logarithms of beliefs: a belief whose probability underflows comes
+back if later data call for it. No floor is added anywhere, so what is impossible stays impossible.
 
-The order of one step t: control u_t is in force, the state is D_t, the observation o_t is made under u_t.
-Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
+The order of one step t: control u_t is in force, the state is D_t, the observation o_t is made
+under u_t. Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,23 +16,26 @@ from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass
-from twin_master.network.transition import TransitionModel, expect_controls, expect_shape
+from twin_master.network.transition import TransitionModel, check_controls, check_shape
+
+_NO_CONTROL = -1
+"""The control before the first step: the belief before it is the prior, without a transition."""
 
 
 @dataclass(frozen=True)
 class Filtered:
-    """Filtered beliefs; the leading axes are twins and steps, as far as there are several.
+    """Filtered beliefs; the leading axes are twins and steps, if there are several.
 
     Attributes
     ----------
-    forecast : (..., S)
+    forecast : (..., S) array
         p(D_t | o_0..o_{t-1}): the belief before the observation.
-    filtered : (..., S)
+    filtered : (..., S) array
         p(D_t | o_0..o_t).
-    log_filtered : (..., S)
-        Its logarithm; carry this to the next step.
-    log_evidence : (...)
-        log p(o_t | o_0..o_{t-1}); the sum is the log evidence of all observations.
+    log_filtered : (..., S) array
+        Its logarithm, which the next step needs.
+    log_evidence : (...) array
+        log p(o_t | o_0..o_{t-1}); the sum over steps is the log evidence of all observations.
     """
 
     forecast: Float
@@ -41,9 +43,14 @@ class Filtered:
     log_filtered: Float
     log_evidence: Float
 
-    def __getitem__(self, place: Any) -> "Filtered":
-        """Return the beliefs at a place of the leading axes."""
-        return Filtered(*(np.asarray(values)[place] for values in vars(self).values()))
+    def __getitem__(self, index: int | slice | tuple[int | slice, ...]) -> "Filtered":
+        """Return the beliefs at an index of the leading axes."""
+        return Filtered(
+            forecast=np.asarray(self.forecast[index]),
+            filtered=np.asarray(self.filtered[index]),
+            log_filtered=np.asarray(self.log_filtered[index]),
+            log_evidence=np.asarray(self.log_evidence[index]),
+        )
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,10 @@ class Predicted:
 
     Attributes
     ----------
-    predicted : (H, S)
+    predicted : (H, S) array
         p(D_{t+h} | o_0..o_t), h = 1..H.
-    joint : (H, S, U)
-        p(D_{t+h}, U_{t+h} | o_0..o_t): quantities and rewards depend on both.
+    joint : (H, S, U) array
+        p(D_{t+h}, U_{t+h} | o_0..o_t), on which sensor values and rewards depend.
     """
 
     predicted: Float
@@ -66,72 +73,124 @@ class Predicted:
         """p(U_{t+h} | o_0..o_t): (H, U)."""
         return np.asarray(self.joint.sum(axis=1))
 
-    def mixed(self, share: float, control: Float) -> "Predicted":
-        """Return it where with probability `share` the controls are p(U) (U,), whatever the state is."""
-        chosen = self.predicted[..., None] * control
-        return Predicted(self.predicted, (1.0 - share) * self.joint + share * chosen)
+    def mix_control(self, weight: float, control: Float) -> "Predicted":
+        """Return the prediction if with a probability the controls do not depend on the state.
+
+        Parameters
+        ----------
+        weight : float
+            That probability.
+        control : (U,) array
+            The probabilities of the controls then.
+        """
+        joint_then = self.predicted[..., None] * control
+        return Predicted(self.predicted, (1.0 - weight) * self.joint + weight * joint_then)
 
 
-def _checked(
-    model: GraphicalModel, control_index: ArrayLike, rows: ArrayLike, *, what: str
+def _check_sequence(
+    model: GraphicalModel, control_index: ArrayLike, log_rows: ArrayLike, *, what: str
 ) -> tuple[Index, Float]:
-    """Return controls (1, T), and rows of logarithms (1, T, S), as the compiled loops expect them."""
+    """Return checked controls (1, T) and logarithms (1, T, S), as the compiled loops expect them.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states and U controls.
+    control_index : (T,) array
+        The control in force in each step.
+    log_rows : (T, S) array
+        A logarithm for each step and state.
+    what : str
+        What the rows are, for the message.
+    """
     control = np.array(control_index, dtype=np.int64, order="C")
-    expect_shape("controls", control.shape, control.size)
-    expect_controls(control, len(model.controls))
-    rows = np.require(rows, np.float64, ["C", "W"])
-    expect_shape(what, rows.shape, *control.shape, model.states.size)
-    if not np.all(rows < np.inf):  # NaN fails this as well
-        where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
-        raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")
+    check_shape("controls", control.shape, control.size)
+    check_controls(control, len(model.controls))
+    rows = np.require(log_rows, np.float64, ["C", "W"])
+    check_shape(what, rows.shape, *control.shape, model.states.size)
+    is_valid = rows < np.inf  # false for NaN as well
+    if not np.all(is_valid):
+        position = tuple(np.argwhere(~is_valid)[0].tolist())
+        raise InvalidObservationError(
+            f"{what} at {position} is {rows[position]}; expected a number or -inf"
+        )
     return control[None], rows[None]
 
 
 def filter_many(
     transition: TransitionModel,
     control: Index,
-    rows: Float,
+    log_likelihood: Float,
     log_before: Float,
-    control_before: ArrayLike = -1,
+    control_before: ArrayLike = _NO_CONTROL,
 ) -> tuple[Filtered, Index]:
     """Filter B twins without any check.
 
     Parameters
     ----------
     transition : TransitionModel
-    control : (B, T)
-    rows : (B, T, S)
+        Transitions between S states.
+    control : (B, T) array
+        The control in force in each step.
+    log_likelihood : (B, T, S) array
         log p(o_t | D_t, u_t).
-    log_before : (B, S) or (S,)
-        Logarithm of the belief in the step before the first, or of the prior where there is none.
-    control_before : int or (B,)
-        Control in force in that step; -1 where there is none.
+    log_before : (B, S) or (S,) array
+        The log belief in the step before the first one; or the log prior if there is none.
+    control_before : int or (B,) array
+        The control in force in that step; -1 if there is none.
 
     Returns
     -------
-    tuple of Filtered, (B,)
-        The latter is -1, or the row whose observation is impossible; the rest of such a twin means nothing.
+    filtered : Filtered
+        The beliefs, with leading axes (B, T).
+    failed : (B,) array
+        The first step whose observation is impossible, or -1. Later beliefs of such a twin are not
+        defined.
     """
-    forecast, filtered, log_filtered = (np.empty_like(rows) for _ in range(3))
-    log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
-    found = forecast, filtered, log_filtered, log_evidence
-    first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
-    forward_pass(transition.forward_lists, control, *first, rows, *found, failed)
-    return Filtered(*found), failed
+    twins, steps, size = log_likelihood.shape
+    result = Filtered(
+        forecast=np.empty_like(log_likelihood),
+        filtered=np.empty_like(log_likelihood),
+        log_filtered=np.empty_like(log_likelihood),
+        log_evidence=np.empty((twins, steps)),
+    )
+    failed = np.empty(twins, dtype=np.int64)
+    forward_pass(
+        transition.forward_lists,
+        control,
+        np.full((twins, size), log_before),
+        np.full(twins, control_before),
+        log_likelihood,
+        result.forecast,
+        result.filtered,
+        result.log_filtered,
+        result.log_evidence,
+        failed,
+    )
+    return result, failed
 
 
 def log_forecast(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
-    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
-    nothing = np.zeros_like(log_filtered)[:, None]
-    found, _ = filter_many(transition, control[:, None], nothing, log_filtered, control)
-    return np.asarray(found.log_filtered[:, 0] + found.log_evidence)
+    """Return log beliefs (B, S) one transition later, each under its control (B,)."""
+    no_information = np.zeros_like(log_filtered)[:, None]
+    beliefs, _ = filter_many(transition, control[:, None], no_information, log_filtered, control)
+    # The filter normalises each belief; its evidence is the sum that it had before.
+    return np.asarray(beliefs.log_filtered[:, 0] + beliefs.log_evidence)
 
 
-def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:
+def smooth_many(
+    transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float
+) -> Float:
     """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
     smoothed = np.empty_like(log_filtered)
-    lists = transition.forward_lists, transition.backward_lists
-    backward_pass(*lists, control, filtered, log_filtered, smoothed)
+    backward_pass(
+        transition.forward_lists,
+        transition.backward_lists,
+        control,
+        filtered,
+        log_filtered,
+        smoothed,
+    )
     return smoothed
 
 
@@ -146,26 +205,28 @@ def filter_sequence(
     Parameters
     ----------
     model : GraphicalModel
-    control_index : (T,)
-        Control u_t in force in each step.
-    log_likelihood : (T, S)
-        log p(o_t | D_t, u_t), a row of zeros where nothing was observed.
-    before : tuple of (S,) and int, optional
-        `log_filtered` of the step before the first, and the control that was in force then; without it the
-        first step starts from the prior.
+        States, controls, prior and transitions.
+    control_index : (T,) array
+        The control u_t in force in each step.
+    log_likelihood : (T, S) array
+        log p(o_t | D_t, u_t); a row of zeros if nothing was observed.
+    before : tuple of (S,) array and int, optional
+        `log_filtered` of the step before the first one, and the control that was in force then. If
+        left out, the first step starts from the prior.
 
     Raises
     ------
     ImpossibleObservation
-        If an observation has probability zero wherever the belief has support.
+        If an observation has probability zero in every state that the belief allows.
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
-    control, rows = _checked(model, control_index, log_likelihood, what="log-likelihood")
-    found, failed = filter_many(model.transition, control, rows, *(before or (model.log_prior,)))
+    control, rows = _check_sequence(model, control_index, log_likelihood, what="log-likelihood")
+    log_before, control_before = before or (model.log_prior, _NO_CONTROL)
+    filtered, failed = filter_many(model.transition, control, rows, log_before, control_before)
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
-    return found[0]
+    return filtered[0]
 
 
 def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Float:
@@ -174,17 +235,18 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     Parameters
     ----------
     model : GraphicalModel
-    control_index : (T,)
-        Control u_t in force in each step.
-    log_filtered : (T, S)
-        As `filter_sequence` gives them, at once or one by one.
+        States, controls, prior and transitions.
+    control_index : (T,) array
+        The control u_t in force in each step.
+    log_filtered : (T, S) array
+        The log beliefs that `filter_sequence` returns, at once or one by one.
 
     Raises
     ------
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log belief is NaN or plus infinity.
     """
-    control, rows = _checked(model, control_index, log_filtered, what="log belief")
+    control, rows = _check_sequence(model, control_index, log_filtered, what="log belief")
     return np.asarray(smooth_many(model.transition, control, np.exp(rows), rows)[0])
 
 
@@ -193,21 +255,22 @@ def predict(
 ) -> Predicted:
     """Predict through the policy: Kapteyn et al. 2021, eqs. (37)-(39).
 
-    D_{t+1} follows the belief at t through the known control u_t; from then on U_{t+h} ~ policy(. | D_{t+h})
-    and D_{t+h+1} ~ T[U_{t+h}](D_{t+h}, .). The control node is marginalised exactly. No observation enters,
-    so the linear domain is exact to rounding.
+    D_{t+1} follows the belief at t through the known control u_t. From then on U_{t+h} follows
+    policy(. | D_{t+h}), and D_{t+h+1} follows T[U_{t+h}](D_{t+h}, .). The control is marginalised
+    exactly. No observation enters, so probabilities are exact to rounding without logarithms.
 
     Parameters
     ----------
     model : GraphicalModel
-    belief : (S,)
+        States, controls and transitions.
+    belief : (S,) array
         p(D_t | o_0..o_t).
     control_index : int
-        Control u_t in force at t.
-    policy : (S, U)
+        The control u_t in force at t.
+    policy : (S, U) array
         p(U | D), row-stochastic.
     horizon : int
-        Number H of steps, not negative.
+        The number H of steps, not negative.
 
     Raises
     ------
@@ -216,26 +279,31 @@ def predict(
     """
     belief = np.asarray(belief, dtype=np.float64)
     policy = np.asarray(policy, dtype=np.float64)
-    expect_shape("a belief", belief.shape, model.states.size)
+    check_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
         raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
-    predicted, transition = np.empty((horizon, len(belief))), model.transition
-    now: Float = belief
-    closed_loop = None if transition.is_product else np.einsum("su,usn->sn", policy, transition.matrix)
-    for h in range(horizon):
-        if h == 0:
-            now = transition.forward(control_index, now)
-        elif closed_loop is not None:
-            now = now @ closed_loop
-        else:
-            flows = enumerate((now[:, None] * policy).T)
-            now = np.sum([transition.forward(u, flow) for u, flow in flows], axis=0)
-        predicted[h] = now
+    predicted = np.empty((horizon, len(belief)))
+    if horizon > 0:
+        predicted[0] = model.transition.forward(control_index, belief)
+    if model.transition.is_product:
+        _predict_by_blocks(model.transition, policy, predicted)
+    else:
+        closed_loop = np.einsum("su,usn->sn", policy, model.transition.matrix)
+        for h in range(1, horizon):
+            predicted[h] = predicted[h - 1] @ closed_loop
     return Predicted(predicted, predicted[:, :, None] * policy)
 
 
+def _predict_by_blocks(transition: TransitionModel, policy: Float, predicted: Float) -> None:
+    """Fill the rows of `predicted` (H, S) after the first one, without the table of all states."""
+    for h in range(1, len(predicted)):
+        joint = predicted[h - 1][:, None] * policy
+        next_by_control = [transition.forward(u, flow) for u, flow in enumerate(joint.T)]
+        predicted[h] = np.sum(next_by_control, axis=0)
+
+
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:
-    """Return the joint (..., S, U) of a belief (..., S) and a control that is known (...)."""
+    """Return the joint (..., S, U) of beliefs (..., S) and known controls (...)."""
     belief = np.asarray(belief, dtype=np.float64)
-    chosen = np.eye(control_count)[np.asarray(control_index)]
-    return np.asarray(belief[..., :, None] * chosen[..., None, :])
+    is_control = np.eye(control_count)[np.asarray(control_index)]
+    return np.asarray(belief[..., :, None] * is_control[..., None, :])

@@ -1,48 +1,75 @@
-"""Planning by value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36), and what is decided."""
+"""Decisions, and planning by value iteration: Kapteyn et al. 2021, eq. (36)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
-from twin_master.errors import PlanningError, said
-from twin_master.network.kernels import sweep
-from twin_master.network.transition import TransitionModel, expect_shape
+from reporting.words import comma_list
+from twin_master.errors import PlanningError
+from twin_master.network.kernels import sweep_bellman
+from twin_master.network.transition import TransitionModel, check_shape
+
+LARGEST_SOLVED = 1000
+"""States up to which the value of a policy is the solution of a dense linear system."""
+_WARM_UP_SWEEPS = 1000
+"""Sweeps of value iteration before policy iteration, if values of policies are solved for."""
+_MOST_EVALUATION_SWEEPS = 10_000_000
+"""Sweeps at most to iterate the value of a policy to rounding."""
+_LARGEST_DISCOUNT = 1.0 - 1e-12
+"""Beyond this, rounding of the transition (1e-16) changes the value by more than 1e-4 of it."""
+_EPSILON = float(np.finfo(np.float64).eps)
+_ROUNDING = 16.0 * _EPSILON
+"""Rounding error of a sum of rewards and values, relative to the size of its terms."""
+_RELATIVE_ROUNDING_OF_SWEEP = 4e-16
+"""Rounding error of a sweep, relative to the largest value."""
 
 
 @dataclass(frozen=True)
 class BeliefPolicy:
-    """What to do by the belief before a step: the control of the vector that is largest there.
+    """A policy that depends on the belief before a step: the control of the largest vector there.
 
     Attributes
     ----------
-    vectors : (N, S)
-        Expected return of a plan that begins with a control, from each state.
-    control : (N,)
-        That control.
+    vectors : (N, S) array
+        The expected return of a plan that begins with a control, from each state.
+    control : (N,) array
+        The control with which each plan begins.
     """
 
     vectors: Float
     control: Index
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
-        """Return the policy of arrays by the names of its attributes, as a file has them.
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
+        """Return the policy in the arrays of a file.
+
+        Parameters
+        ----------
+        arrays : dict of str to array
+            Arrays by name, among them `vectors` and `control` behind the prefix.
+        prefix : str
+            The beginning of the two names.
 
         Raises
         ------
         PlanningError
-            They are none.
+            If one is missing, or they do not fit together.
         """
         before = "a policy on the belief has `vectors` and `control`: "
         with PlanningError.instead_of(KeyError, before=before, after=" is missing"):
-            vectors, control = arrays[f"{prefix}vectors"], arrays[f"{prefix}control"]
-        if vectors.ndim != 2 or control.shape != vectors.shape[:1] or control.dtype.kind not in "iu":
-            raise PlanningError(said("network.vectors", vectors=vectors.shape, controls=control.shape))
+            vectors = arrays[f"{prefix}vectors"]
+            control = arrays[f"{prefix}control"]
+        is_integer = control.dtype.kind in "iu"
+        if vectors.ndim != 2 or control.shape != vectors.shape[:1] or not is_integer:
+            raise PlanningError(
+                "expected vectors (N, S) and a control for each, got "
+                f"{comma_list(vectors.shape)} and {comma_list(control.shape)}"
+            )
         return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
 
     def value(self, belief: ArrayLike) -> Float:
@@ -50,16 +77,21 @@ class BeliefPolicy:
         return np.asarray((np.asarray(belief) @ self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
-        """Return the same by the control of the first step: (..., U), minus infinity without a vector."""
-        every = np.asarray(belief) @ self.vectors.T
-        result: Float = np.full((*every.shape[:-1], controls), -np.inf)
+        """Return the expected return by the control of the first step: (..., S) -> (..., U).
+
+        It is minus infinity for a control without a vector.
+        """
+        vector_values = np.asarray(belief) @ self.vectors.T  # (..., N)
+        result: Float = np.full((*vector_values.shape[:-1], controls), -np.inf)
         for control in np.unique(self.control).tolist():
-            result[..., control] = every[..., self.control == control].max(axis=-1)
+            has_control = self.control == control
+            result[..., control] = vector_values[..., has_control].max(axis=-1)
         return result
 
     def decide(self, belief: ArrayLike) -> Index:
         """Return the control for beliefs (..., S): (...)."""
-        return np.asarray(self.control[np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)])
+        largest_vector = np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)
+        return np.asarray(self.control[largest_vector])
 
 
 @dataclass(frozen=True)
@@ -68,16 +100,16 @@ class PlannedPolicy:
 
     Attributes
     ----------
-    value : (S,)
-        Expected discounted reward from each state.
-    action_value : (S, U)
+    value : (S,) array
+        The expected discounted reward from each state.
+    action_value : (S, U) array
         The same, if the given control is taken first.
-    policy : (S, U)
-        Row-stochastic, p(U | D).
+    policy : (S, U) array
+        p(U | D), row-stochastic.
     iterations : int
-        Sweeps of value iteration; zero where the policy was given.
+        The number of sweeps of value iteration; zero if the policy was given.
     on_belief : BeliefPolicy or None
-        What decides by the belief in the place of `policy`, which then predicts alone.
+        A policy that decides by the belief in the place of `policy`, which then only predicts.
     """
 
     value: Float
@@ -92,84 +124,105 @@ class PlannedPolicy:
         return np.asarray(np.argmax(self.policy, axis=1), dtype=np.int64)
 
 
-def decision(
-    transition: TransitionModel, filtered: Float, control: Index, policy: Float,
-    on_belief: BeliefPolicy | None = None, *, ahead: bool = False,
-) -> Float:  # fmt: skip
-    """Return the probability of each next control of B twins (B, U), of each what it would be alone.
+def decision_probability(
+    transition: TransitionModel,
+    filtered: Float,
+    control: Index,
+    policy: Float,
+    on_belief: BeliefPolicy | None = None,
+    *,
+    ahead: bool = False,
+) -> Float:
+    """Return the probability of each next control of B twins: (B, U).
+
+    Each twin has what it would have alone, to the last bit.
 
     Parameters
     ----------
     transition : TransitionModel
-    filtered : (B, S)
+        The transitions between S states.
+    filtered : (B, S) array
         p(D_t | o_0..o_t).
-    control : (B,)
-        Control in force in step t.
-    policy : (S, U)
+    control : (B,) array
+        The control in force in step t.
+    policy : (S, U) array
         p(U | D), which is averaged over the belief.
     on_belief : BeliefPolicy, optional
-        Decides in its place by p(D_{t+1} | o_0..o_t).
+        Decides by p(D_{t+1} | o_0..o_t) in the place of `policy`.
     ahead : bool
-        Average over that belief, too.
+        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t), too.
     """
     belief = filtered
     if ahead or on_belief is not None:
         pairs = zip(control.tolist(), filtered, strict=True)
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
     if on_belief is not None:
-        return np.eye(policy.shape[1])[[on_belief.decide(row) for row in belief]]
-    # One product for each twin, so that its last bit does not depend on how many there are.
+        decided = [on_belief.decide(row) for row in belief]
+        return np.eye(policy.shape[1])[decided]
+    # One product for each twin, so that its last bit does not depend on the number of twins.
     return np.asarray(np.matmul(belief[:, None, :], policy)[:, 0])
 
 
-def rationed(
-    transition: TransitionModel, filtered: Float, before: Index, chosen: Index, policy: BeliefPolicy,
-    scarce: Sequence[int], budget: int,
-) -> Index:  # fmt: skip
-    """Return the next controls (B,) of which so many at most are scarce: those that are worth most.
+def ration_controls(
+    transition: TransitionModel,
+    filtered: Float,
+    before: Index,
+    chosen: Index,
+    policy: BeliefPolicy,
+    scarce: Sequence[int],
+    budget: int,
+) -> Index:
+    """Return the next controls (B,), with the scarce ones where they are worth most.
 
-    A scarce control is worth what its return is above that of the best other one, which is taken where the
-    budget is spent.
+    A scarce control is worth the difference of its return to that of the best other control, which
+    is taken where the budget is spent.
 
     Parameters
     ----------
-    transition, filtered
-        As of `decision`.
-    before, chosen : (B,)
-        Controls in force, and those that were decided.
+    transition : TransitionModel
+        The transitions between S states.
+    filtered : (B, S) array
+        p(D_t | o_0..o_t).
+    before : (B,) array
+        The controls in force.
+    chosen : (B,) array
+        The next controls that were decided for each twin alone.
     policy : BeliefPolicy
+        The policy by which they were decided.
     scarce : sequence of int
-        Controls of which there are few, such as inspections.
+        The controls of which there are few, such as inspections.
     budget : int
-        How many.
+        The largest number of scarce controls.
     """
     wanting = np.flatnonzero(np.isin(chosen, scarce))
     if len(wanting) <= budget:
         return chosen
-    ahead = np.array([transition.forward(int(before[twin]), filtered[twin]) for twin in wanting])
-    value = policy.action_value(ahead, transition.shape[0])
-    others = value.copy()
-    others[:, scarce] = -np.inf
-    gain = value[:, scarce].max(axis=1) - others.max(axis=1)
-    late = np.argsort(-gain, kind="stable")[budget:]
+    predicted = [transition.forward(int(before[twin]), filtered[twin]) for twin in wanting]
+    action_value = policy.action_value(np.array(predicted), transition.shape[0])
+    value_of_others = action_value.copy()
+    value_of_others[:, scarce] = -np.inf
+    gain = action_value[:, scarce].max(axis=1) - value_of_others.max(axis=1)
+    refused = np.argsort(-gain, kind="stable")[budget:]
     result = chosen.copy()
-    result[wanting[late]] = np.argmax(others[late], axis=1)
+    result[wanting[refused]] = np.argmax(value_of_others[refused], axis=1)
     return result
 
 
-LARGEST_SOLVED = 1000
-"""States up to which the value of a policy is solved for; beyond it is iterated to rounding."""
-_WARM_UP = 1000
-"""Sweeps before policies are improved, where the value of a policy is solved for."""
-_MOST_EVALUATION_SWEEPS = 10_000_000
-_LARGEST_DISCOUNT = 1.0 - 1e-12
-"""Beyond it rounding of the transition alone, 1e-16, changes the value by more than 1e-4 of its size."""
-_ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
-"""Of the terms of a sum of rewards and values: what rounding may change of it."""
+@dataclass(frozen=True)
+class _ValueIteration:
+    """The result of value iteration.
 
-
-class _Sweeps(NamedTuple):
-    """Value iteration as far as it went: the value (S,), sweeps, and the last change of the value."""
+    Attributes
+    ----------
+    value : (S,) array
+        The value of each state.
+    sweeps : int
+        The number of sweeps.
+    change : float
+        The last change of the value.
+    converged : bool
+        Whether it is as small as the tolerance asks.
+    """
 
     value: Float
     sweeps: int
@@ -184,11 +237,11 @@ class _DecisionProcess:
     Attributes
     ----------
     transition : TransitionModel
-        Of U controls and S states.
+        The transitions between S states under U controls.
     reward : (S, U) array
-        Expected reward of one step.
+        The expected reward of one step.
     discount : (U,) array
-        gamma of each control, in [0, 1).
+        The discount factor gamma of each control, in [0, 1).
     """
 
     transition: TransitionModel
@@ -196,63 +249,91 @@ class _DecisionProcess:
     discount: Float
 
     @classmethod
-    def checked(
+    def from_arrays(
         cls, transition: TransitionModel, reward: ArrayLike, discount: ArrayLike
     ) -> "_DecisionProcess":
-        """Return the problem of what a caller gives.
+        """Return the problem with checked rewards (S, U) and discounts, one or (U,).
 
         Raises
         ------
         PlanningError
-            If shapes do not fit, a reward is not finite, or a discount is not between 0 and 1 - 1e-12.
+            If shapes do not fit, a reward is not finite, or a discount is not between 0 and
+            1 - 1e-12.
         """
+        controls, states, _ = transition.shape
         rewards = np.array(reward, dtype=np.float64, order="C")
-        expect_shape("rewards", rewards.shape, *transition.shape[1::-1], error=PlanningError)
-        if not np.all(np.isfinite(rewards)):
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
-            raise PlanningError(said("network.reward", where=where, reward=rewards[where]))
+        check_shape("rewards", rewards.shape, states, controls, error=PlanningError)
+        is_finite = np.isfinite(rewards)
+        if not np.all(is_finite):
+            position = tuple(int(i) for i in np.argwhere(~is_finite)[0])
+            raise PlanningError(
+                f"reward at (state, control) {position} is {rewards[position]}; expected finite "
+                "rewards"
+            )
         factors = np.array(discount, dtype=np.float64)
-        if factors.shape not in ((), rewards.shape[1:]) or not np.all((factors >= 0.0) & (factors < 1.0)):
-            raise PlanningError(said("network.discount", controls=rewards.shape[1], factors=factors))
+        in_range = np.all((factors >= 0.0) & (factors < 1.0))
+        if factors.shape not in ((), (controls,)) or not in_range:
+            raise PlanningError(
+                f"expected a discount factor in [0, 1), or one for each of {controls} controls, "
+                f"got {factors}"
+            )
         if factors.max() > _LARGEST_DISCOUNT:
             raise PlanningError(
-                f"the discount factor {float(factors.max())!r} is so close to 1 that rounding decides the"
-                " value; expected at most 1 - 1e-12. Take a smaller one."
+                f"the discount factor {float(factors.max())!r} is so close to 1 that rounding "
+                "decides the value; expected at most 1 - 1e-12. Take a smaller one."
             )
-        return cls(transition, rewards, np.full(rewards.shape[1], factors))
+        return cls(transition, rewards, np.full(controls, factors))
 
     @property
     def is_solved(self) -> bool:
         """Whether the value of a policy is the solution of a dense linear system."""
         return len(self.reward) <= LARGEST_SOLVED
 
-    def sweep(
-        self, tolerance: float, most: int, policy: Float | None = None, start: Float | None = None
-    ) -> _Sweeps:
+    def iterate_value(
+        self,
+        tolerance: float,
+        most_sweeps: int,
+        policy: Float | None = None,
+        start: Float | None = None,
+    ) -> _ValueIteration:
         """Iterate the Bellman equation until the value is known to a tolerance, or to rounding.
 
         Parameters
         ----------
         tolerance : float
-            Largest error of the value, relative to the largest reward.
-        most : int
-            Sweeps after which to stop.
+            The largest error of the value, relative to the largest reward.
+        most_sweeps : int
+            The number of sweeps after which to stop.
         policy : (S, U) array, optional
-            Whose value is asked for; that of the best policy by default.
+            The policy whose value is computed; the best one by default.
         start : (S,) array, optional
-            Value to begin with; zero by default.
+            The value to begin with; zero by default.
         """
         states, controls = self.reward.shape
-        scale, contraction = float(np.abs(self.reward).max()) or 1.0, float(self.discount.max())
-        # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
-        limit = max(tolerance * scale * (1.0 - contraction), 4e-16 * scale / (1.0 - contraction))
-        rows = np.empty((0, controls)) if policy is None else policy.copy()
-        value = np.zeros(states) if start is None else start.copy()
-        lists, first = self.transition.backward_lists, np.empty_like(self.reward)
-        sweeps, change = sweep(lists, self.reward, self.discount, rows, limit, most, value, first)
-        return _Sweeps(value, sweeps, change, converged=change <= limit)
+        scale = float(np.abs(self.reward).max()) or 1.0
+        gamma = float(self.discount.max())
+        # The error |V_k - V*| is at most gamma / (1 - gamma) times the change |V_k - V_{k-1}|.
+        # Below rounding nothing changes any more.
+        allowed_change = tolerance * scale * (1.0 - gamma)
+        rounding = _RELATIVE_ROUNDING_OF_SWEEP * scale / (1.0 - gamma)
+        largest_change = max(allowed_change, rounding)
 
-    def expect_converged(self, result: _Sweeps) -> None:
+        value = np.zeros(states) if start is None else start.copy()
+        best_control = np.empty((0, controls))  # no rows: the kernel takes the best control
+        action_value = np.empty_like(self.reward)
+        sweeps, change = sweep_bellman(
+            self.transition.backward_lists,
+            self.reward,
+            self.discount,
+            best_control if policy is None else policy.copy(),
+            largest_change,
+            most_sweeps,
+            value,
+            action_value,
+        )
+        return _ValueIteration(value, sweeps, change, converged=change <= largest_change)
+
+    def check_converged(self, result: _ValueIteration) -> None:
         """Refuse a value that still changes.
 
         Raises
@@ -261,67 +342,74 @@ class _DecisionProcess:
             If the value is not known to the tolerance.
         """
         if not result.converged:
-            largest = float(self.discount.max())
             raise PlanningError(
-                said("network.sweeps", change=result.change, sweeps=result.sweeps, largest=largest)
+                f"value iteration still changes by {result.change:.3g} after {result.sweeps} "
+                f"sweeps with discount {float(self.discount.max())}; allow more sweeps or a larger "
+                "tolerance"
             )
 
     def action_value(self, value: Float) -> Float:
-        """Return what each control is worth in each state (S, U) if a value (S,) follows."""
-        following = [self.transition.expected(control, value) for control in range(len(self.discount))]
-        return np.asarray(self.reward + self.discount * np.stack(following, axis=1))
+        """Return the return of each control in each state (S, U), if a value (S,) follows."""
+        expected = [
+            self.transition.expected_value(control, value) for control in range(len(self.discount))
+        ]
+        return np.asarray(self.reward + self.discount * np.stack(expected, axis=1))
 
-    def rounding(self, value: Float) -> Float:
-        """Return the difference (S,) that rounding may make between equally good controls in each state."""
-        sizes = replace(self, reward=np.abs(self.reward)).action_value(np.abs(value))
-        return np.asarray(_ROUNDING * sizes.max(axis=1))
+    def rounding_error(self, value: Float) -> Float:
+        """Return the rounding error of the returns of controls in each state: (S,)."""
+        absolute = replace(self, reward=np.abs(self.reward))
+        size_of_terms = absolute.action_value(np.abs(value))
+        return np.asarray(_ROUNDING * size_of_terms.max(axis=1))
 
-    def value_of(self, policy: Float, start: Float | None = None) -> Float:
-        """Return the value (S,) of a policy (S, U): V = r + gamma P V with its rewards and transitions.
+    def evaluate(self, policy: Float, start: Float | None = None) -> Float:
+        """Return the value (S,) of a policy: V = r + gamma P V with its rewards and transitions.
 
         Parameters
         ----------
         policy : (S, U) array
             p(U | D), row-stochastic.
         start : (S,) array, optional
-            Where an iteration begins, if there are too many states to solve for.
+            The value from which an iteration begins, if there are too many states to solve for.
         """
         if not self.is_solved:
-            result = self.sweep(0.0, _MOST_EVALUATION_SWEEPS, policy, start)
-            self.expect_converged(result)
+            result = self.iterate_value(0.0, _MOST_EVALUATION_SWEEPS, policy, start)
+            self.check_converged(result)
             return result.value
         states = len(self.reward)
-        discounted = np.zeros((states, states))
+        discounted = np.zeros((states, states))  # gamma P
         for control, discount in enumerate(self.discount):
-            chosen = np.flatnonzero(policy[:, control])
-            weight = discount * policy[chosen, control]
-            following = self.transition.rows(np.full_like(chosen, control), chosen)
-            discounted[chosen] += weight[:, None] * following
+            taking = np.flatnonzero(policy[:, control])  # states in which the control is taken
+            weight = discount * policy[taking, control]
+            next_state = self.transition.rows(np.full_like(taking, control), taking)
+            discounted[taking] += weight[:, None] * next_state
         reward = np.sum(policy * self.reward, axis=1)
         return np.asarray(np.linalg.solve(np.eye(states) - discounted, reward))
 
-    def improved(self, control: Index, start: Float) -> tuple[Index, Float]:
+    def improve_policy(self, control: Index, start: Float) -> tuple[Index, Float]:
         """Return the best controls (S,) and their value (S,), by policy iteration (Howard 1960).
 
         Parameters
         ----------
         control : (S,) array
-            Controls to begin with.
+            The controls to begin with.
         start : (S,) array
-            About their value.
+            An estimate of their value.
         """
-        states, every = np.arange(len(control)), np.eye(len(self.discount))
-        value = self.value_of(every[control], start)
+        states = np.arange(len(control))
+        certain = np.eye(len(self.discount))
+        value = self.evaluate(certain[control], start)
         while True:
             action_value = self.action_value(value)
             gain = action_value.max(axis=1) - action_value[states, control]
-            better = np.where(gain > self.rounding(value), np.argmax(action_value, axis=1), control)
+            is_gain_real = gain > self.rounding_error(value)
+            better = np.where(is_gain_real, np.argmax(action_value, axis=1), control)
             if np.array_equal(better, control):
                 return control, value
-            better_value = self.value_of(every[better], value)
+            better_value = self.evaluate(certain[better], value)
             if not better_value.sum() > value.sum():  # an improvement by rounding alone
                 return control, value
-            control, value = better, better_value
+            control = better
+            value = better_value
 
 
 def value_iteration(
@@ -334,70 +422,74 @@ def value_iteration(
 ) -> PlannedPolicy:
     """Return the best policy and its value, by value iteration on the Bellman equation (36).
 
-    Value iteration finds a policy; policy iteration improves it until no control is better by more than
-    rounding. The value is that of the policy that is returned: the solution of its linear equations, or with
-    more than 1,000 states iterated to rounding.
+    Value iteration finds a policy; policy iteration improves it until no control is better by more
+    than rounding. The value is that of the returned policy: the solution of its linear equations,
+    or with more than 1,000 states iterated to rounding.
 
     Parameters
     ----------
-    transition : TransitionModel, or (U, S, S) dimensionless
-        Row-stochastic.
-    reward : (S, U)
-        Expected reward of one step.
-    discount : float or (U,)
-        gamma, in [0, 1), for all controls or for each: zero where nothing comes after a control. Rounding of
-        the value is about 1e-16 / (1 - gamma) of its size.
+    transition : TransitionModel, or (U, S, S) array
+        The transitions, row-stochastic.
+    reward : (S, U) array
+        The expected reward of one step.
+    discount : float or (U,) array
+        The discount factor gamma in [0, 1), for all controls or for each: zero if nothing comes
+        after a control. Rounding of the value is about 1e-16 / (1 - gamma) of its size.
     tolerance : float
-        Error of the value at which value iteration ends, relative to the largest reward (bounded from the
-        last change of the value by the contraction).
+        The error of the value at which value iteration ends, relative to the largest reward. It is
+        bounded from the last change of the value by the contraction.
     max_iterations : int
-        Sweeps of value iteration at most. With up to 1,000 states policy iteration goes on from there; with
-        more the plan is refused.
+        The largest number of sweeps of value iteration. With up to 1,000 states policy iteration
+        goes on from there; with more the plan is refused.
 
     Returns
     -------
     PlannedPolicy
-        Where several controls are equally good but for rounding, the first of them.
+        Among controls that are equally good but for rounding, the policy takes the first.
 
     Raises
     ------
     PlanningError
-        If shapes do not fit, a reward is not finite, the discount is not between 0 and 1 - 1e-12, or value
-        iteration with more than 1,000 states did not converge.
+        If shapes do not fit, a reward is not finite, the discount is not between 0 and 1 - 1e-12,
+        or value iteration with more than 1,000 states did not converge.
     InvalidModelError
         If a row of the transition does not sum to one.
     """
     if not isinstance(transition, TransitionModel):
         transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
-    problem = _DecisionProcess.checked(transition, reward, discount)
-    most = min(max_iterations, _WARM_UP) if problem.is_solved else max_iterations
-    swept = problem.sweep(tolerance, most)
+    problem = _DecisionProcess.from_arrays(transition, reward, discount)
+    most_sweeps = max_iterations
+    if problem.is_solved:
+        most_sweeps = min(max_iterations, _WARM_UP_SWEEPS)
+    iteration = problem.iterate_value(tolerance, most_sweeps)
     if not problem.is_solved:
-        problem.expect_converged(swept)
-    greedy = np.argmax(problem.action_value(swept.value), axis=1)
-    control, value = problem.improved(greedy, swept.value)
+        problem.check_converged(iteration)
+    greedy = np.argmax(problem.action_value(iteration.value), axis=1)
+    control, value = problem.improve_policy(greedy, iteration.value)
+
+    # The first of equally good controls.
     action_value = problem.action_value(value)
-    least = action_value.max(axis=1) - problem.rounding(value)
+    least = action_value.max(axis=1) - problem.rounding_error(value)
     first_of_equals = np.argmax(action_value >= least[:, None], axis=1)
     policy = np.eye(len(problem.discount))[first_of_equals]
     if not np.array_equal(first_of_equals, control):
-        value = problem.value_of(policy, value)
+        value = problem.evaluate(policy, value)
         action_value = problem.action_value(value)
-    return PlannedPolicy(value, action_value, policy, swept.sweeps)
+    return PlannedPolicy(value, action_value, policy, iteration.sweeps)
 
 
-def given_policy(
+def evaluate_policy(
     transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: Float
 ) -> PlannedPolicy:
-    """Return a policy that was made elsewhere, with its value.
+    """Return a given policy with its value.
 
     Parameters
     ----------
     transition, reward, discount
         As `value_iteration`.
-    policy : (S, U)
+    policy : (S, U) array
         p(U | D), row-stochastic.
     """
-    problem = _DecisionProcess.checked(transition, reward, discount)
-    value = problem.value_of(policy)
-    return PlannedPolicy(value, problem.action_value(value), policy, 0)
+    problem = _DecisionProcess.from_arrays(transition, reward, discount)
+    value = problem.evaluate(policy)
+    return PlannedPolicy(value, problem.action_value(value), policy, iterations=0)

@@ -1,15 +1,16 @@
-"""Quantities of interest: what a belief about the state says about what the sensors would show without noise.
+"""Sensor values without noise, and rewards, under a belief about the state.
 
-The quantity depends on the state, the control and the uncertain parameters of the asset, of which there are
-draws. Given a belief, its distribution is a mixture of point values, so that mean, standard deviation and
-quantiles are exact: Kapteyn et al. 2021, eqs. (3) and (37).
+A sensor value depends on the state, the control and the uncertain parameters of the asset, of which
+there are draws. Given a belief, its distribution is a mixture of points, so that mean, standard
+deviation and quantiles are exact: Kapteyn et al. 2021, eqs. (3) and (37).
 
-Rewards for health, control and error follow from it with their uncertainty, eqs. (9)-(11): what counts as a
-limit, what a control is worth and how an error is scaled comes from the scenario.
+Rewards for health, control and error follow with their uncertainty, eqs. (9)-(11). The scenario
+says which value is a limit, what a control is worth and how an error is scaled.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,35 +18,76 @@ from scipy.special import ndtr
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.errors import InvalidModelError, said
-from twin_master.network.transition import distribution, expect_shape
+from twin_master.errors import InvalidModelError
+from twin_master.network.transition import check_shape, distribution
 
-TIE = 1e-12
-"""A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""
+ROUNDING = 1e-12
+"""A cumulative probability reaches a level if it misses it by no more than this."""
+HEALTH = 0
+"""Index of the health reward."""
+CONTROL = 1
+"""Index of the control reward."""
+ERROR = 2
+"""Index of the error reward."""
+REWARD_COUNT = 3
+"""Number of rewards."""
+
+
+class SortedValues(NamedTuple):
+    """The N = S U E values of each sensor, in rising order.
+
+    Attributes
+    ----------
+    state_and_control : (G, N) array
+        The index of the pair of state and control to which a value belongs.
+    draw_weight : (G, N) array
+        The probability of the draw to which it belongs.
+    value : (G, N) array
+        The value.
+    """
+
+    state_and_control: Index
+    draw_weight: Float
+    value: Float
 
 
 @compiled
-def _quantiles(
-    weight: Float, order: Index, owner: Index, point_weight: Float, value: Float, levels: Float, result: Float
+def _fill_quantiles(
+    weight: Float, sorted_values: SortedValues, levels: Float, result: Float
 ) -> None:
-    """Fill result (B, P, G): for each belief and sensor walk up the sorted points until each level is met."""
-    for sensor in range(order.shape[0]):
+    """Fill result (B, P, G) with the quantiles of each sensor under each belief.
+
+    For each belief and sensor, the sorted values are passed until each level is reached.
+
+    Parameters
+    ----------
+    weight : (B, S U) array
+        The beliefs over pairs of state and control.
+    sorted_values : SortedValues
+        The values of each sensor.
+    levels : (P,) array
+        The levels, increasing.
+    result : (B, P, G) array
+        To be filled.
+    """
+    pair, draw_weight, value = sorted_values
+    for sensor in range(value.shape[0]):
         for belief in range(weight.shape[0]):
-            reached = 0.0
+            cumulative = 0.0
             level = 0
-            last = value[sensor, 0]
-            for k in range(order.shape[1]):
-                share = weight[belief, owner[sensor, k]]
-                if share > 0.0:
-                    reached += share * point_weight[sensor, k]
-                    last = value[sensor, k]
-                    while level < len(levels) and reached >= levels[level]:
-                        result[belief, level, sensor] = last
+            last_value = value[sensor, 0]
+            for k in range(value.shape[1]):
+                pair_weight = weight[belief, pair[sensor, k]]
+                if pair_weight > 0.0:
+                    cumulative += pair_weight * draw_weight[sensor, k]
+                    last_value = value[sensor, k]
+                    while level < len(levels) and cumulative >= levels[level]:
+                        result[belief, level, sensor] = last_value
                         level += 1
                     if level == len(levels):
                         break
             while level < len(levels):  # a level of one, and a sum that rounds below it
-                result[belief, level, sensor] = last
+                result[belief, level, sensor] = last_value
                 level += 1
 
 
@@ -54,18 +96,20 @@ class QuantityModel:
 
     Parameters
     ----------
-    value_per_draw : (E, S, U, G)
-        One value for each of E draws of the uncertain parameters, S states, U controls and G sensors, SI.
-    draw_weight : (E,), optional
-        Probability of each draw; equal by default.
+    value_per_draw : (E, S, U, G) array
+        One value for each of E draws of the uncertain parameters, S states, U controls and G
+        sensors, SI.
+    draw_weight : (E,) array, optional
+        The probability of each draw; equal by default.
 
     Attributes
     ----------
-    value_per_draw : (E, S, U, G)
-        SI, read-only.
-    draw_weight : (E,)
-        Read-only.
+    value_per_draw : (E, S, U, G) array
+        The values, SI, read-only.
+    draw_weight : (E,) array
+        The probability of each draw, read-only.
     draw_count, state_count, control_count, sensor_count : int
+        The lengths of the axes.
 
     Raises
     ------
@@ -75,17 +119,22 @@ class QuantityModel:
 
     def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:
         values = np.array(value_per_draw, dtype=np.float64, order="C")
-        expect_shape("values", values.shape, "draws", "states", "controls", "sensors")
+        check_shape("values", values.shape, "draws", "states", "controls", "sensors")
         if values.size == 0:
             raise InvalidModelError(f"expected one value or more, got the shape {values.shape}")
-        if not np.all(np.isfinite(values)):
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
-            raise InvalidModelError(said("network.value", where=where, value=values[where]))
+        is_finite = np.isfinite(values)
+        if not np.all(is_finite):
+            position = tuple(int(i) for i in np.argwhere(~is_finite)[0])
+            raise InvalidModelError(
+                f"value at (draw, state, control, sensor) {position} is {values[position]}; "
+                "expected finite values"
+            )
         values.setflags(write=False)
         self.value_per_draw: Float = values
         self.draw_count, self.state_count, self.control_count, self.sensor_count = values.shape
-        weight = np.full(self.draw_count, 1.0 / self.draw_count) if draw_weight is None else draw_weight
-        self.draw_weight = distribution(weight, size=self.draw_count, name="draw weights")
+        if draw_weight is None:
+            draw_weight = np.full(self.draw_count, 1.0 / self.draw_count)
+        self.draw_weight = distribution(draw_weight, size=self.draw_count, name="draw weights")
 
     @cached_property
     def mean(self) -> Float:
@@ -95,21 +144,24 @@ class QuantityModel:
     @cached_property
     def variance(self) -> Float:
         """Variance over the draws (S, U, G)."""
-        return np.asarray(np.tensordot(self.draw_weight, (self.value_per_draw - self.mean) ** 2, axes=1))
+        deviation = self.value_per_draw - self.mean
+        return np.asarray(np.tensordot(self.draw_weight, deviation**2, axes=1))
 
     @cached_property
-    def _sorted(self) -> tuple[Index, Index, Float, Float]:
-        """Order (G, N) of all N = S * U * E points of each sensor, their owner, weight and value."""
-        points = self.value_per_draw.transpose(3, 1, 2, 0).reshape(self.sensor_count, -1)
-        order = np.argsort(points, axis=1, kind="stable").astype(np.int64)
-        owner, draw = np.divmod(order, self.draw_count)
-        return order, owner, self.draw_weight[draw], np.take_along_axis(points, order, axis=1)
+    def _sorted_values(self) -> SortedValues:
+        """The values of each sensor in rising order."""
+        values = self.value_per_draw.transpose(3, 1, 2, 0).reshape(self.sensor_count, -1)
+        order = np.argsort(values, axis=1, kind="stable").astype(np.int64)
+        state_and_control, draw = np.divmod(order, self.draw_count)
+        sorted_values = np.take_along_axis(values, order, axis=1)
+        return SortedValues(state_and_control, self.draw_weight[draw], sorted_values)
 
-    def weights(self, joint: ArrayLike) -> Float:
-        """Return the checked joint (..., S, U)."""
+    def check_joint(self, joint: ArrayLike) -> Float:
+        """Return a joint belief (..., S, U) as an array, or refuse its shape."""
         joint = np.asarray(joint, dtype=np.float64)
         what = "a joint belief, see `known_control`,"
-        expect_shape(what, joint.shape, *joint.shape[:-2], self.state_count, self.control_count)
+        leading = joint.shape[:-2]
+        check_shape(what, joint.shape, *leading, self.state_count, self.control_count)
         return joint
 
     def moments(self, joint: ArrayLike) -> tuple[Float, Float]:
@@ -117,23 +169,24 @@ class QuantityModel:
 
         Parameters
         ----------
-        joint : (..., S, U)
+        joint : (..., S, U) array
             p(D, U), each summing to one.
 
         Returns
         -------
-        tuple of two (..., G)
+        mean, standard_deviation : (..., G) array
             In the unit of the values.
         """
-        weights = self.weights(joint)
-        flat = weights.reshape(-1, self.state_count * self.control_count)
+        joint = self.check_joint(joint)
+        weight = joint.reshape(-1, self.state_count * self.control_count)
         mean_table = self.mean.reshape(-1, self.sensor_count)
-        mean = flat @ mean_table
-        # Centred, so that a certain belief gives the spread of the draws and no cancellation.
-        variance = flat @ self.variance.reshape(-1, self.sensor_count)
-        for row in range(len(flat)):
-            variance[row] += flat[row] @ (mean_table - mean[row]) ** 2
-        shape = (*weights.shape[:-2], self.sensor_count)
+        mean = weight @ mean_table
+        # Variance within a pair of state and control, plus that of the means. The latter is
+        # centred, so that a certain belief gives the variance of the draws without cancellation.
+        variance = weight @ self.variance.reshape(-1, self.sensor_count)
+        for row in range(len(weight)):
+            variance[row] += weight[row] @ (mean_table - mean[row]) ** 2
+        shape = (*joint.shape[:-2], self.sensor_count)
         return mean.reshape(shape), np.sqrt(variance).reshape(shape)
 
     def quantiles(self, joint: ArrayLike, levels: ArrayLike) -> Float:
@@ -143,53 +196,78 @@ class QuantityModel:
 
         Parameters
         ----------
-        joint : (..., S, U)
+        joint : (..., S, U) array
             p(D, U), each summing to one.
-        levels : (P,)
+        levels : (P,) array
             Increasing, in (0, 1].
 
         Returns
         -------
-        (..., P, G)
+        (..., P, G) array
             In the unit of the values.
         """
-        weights = self.weights(joint)
-        chosen = np.array(levels, dtype=np.float64)
-        if chosen.ndim != 1 or np.any(np.diff(chosen) < 0) or not np.all((chosen > 0.0) & (chosen <= 1.0)):
-            raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {chosen}")
-        flat = np.require(weights.reshape(-1, self.state_count * self.control_count), np.float64, ["C", "W"])
-        result = np.empty((len(flat), len(chosen), self.sensor_count))
-        order, owner, point_weight, value = self._sorted
-        _quantiles(flat, order, owner, point_weight, value, chosen - TIE, result)
-        return result.reshape(*weights.shape[:-2], len(chosen), self.sensor_count)
+        joint = self.check_joint(joint)
+        levels = np.array(levels, dtype=np.float64)
+        is_increasing = levels.ndim == 1 and not np.any(np.diff(levels) < 0)
+        if not is_increasing or not np.all((levels > 0.0) & (levels <= 1.0)):
+            raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {levels}")
+        weight = joint.reshape(-1, self.state_count * self.control_count)
+        weight = np.require(weight, np.float64, ["C", "W"])  # as the compiled loop expects it
+        result = np.empty((len(weight), len(levels), self.sensor_count))
+        _fill_quantiles(weight, self._sorted_values, levels - ROUNDING, result)
+        return result.reshape(*joint.shape[:-2], len(levels), self.sensor_count)
 
 
-def _error_moments(observation: Float, shown: Float, variance: Float, scale: Float) -> tuple[Float, Float]:
-    """Return mean and variance of the error reward: minus the mean distance of observation and model.
+def _error_moments(
+    observation: Float, mean: Float, variance: Float, scale: Float
+) -> tuple[Float, Float]:
+    """Return mean and variance (...) of the error reward: minus the mean distance from the model.
 
-    What the sensors show is independently normal, and the distance of such a variable from a point has a
-    folded normal distribution. observation is (G,), NaN for a lost sensor, which is left out; shown and
-    variance are (..., G), and scale is broadcast against them.
+    Sensor values are independently normal. The distance of a normal variable from a point has a
+    folded normal distribution.
+
+    Parameters
+    ----------
+    observation : (G,) array
+        The observed values, SI; NaN for a lost sensor, which is left out.
+    mean, variance : (..., G) array
+        Moments of the sensor values without noise.
+    scale : (..., G) or (..., 1) array
+        The error that costs one.
     """
-    seen = ~np.isnan(observation)
-    distance, squared = np.abs(observation - shown)[..., seen], variance[..., seen]
-    deviation = np.sqrt(squared)
-    share = np.divide(distance, deviation, out=np.full_like(distance, np.inf), where=deviation > 0.0)
-    folded = distance * (1.0 - 2.0 * ndtr(-share))
-    folded += deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * share**2)
-    unit = 1.0 / (np.broadcast_to(scale, shown.shape)[..., seen] * seen.sum())
-    left = np.maximum(distance**2 + squared - folded**2, 0.0)
-    return -(folded * unit).sum(axis=-1), (left * unit**2).sum(axis=-1)
+    is_present = ~np.isnan(observation)
+    distance = np.abs(observation - mean)[..., is_present]
+    variance = variance[..., is_present]
+    deviation = np.sqrt(variance)
+    standardized = np.full_like(distance, np.inf)  # for a value without variance
+    np.divide(distance, deviation, out=standardized, where=deviation > 0.0)
+    folded_mean = distance * (1.0 - 2.0 * ndtr(-standardized))
+    folded_mean += deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * standardized**2)
+    folded_variance = np.maximum(distance**2 + variance - folded_mean**2, 0.0)
+    cost = 1.0 / (np.broadcast_to(scale, mean.shape)[..., is_present] * is_present.sum())
+    return -(folded_mean * cost).sum(axis=-1), (folded_variance * cost**2).sum(axis=-1)
 
 
-def _mixed(weight: Float, mean: Float, within: Float) -> tuple[Float, Float]:
-    """Return mean and variance (B, R) of mixtures with weights (B, ...) of parts with moments (R, ...)."""
-    flat, means, variances = (part.reshape(len(part), -1) for part in (weight, mean, within))
-    # Of each belief what it would be alone, which a product of matrices does not give.
-    whole, spread = (np.einsum("bn,rn->br", flat, part) for part in (means, variances))
-    for row, own, center in zip(spread, flat, whole, strict=True):
-        row += (means - center[:, None]) ** 2 @ own
-    return whole, spread
+def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float, Float]:
+    """Return mean and variance (B, R) of R quantities under B mixtures.
+
+    Parameters
+    ----------
+    weight : (B, ...) array
+        The weights of the components in each mixture.
+    mean, variance : (R, ...) array
+        Moments of each quantity in each component.
+    """
+    weight = weight.reshape(len(weight), -1)
+    mean = mean.reshape(len(mean), -1)
+    variance = variance.reshape(len(variance), -1)
+    # A sum gives each belief what it has alone; a product of matrices does not, to the last bit.
+    mixture_mean = np.einsum("bn,rn->br", weight, mean)
+    mixture_variance = np.einsum("bn,rn->br", weight, variance)
+    for b in range(len(weight)):
+        deviation = mean - mixture_mean[b][:, None]
+        mixture_variance[b] += deviation**2 @ weight[b]
+    return mixture_mean, mixture_variance
 
 
 @dataclass(frozen=True)
@@ -199,22 +277,22 @@ class RewardModel:
     Attributes
     ----------
     quantity : QuantityModel
-        What the sensors would show without noise, for each draw, state and control.
+        The sensor values without noise, for each draw, state and control.
     limit : float or tuple of float
-        Sensor value at which the health reward is zero, in its unit, positive; one, or one for each of the
-        sensors that count.
+        The sensor value at which the health reward is zero, SI, positive: one, or one for each of
+        the sensors that count.
     control_reward : tuple of float
-        One for each control.
+        The reward of each control.
     error_scale : float or tuple of float
-        Normalised error that costs one, in its unit, positive; one, or one for each sensor.
+        The normalised error that costs one, SI, positive: one, or one for each sensor.
     control_normaliser : tuple of float or None
-        For each control the figure by which observation and model are divided before their distance is
-        taken (the load factor); None for ones.
+        For each control the number by which observation and model are divided before their distance
+        is taken, such as the load factor; None for ones.
     health_sensors : tuple of int or None
-        Indices of the sensors that count for the health reward; None for all.
-    true_per_draw : (E, S, U, G), optional
-        What is there at the sensors, SI, where that is not what they show: limits and health are of the
-        structure, and a gauge that is known to show too little does not make it healthier.
+        The indices of the sensors that count for the health reward; None for all.
+    true_per_draw : (E, S, U, G) array, optional
+        The true values at the sensors, SI, if sensors are known to show something else. Limits and
+        health belong to the structure: a gauge that shows too little does not make it healthier.
     """
 
     quantity: QuantityModel
@@ -226,48 +304,55 @@ class RewardModel:
     true_per_draw: Float | None = None
 
     def health(self, values: Float) -> Float:
-        """Return the health reward of what is there at the sensors (..., G): one minus the largest share.
+        """Return the health reward (...) of true values at the sensors (..., G), SI.
 
-        One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
+        It is one without load, zero if one sensor reaches its limit, and negative beyond.
         """
-        chosen = slice(None) if self.health_sensors is None else list(self.health_sensors)
-        # As a share first: rounding is monotonic: for one limit the result is that of the largest value.
-        return np.asarray(1.0 - (values[..., chosen] / np.asarray(self.limit)).max(axis=-1))
+        sensors = slice(None) if self.health_sensors is None else list(self.health_sensors)
+        # Divided by the limit first: for one limit the result is that of the largest value, because
+        # rounding is monotonic.
+        fraction_of_limit = values[..., sensors] / np.asarray(self.limit)
+        return np.asarray(1.0 - fraction_of_limit.max(axis=-1))
 
     @cached_property
     def health_per_draw(self) -> Float:
         """Health reward of each draw, state and control (E, S, U)."""
-        return self.health(self.quantity.value_per_draw if self.true_per_draw is None else self.true_per_draw)
+        if self.true_per_draw is None:
+            return self.health(self.quantity.value_per_draw)
+        return self.health(self.true_per_draw)
 
     @cached_property
     def _error_scale(self) -> Float:
-        """Error that costs one under each control (U, 1) or (U, G)."""
+        """Error that costs one under each control (U, 1) or (U, G), SI."""
         normaliser = self.control_normaliser or (1.0,) * len(self.control_reward)
         return np.asarray(self.error_scale * np.array(normaliser)[:, None])
 
     @cached_property
     def _health_moments(self) -> tuple[Float, Float]:
         """Mean and variance of the health reward over the draws, each (S, U)."""
-        mean = np.tensordot(self.quantity.draw_weight, self.health_per_draw, axes=1)
-        variance = np.tensordot(self.quantity.draw_weight, (self.health_per_draw - mean) ** 2, axes=1)
+        weight = self.quantity.draw_weight
+        mean = np.tensordot(weight, self.health_per_draw, axes=1)
+        variance = np.tensordot(weight, (self.health_per_draw - mean) ** 2, axes=1)
         return mean, variance
 
     def planning_reward(self, health_weight: float, control_weight: float) -> Float:
         """Return the expected reward of each state and control for planning, eq. (36): (S, U)."""
-        worth = np.multiply(control_weight, self.control_reward)
-        return np.asarray(health_weight * self._health_moments[0] + worth)
+        mean_health, _ = self._health_moments
+        weighted_control = np.multiply(control_weight, self.control_reward)
+        return np.asarray(health_weight * mean_health + weighted_control)
 
-    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> tuple[Float, Float]:
-        """Return mean and standard deviation of each reward (..., 3), in the order of `REWARD_NAMES`.
-
-        The error reward is NaN where nothing was observed.
+    def expectation(
+        self, joint: ArrayLike, observation: ArrayLike | None = None
+    ) -> tuple[Float, Float]:
+        """Return mean and standard deviation of each reward (..., 3), in order of `REWARD_NAMES`.
 
         Parameters
         ----------
-        joint : (..., S, U)
+        joint : (..., S, U) array
             p(D, U); use `known_control` for a control that is known.
-        observation : (..., G), optional
-            SI, NaN for a lost sensor; without it (prediction) the error reward is NaN.
+        observation : (..., G) array, optional
+            SI, NaN for a lost sensor. Without any observed value, as in a prediction, the error
+            reward is NaN.
 
         Raises
         ------
@@ -275,55 +360,70 @@ class RewardModel:
             If shapes do not fit.
         """
         quantity = self.quantity
-        joint = quantity.weights(joint)
-        lead = joint.shape[:-2]
-        flat = joint.reshape(-1, quantity.state_count, quantity.control_count)
-        health, health_variance = self._health_moments
-        tables = np.stack([health, np.broadcast_to(self.control_reward, health.shape)])
-        within = np.stack([health_variance, np.zeros_like(health)])
-        mean, variance = (
-            np.pad(own, ((0, 0), (0, 1)), constant_values=np.nan) for own in _mixed(flat, tables, within)
+        joint = quantity.check_joint(joint)
+        beliefs = joint.reshape(-1, quantity.state_count, quantity.control_count)
+        mean = np.full((len(beliefs), REWARD_COUNT), np.nan)
+        variance = np.full((len(beliefs), REWARD_COUNT), np.nan)
+
+        health_mean, health_variance = self._health_moments
+        control_mean = np.broadcast_to(self.control_reward, health_mean.shape)
+        mean[:, :ERROR], variance[:, :ERROR] = _mixture_moments(
+            beliefs,
+            np.stack([health_mean, control_mean]),
+            np.stack([health_variance, np.zeros_like(health_mean)]),
         )
+
         if observation is not None:
-            observation = np.asarray(observation, dtype=np.float64)
-            for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
-                if not np.isnan(seen).all():
-                    state, chosen = np.nonzero(flat[row])
-                    shown = quantity.value_per_draw[:, state, chosen]
-                    error, _ = _error_moments(seen, shown, np.zeros_like(shown), self._error_scale[chosen])
-                    share = quantity.draw_weight[:, None] * flat[row, state, chosen]
-                    mean[row, 2] = (share * error).sum()
-                    variance[row, 2] = (share * (error - mean[row, 2]) ** 2).sum()
-        return mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3)
+            observations = np.asarray(observation, dtype=np.float64)
+            for b, row in enumerate(observations.reshape(-1, quantity.sensor_count)):
+                if not np.isnan(row).all():
+                    mean[b, ERROR], variance[b, ERROR] = self._error_reward(beliefs[b], row)
+        shape = (*joint.shape[:-2], REWARD_COUNT)
+        return mean.reshape(shape), np.sqrt(variance).reshape(shape)
+
+    def _error_reward(self, belief: Float, observation: Float) -> tuple[float, float]:
+        """Return mean and variance of the error reward of an observation (G,) under (S, U)."""
+        state, control = np.nonzero(belief)
+        value = self.quantity.value_per_draw[:, state, control]  # (E, n, G)
+        error, _ = _error_moments(
+            observation, value, np.zeros_like(value), self._error_scale[control]
+        )
+        weight = self.quantity.draw_weight[:, None] * belief[state, control]
+        mean = (weight * error).sum()
+        variance = (weight * (error - mean) ** 2).sum()
+        return mean, variance
 
     def expectation_of(
         self,
         weight: Float,
         draw: Index,
         controls: slice,
-        shown: Float,
+        mean: Float,
         variance: Float,
         observation: Float | None = None,
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation (B, 3) under beliefs over hypotheses, states and controls.
+        """Return mean and standard deviation (B, 3) under beliefs that contain static hypotheses.
 
         Parameters
         ----------
-        weight : (B, K, S, U')
-            Probabilities, which sum to one.
-        draw : (K,)
-            Draw of the parameter of each hypothesis.
+        weight : (B, K, S, U') array
+            The beliefs over hypotheses, states and controls, which sum to one.
+        draw : (K,) array
+            The draw of the parameter of each hypothesis.
         controls : slice
-            Which of the controls the U' are.
-        shown, variance : (K, S, U', G)
-            What each sensor shows there without noise, independently normal, SI.
-        observation : (G,), optional
-            SI, NaN for a lost sensor; without it the error reward is NaN.
+            The U' controls among all.
+        mean, variance : (K, S, U', G) array
+            Moments of each sensor's value without noise, independently normal, SI.
+        observation : (G,) array, optional
+            SI, NaN for a lost sensor; if left out, the error reward is NaN.
         """
-        mean = np.full((3, *shown.shape[:-1]), np.nan)
-        within = np.zeros_like(mean)
-        mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self.control_reward[controls]
+        reward_mean = np.full((REWARD_COUNT, *mean.shape[:-1]), np.nan)
+        reward_variance = np.zeros_like(reward_mean)
+        reward_mean[HEALTH] = self.health_per_draw[draw][:, :, controls]
+        reward_mean[CONTROL] = self.control_reward[controls]
         if observation is not None and not np.isnan(observation).all():
-            mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
-        whole, spread = _mixed(weight, mean, within)
-        return whole, np.sqrt(spread)
+            reward_mean[ERROR], reward_variance[ERROR] = _error_moments(
+                observation, mean, variance, self._error_scale[controls]
+            )
+        mixture_mean, mixture_variance = _mixture_moments(weight, reward_mean, reward_variance)
+        return mixture_mean, np.sqrt(mixture_variance)

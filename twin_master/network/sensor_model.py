@@ -1,97 +1,132 @@
-"""Gaussian sensors: the likelihood of what they show, residuals, and classes of what they may show.
+"""Gaussian sensors: the likelihood of their values in each state, and residuals.
 
 Kapteyn et al. 2021, eqs. (30) and (32).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import rel_entr
 
 from reporting.arrays import Float, Index
 from reporting.choices import require_one_of
 from reporting.words import brief
-from twin_master.errors import InvalidModelError, InvalidObservationError, said
-from twin_master.network.kernels import LOG_ROOT_TWO_PI, log_densities, separated
+from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network.gaussian_kernels import (
+    LOG_ROOT_TWO_PI,
+    log_densities,
+    separate_matrix,
+)
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.transition import expect_controls, expect_shape
+from twin_master.network.transition import check_controls, check_shape
 
 Averaging = Literal["outside", "inside"]
-"""Whether draws are averaged over their likelihoods, or their predictions before it."""
-_WORST_SHOWN = 3
-LARGEST = 1e140
-"""Its square is still a number."""
-LEAST_LEFT = 1e-12
-"""What rounding leaves of the share of a sensor that alone tells where in the interval the truth is."""
+"""Whether the likelihoods of the draws are averaged, or those of each sensor."""
+_WORST_LISTED = 3
+"""Sensors that are listed as the worst ones."""
+LARGEST_DISTANCE = 1e140
+"""Distances are cut to this; its square is still a number."""
+LEAST_ONE_MINUS_LEVERAGE = 1e-12
+"""Less than this is a rounding error, if a sensor alone determines the value in the interval."""
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """Predictions where in the interval of each state they fit an observation best.
+class IntervalFit:
+    """Predictions for the point in the interval of each state that fits an observation best.
 
     Attributes
     ----------
-    value, alone : (E, S, G)
-        At the most probable place by all sensors, and for each sensor at that by all the others, SI.
-    left : (S, G) dimensionless
-        Variance of a sensor's noise over that of its observation, given all the others.
-    log_density : (E, S)
-        Of the place, with all that it might have been: what is to be added to the log density of independent
-        sensors at `value`.
+    value : (E, S, G) array
+        The predictions at the most probable point, given all sensors, SI.
+    value_by_others : (E, S, G) array
+        For each sensor the prediction at the most probable point given all other sensors, SI.
+    one_minus_leverage : (S, G) array
+        One minus the leverage: the variance of a sensor's noise over that of its observation, given
+        all other sensors.
+    log_density : (E, S) array
+        The log of the factor by which the density of independent sensors at `value` is multiplied
+        to give the density averaged over the interval.
     """
 
     value: Float
-    alone: Float
-    left: Float
+    value_by_others: Float
+    one_minus_leverage: Float
     log_density: Float
+
+
+class _DensityTerms(NamedTuple):
+    """What all observations by the same sensors under one control share, see `log_densities`.
+
+    Attributes
+    ----------
+    log_scale : (S,) array
+        The log of the density's factor.
+    draw_offset : (S, E) array
+        Half the square of the difference of each draw from the mean.
+    mean, inverse_deviation : (S, G) array
+        The mean over the draws, and one over the noise; zero for a lost sensor.
+    interval_directions : (S, F, G) array
+        The directions in which the interval of a state moves the sensors.
+    draw_directions : (S, G, R) array
+        The directions in which the draws move the sensors.
+    """
+
+    log_scale: Float
+    draw_offset: Float
+    mean: Float
+    inverse_deviation: Float
+    interval_directions: Float
+    draw_directions: Float
 
 
 class GaussianSensorModel(QuantityModel):
     """Sensors that show a value plus independent Gaussian noise.
 
-    Where the twin doubts its model, an error of the model is added to the noise in quadrature for each
-    state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), the mean over the draws. It
-    is an error that is drawn anew for each sensor and step; a real one stays the same from step to step, so
-    that the term is a safeguard and no description of it.
+    If the twin doubts its model, an error of the model is added to the noise in quadrature for each
+    state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), with the mean over
+    the draws. That error is drawn anew for each sensor and step, while a real one stays the same
+    from step to step. So the term is a safeguard and no description of the error.
 
-    A state may stand for an interval of each factor. Where the truth is inside it moves all sensors together,
-    so that it adds to the covariance of a state and control one term for each factor, of rank one.
+    A state may stand for an interval of each factor. The true value in it moves all sensors
+    together, so that each factor adds one term of rank one to the covariance of the sensors.
 
     Parameters
     ----------
-    strain_per_draw : (E, S, U, G)
-        Noise-free value for each draw e of the uncertain parameters, state, control and sensor, SI.
-    standard_deviation : float or (G,)
-        Of the noise that the twin assumes, SI, positive.
-    draw_weight : (E,), optional
-        Probability of each draw; equal by default.
+    strain_per_draw : (E, S, U, G) array
+        The noise-free value for each draw e of the uncertain parameters, state, control and sensor,
+        SI.
+    standard_deviation : float or (G,) array
+        The standard deviation of the noise that the twin assumes, SI, positive.
+    draw_weight : (E,) array, optional
+        The probability of each draw; equal by default.
     average : {"outside", "inside"}
-        Where the average over the draws stands. "outside", the default, is the integral (30):
-        mean over e of the product over sensors. "inside" is eq. (32) as printed: the product over sensors of
-        the mean over e, as if each sensor had parameters of its own.
-    model_error : float or (G,) dimensionless
-        Standard deviation of the predicted value as a share of it; none by default.
-    interval : (S, U, G, F), optional
-        What each sensor changes by, SI, when a factor moves by one standard deviation inside the interval
-        that the state stands for (`StateSpace.within_interval`); without it the truth is at the levels.
+        Where the average over the draws stands. "outside", the default, is the integral (30): the
+        mean over e of the product over sensors. "inside" is eq. (32) as printed: the product over
+        sensors of the mean over e, as if each sensor had parameters of its own.
+    model_error : float or (G,) array
+        The standard deviation of the predicted value as a fraction of it; zero by default.
+    interval : (S, U, G, F) array, optional
+        The change of each sensor, SI, if a factor moves by one standard deviation within the
+        interval of the state, see `StateSpace.change_within_interval`. If left out, the true values
+        are exactly at the levels.
 
     Raises
     ------
     InvalidModelError
-        If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
+        If shapes do not fit, a value is not finite, a standard deviation is not positive, or an
+        error is negative.
     InvalidChoiceError
         If `average` is another word.
     """
 
     interval: Float
-    """What each sensor changes by within the interval of a state (S, U, G, F), SI."""
+    """Change of each sensor within the interval of a state (S, U, G, F), SI, read-only."""
     independent_standard_deviation: Float
-    """Noise and model error of each state, control and sensor (S, U, G), SI, independent; read-only."""
+    """Noise and model error of each state, control and sensor (S, U, G), SI, read-only."""
     total_standard_deviation: Float
-    """The same with what a sensor changes by within the interval of a state (S, U, G), SI; read-only."""
+    """The same with the change within the interval of the state (S, U, G), SI, read-only."""
 
     def __repr__(self) -> str:
         draws, states, controls, sensors = self.value_per_draw.shape
@@ -108,100 +143,133 @@ class GaussianSensorModel(QuantityModel):
     ) -> None:
         require_one_of(average, get_args(Averaging), "average")
         super().__init__(strain_per_draw, draw_weight)
-        for what, given, positive in (
-            ("positive noise standard deviation", standard_deviation, True),
-            ("relative model error that is not negative", model_error, False),
-        ):
-            value = np.array(given, dtype=np.float64)
-            enough = value > 0.0 if positive else value >= 0.0
-            if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
-                count = self.sensor_count
-                raise InvalidModelError(said("network.one_or_each", what=what, sensors=count, value=value))
-        self.standard_deviation: Float = np.full(self.sensor_count, standard_deviation, np.float64)
-        self.model_error: Float = np.full(self.sensor_count, model_error, np.float64)
-        independent = np.hypot(
-            self.standard_deviation, self.model_error * self.mean
-        )  # a root of a square rounds
-        shape = independent.shape
-        self.interval = np.zeros((*shape, 0)) if interval is None else np.array(interval, dtype=np.float64)
-        expect_shape("changes within intervals", self.interval.shape, *shape, "factors")
+        noise = np.array(standard_deviation, dtype=np.float64)
+        self._check_one_or_each(noise, noise > 0.0, "positive noise standard deviation")
+        relative_error = np.array(model_error, dtype=np.float64)
+        self._check_one_or_each(
+            relative_error, relative_error >= 0.0, "relative model error that is not negative"
+        )
+        self.standard_deviation: Float = np.full(self.sensor_count, noise)
+        self.model_error: Float = np.full(self.sensor_count, relative_error)
+        # Not the root of a sum of squares, which rounds where there is no model error.
+        independent = np.hypot(self.standard_deviation, self.model_error * self.mean)
+
+        if interval is None:
+            self.interval = np.zeros((*independent.shape, 0))
+        else:
+            self.interval = np.array(interval, dtype=np.float64)
+        check_shape("changes within intervals", self.interval.shape, *independent.shape, "factors")
         if not np.all(np.isfinite(self.interval)):
             raise InvalidModelError("expected finite changes within intervals")
         self.independent_standard_deviation = independent
-        self.total_standard_deviation = np.hypot(independent, np.linalg.norm(self.interval, axis=-1))
+        self.total_standard_deviation = np.hypot(
+            independent, np.linalg.norm(self.interval, axis=-1)
+        )
         for array in (independent, self.total_standard_deviation, self.interval):
             array.setflags(write=False)
         self.averages_inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
-        beside = (self.value_per_draw - self.mean) / independent
-        size = float(np.max(np.abs(self.value_per_draw) / independent))
-        part, self._function = separated(np.moveaxis(beside, 0, -1).reshape(-1, self.draw_count), size)
-        self._part = part.reshape(*shape, len(self._function))
-        self._shared = dict[int, tuple[Any, ...]]()  # by control, of the sensors that were there last
+
+        # The draws differ from their mean by few directions (S, U, G, R) times coefficients (R, E).
+        difference = (self.value_per_draw - self.mean) / independent
+        largest = float(np.max(np.abs(self.value_per_draw) / independent))
+        rows_of_draws = np.moveaxis(difference, 0, -1).reshape(-1, self.draw_count)
+        directions, self._draw_coefficients = separate_matrix(rows_of_draws, largest)
+        self._draw_directions = directions.reshape(*independent.shape, len(self._draw_coefficients))
+        # By control: the sensors that were present last (as bytes), and the terms of the density.
+        self._last_terms: dict[int, tuple[bytes, _DensityTerms]] = {}
+
+    def _check_one_or_each(self, value: Float, is_valid: NDArray[np.bool_], what: str) -> None:
+        """Refuse a value that is neither one finite, valid number nor one for each sensor."""
+        has_shape = value.shape in ((), (self.sensor_count,))
+        if not has_shape or not np.all(np.isfinite(value) & is_valid):
+            raise InvalidModelError(
+                f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+            )
 
     @property
-    def beside(self) -> dict[str, Any]:
-        """Keywords that a kind of sensors has beside those of all."""
+    def extra_arguments(self) -> Mapping[str, Any]:
+        """Keyword arguments of a subclass that `GaussianSensorModel` does not have."""
         return {}
 
-    def checked(self, observation: ArrayLike) -> Float:
-        """Return observations (..., G) in which NaN stands for a lost sensor.
+    def check_observation(self, observation: ArrayLike) -> Float:
+        """Return observations (..., G) as an array, in which NaN stands for a lost sensor.
 
         Raises
         ------
         InvalidObservationError
-            The shape is another one, or a value is infinite.
+            If the shape is another one, or a value is infinite.
         """
         observation = np.array(observation, dtype=np.float64, order="C")
-        shape = observation.shape
-        expect_shape("sensor values", shape, *shape[:-1], self.sensor_count, error=InvalidObservationError)
-        if np.any(np.isinf(observation)):
-            where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
-            raise InvalidObservationError(said("network.infinite", where=where))
+        leading = observation.shape[:-1]
+        check_shape(
+            "sensor values",
+            observation.shape,
+            *leading,
+            self.sensor_count,
+            error=InvalidObservationError,
+        )
+        is_infinite = np.isinf(observation)
+        if np.any(is_infinite):
+            position = tuple(int(i) for i in np.argwhere(is_infinite)[0])
+            raise InvalidObservationError(
+                f"sensor value at {position} is infinite; expected a number, or NaN for a lost "
+                "sensor"
+            )
         return observation
 
-    def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return of an observation the values of the sensors (G,), and the rest of its log density (S,).
+    def split_observation(self, observation: ArrayLike) -> tuple[Float, Float]:
+        """Return the sensor values of an observation, and the log density of its other parts.
 
-        The rest is that of what does not pass through the sensors, in each state; zero here.
+        Returns
+        -------
+        values : (..., G) array
+            The values of the sensors, SI.
+        log_density : (..., S) array
+            The log density of what does not pass through the sensors, in each state; zero here.
         """
-        return self.checked(observation), np.zeros(self.state_count)
+        return self.check_observation(observation), np.zeros(self.state_count)
 
-    def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
+    def draw_observations(
+        self, state: Index, control_index: int, generator: np.random.Generator
+    ) -> Float:
         """Return one observation drawn in each of N states (N,) under a control: (N, G), SI."""
-        size = len(state), self.sensor_count
-        draw = generator.choice(
-            self.draw_count, size if self.averages_inside else (size[0], 1), p=self.draw_weight
-        )
-        values = self.value_per_draw[draw, state[:, None], control_index, np.arange(self.sensor_count)]
-        within = generator.standard_normal((size[0], self.interval.shape[-1]))
-        noise = self.independent_standard_deviation[state, control_index] * generator.standard_normal(size)
-        moved = np.einsum("ngf,nf->ng", self.interval[state, control_index], within)
-        return np.asarray(values + noise + moved)
+        count = len(state)
+        # With the average inside, each sensor has a draw of its own.
+        draws_per_row = self.sensor_count if self.averages_inside else 1
+        draw = generator.choice(self.draw_count, (count, draws_per_row), p=self.draw_weight)
+        sensors = np.arange(self.sensor_count)
+        values = self.value_per_draw[draw, state[:, None], control_index, sensors]
+        within = generator.standard_normal((count, self.interval.shape[-1]))
+        deviation = self.independent_standard_deviation[state, control_index]
+        noise = deviation * generator.standard_normal((count, self.sensor_count))
+        change = np.einsum("ngf,nf->ng", self.interval[state, control_index], within)
+        return np.asarray(values + noise + change)
 
     def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
         """Return log p(o | D, u) for each state, eq. (30) or (32).
 
         Parameters
         ----------
-        observation : (G,)
-            SI; NaN where the sensor is lost. If all are lost the result is zero.
+        observation : (G,) array
+            SI; NaN where the sensor is lost. If all are lost, the result is zero.
         control_index : int
-            Control in force.
+            The control in force.
 
         Returns
         -------
-        (S,)
-            Density in SI.
+        (S,) array
+            The log density in SI.
 
         Raises
         ------
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        values, told = self.apart(observation)
-        return np.asarray(self._densities(values[None], [control_index], 1)[0, :, 0] + told)
+        values, log_density_beside = self.split_observation(observation)
+        log_density = self._log_densities(values[None], [control_index], 1)[0, :, 0]
+        return np.asarray(log_density + log_density_beside)
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
@@ -211,100 +279,187 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        values, told = self.apart(observations)
-        return np.asarray(self._densities(values, control_index, 1)[..., 0] + told)
+        values, log_density_beside = self.split_observation(observations)
+        log_density = self._log_densities(values, control_index, 1)[..., 0]
+        return np.asarray(log_density + log_density_beside)
 
     def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
-        """Return log p(o_t | D_t, u_t, e) of a sequence for each draw e: (T, G) and (T,) -> (T, S, E).
+        """Return log p(o_t | D_t, u_t, e) of a sequence for each draw e: (T, G), (T,) -> (T, S, E).
 
         Raises
         ------
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        values, told = self.apart(observations)
-        return self._densities(values, control_index, self.draw_count) + told[..., None]
+        values, log_density_beside = self.split_observation(observations)
+        log_density = self._log_densities(values, control_index, self.draw_count)
+        return log_density + log_density_beside[..., None]
 
-    def _densities(self, observations: ArrayLike, control_index: ArrayLike, draws: int) -> Float:
-        """Return log densities (T, S, E) of each draw, or of their average where `draws` is one."""
-        observations = self.checked(observations)
-        control = np.array(control_index, dtype=np.int64)
-        expect_shape("controls", control.shape, control.size)
-        expect_shape("observations", observations.shape, control.size, self.sensor_count)
-        expect_controls(control, self.control_count)
-        inside = self.averages_inside and draws == 1
-        result = np.zeros((len(observations), self.state_count, draws))
-        for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
-            seen = sensors & ~np.isnan(observations)
-            alike: dict[tuple[int, bytes], list[int]] = {}
-            there = seen.view(f"V{self.sensor_count}")[:, 0].tolist()  # as bytes
-            for row, kind in enumerate(zip(control.tolist(), there, strict=True)):
-                alike.setdefault(kind, []).append(row)
-            for kind, rows in alike.items():
-                result[rows] += self._alike(observations[rows], *kind, draws)
-        return result
-
-    def _alike(self, observations: Float, control: int, seen: bytes, draws: int) -> Float:
-        """Return log densities (T, S, E) or (T, S, 1) of what the same sensors show under a control."""
-        there = np.frombuffer(seen, dtype=bool)
-        if self._shared.get(control, (b"",))[0] != seen:
-            self._shared[control] = seen, *self._shared_by(control, there)
-        _, scale, offset, mean, inverse, outward, part = self._shared[control]
-        offset = offset - self._log_weight if draws == 1 else offset
-        result = np.empty((len(observations), self.state_count, draws))
-        shown = np.ascontiguousarray(np.where(there, observations, 0.0).T)
-        log_densities(shown, mean, inverse, outward, part, self._function, offset, scale, result)
-        return result
-
-    def _shared_by(self, control: int, there: NDArray[np.bool_]) -> tuple[Float, ...]:
-        """Return what all observations by the same sensors share, as `log_densities` takes it.
-
-        First are the log of their scale (S,) and half the squares of what each draw adds (S, E). The
-        covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity: with
-        the Cholesky factor L of 1 + interval' interval, outward (F, G) is L^-1 interval'. With d what is
-        observed beside the mean, -|d - A b_e|² / 2 of a draw e is -|d|² / 2 + (A'd) b_e - |A b_e|² / 2.
-        """
-        inverse = np.where(there, 1.0 / self.independent_standard_deviation[:, control], 0.0)
-        interval = self.interval[:, control] * inverse[..., None]
-        part = np.where(there[:, None], self._part[:, control], 0.0)
-        root = np.linalg.cholesky(np.eye(interval.shape[-1]) + interval.swapaxes(1, 2) @ interval)
-        outward = np.linalg.solve(root, interval.swapaxes(1, 2))
-        whole = part - outward.swapaxes(1, 2) @ (outward @ part)
-        offset = 0.5 * np.sum((whole.swapaxes(1, 2) @ part @ self._function) * self._function, axis=1)
-        scale = np.log(inverse[:, there]).sum(axis=1) - LOG_ROOT_TWO_PI * there.sum()
-        scale -= np.log(np.einsum("sff->sf", root)).sum(axis=1)
-        return scale, offset, np.ascontiguousarray(self.mean[:, control]), inverse, outward, whole
-
-    def nearest(
-        self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
-    ) -> Nearest:
-        """Return what the sensors show where in the interval of each state they fit an observation best.
+    def _log_densities(
+        self, observations: ArrayLike, control_index: ArrayLike, draws: int
+    ) -> Float:
+        """Return log densities of a sequence of observations.
 
         Parameters
         ----------
-        observation : (G,)
+        observations : (T, G) array
+            The sensor values, SI; NaN where a sensor is lost.
+        control_index : (T,) array
+            The control in force in each step.
+        draws : int
+            The number E of draws for the density of each draw; 1 for their average.
+
+        Returns
+        -------
+        (T, S, draws) array
+            In SI.
+        """
+        observations = self.check_observation(observations)
+        control = np.array(control_index, dtype=np.int64)
+        check_shape("controls", control.shape, control.size)
+        check_shape("observations", observations.shape, control.size, self.sensor_count)
+        check_controls(control, self.control_count)
+        is_present = ~np.isnan(observations)
+        result = np.zeros((len(observations), self.state_count, draws))
+        if not self.averages_inside or draws != 1:
+            self._add_log_densities(observations, control, is_present, result)
+            return result
+        for is_sensor in np.eye(self.sensor_count, dtype=bool):  # each sensor by itself
+            self._add_log_densities(observations, control, is_sensor & is_present, result)
+        return result
+
+    def _add_log_densities(
+        self, observations: Float, control: Index, is_present: NDArray[np.bool_], result: Float
+    ) -> None:
+        """Add the log densities of observations (T, G) by the present sensors (T, G) to `result`.
+
+        Steps with the same control and the same sensors are computed together.
+        """
+        present_bytes = is_present.view(f"V{self.sensor_count}")[:, 0].tolist()
+        rows_by_kind: dict[tuple[int, bytes], list[int]] = {}
+        for row, kind in enumerate(zip(control.tolist(), present_bytes, strict=True)):
+            rows_by_kind.setdefault(kind, []).append(row)
+        for (one_control, sensors), rows in rows_by_kind.items():
+            result[rows] += self._log_densities_by_same_sensors(
+                observations[rows], one_control, sensors, result.shape[-1]
+            )
+
+    def _log_densities_by_same_sensors(
+        self, observations: Float, control: int, present_bytes: bytes, draws: int
+    ) -> Float:
+        """Return the log densities (T, S, draws) of observations by the same sensors.
+
+        The terms of the last such sensors are kept, because they are mostly the same in the next
+        step.
+        """
+        is_present = np.frombuffer(present_bytes, dtype=bool)
+        last_present, terms = self._last_terms.get(control, (b"", None))
+        if terms is None or last_present != present_bytes:
+            terms = self._density_terms(control, is_present)
+            self._last_terms[control] = (present_bytes, terms)
+        draw_offset = terms.draw_offset
+        if draws == 1:
+            draw_offset = draw_offset - self._log_weight  # the sum over draws is weighted
+        result = np.empty((len(observations), self.state_count, draws))
+        log_densities(
+            np.ascontiguousarray(np.where(is_present, observations, 0.0).T),
+            terms.mean,
+            terms.inverse_deviation,
+            terms.interval_directions,
+            terms.draw_directions,
+            self._draw_coefficients,
+            draw_offset,
+            terms.log_scale,
+            result,
+        )
+        return result
+
+    def _density_terms(self, control: int, is_present: NDArray[np.bool_]) -> _DensityTerms:
+        """Return the terms that all observations by the same sensors share.
+
+        In units of noise the covariance is C = 1 + V V', with V (G, F) the changes within the
+        interval. By Woodbury's identity its inverse is 1 - I' I, where I = L^-1 V' are the interval
+        directions, and L is the Cholesky factor of 1 + V' V. Let d be the observation minus the
+        mean, and A b_e what draw e adds to the mean. Then
+
+            -(d - A b_e)' C^-1 (d - A b_e) / 2 =
+                -d' C^-1 d / 2 + d' (C^-1 A) b_e - b_e' A' C^-1 A b_e / 2.
+        """
+        inverse_deviation = np.where(
+            is_present, 1.0 / self.independent_standard_deviation[:, control], 0.0
+        )
+        interval = self.interval[:, control] * inverse_deviation[..., None]  # V, (S, G, F)
+        transposed = interval.swapaxes(1, 2)
+        root = np.linalg.cholesky(np.eye(interval.shape[-1]) + transposed @ interval)
+        interval_directions = np.linalg.solve(root, transposed)
+
+        directions = np.where(is_present[:, None], self._draw_directions[:, control], 0.0)  # A
+        whitened = directions - interval_directions.swapaxes(1, 2) @ (
+            interval_directions @ directions
+        )
+        coefficients = self._draw_coefficients
+        quadratic = whitened.swapaxes(1, 2) @ directions @ coefficients
+        draw_offset = 0.5 * np.sum(quadratic * coefficients, axis=1)
+
+        log_scale = np.log(inverse_deviation[:, is_present]).sum(axis=1)
+        log_scale = log_scale - LOG_ROOT_TWO_PI * is_present.sum()
+        log_scale -= np.log(np.einsum("sff->sf", root)).sum(axis=1)  # half the log determinant
+        return _DensityTerms(
+            log_scale=log_scale,
+            draw_offset=draw_offset,
+            mean=np.ascontiguousarray(self.mean[:, control]),
+            inverse_deviation=inverse_deviation,
+            interval_directions=interval_directions,
+            draw_directions=whitened,
+        )
+
+    def fit_within_interval(
+        self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
+    ) -> IntervalFit:
+        """Fit the point within the interval of each state to an observation.
+
+        The point has a standard normal prior for each factor, so that the fit is a ridge
+        regression.
+
+        Parameters
+        ----------
+        observation : (G,) array
             SI; NaN where the sensor is lost.
         control_index : int
-        value : (E, S, G)
-            Predictions at the levels, of any draws, SI.
-        precision : float or (G,) dimensionless
-            Of the sensors over the assumed one, where more is known: a sensor that is off tells no place.
+            The control in force.
+        value : (E, S, G) array
+            The predictions of some draws at the levels, SI.
+        precision : float or (G,) array
+            The precision of each sensor over the assumed one. With a low precision a sensor that is
+            off does not shift the fitted point.
         """
-        seen, root = ~np.isnan(observation), np.sqrt(precision)
+        is_present = ~np.isnan(observation)
+        root_precision = np.sqrt(precision)
         inverse_deviation = 1.0 / self.independent_standard_deviation[:, control_index]
-        scaled = (np.where(seen, root, 0.0) * inverse_deviation)[..., None] * self.interval[:, control_index]
-        distance = np.where(seen, observation - value, 0.0).clip(-LARGEST, LARGEST)
-        residual = distance * inverse_deviation * root
-        inverse = np.linalg.inv(np.eye(scaled.shape[-1]) + scaled.swapaxes(1, 2) @ scaled)
-        weight = inverse @ scaled.swapaxes(1, 2)  # (S, F, G)
-        place = (weight @ residual[..., None])[..., 0]
-        moved = (self.interval[:, control_index] @ place[..., None])[..., 0]
-        left = (1.0 - np.einsum("sgf,sfg->sg", scaled, weight)).clip(LEAST_LEFT)
-        return Nearest(
-            value=value + moved,
-            alone=value + (distance - (distance - moved) / left),
-            left=left,
-            log_density=0.5 * (np.linalg.slogdet(inverse)[1] - np.sum(place**2, axis=-1)),
+        interval = self.interval[:, control_index]  # (S, G, F)
+        design_scale = np.where(is_present, root_precision, 0.0) * inverse_deviation
+        design = design_scale[..., None] * interval
+        distance = np.where(is_present, observation - value, 0.0)
+        distance = distance.clip(-LARGEST_DISTANCE, LARGEST_DISTANCE)
+        residual = distance * inverse_deviation * root_precision
+
+        # The most probable point, for each draw and state.
+        normal_matrix = np.eye(design.shape[-1]) + design.swapaxes(1, 2) @ design
+        covariance = np.linalg.inv(normal_matrix)  # (S, F, F)
+        regression = covariance @ design.swapaxes(1, 2)  # (S, F, G)
+        point = (regression @ residual[..., None])[..., 0]  # (E, S, F)
+        change = (interval @ point[..., None])[..., 0]  # (E, S, G)
+
+        # Without one sensor its residual is larger by one over (1 - leverage).
+        leverage = np.einsum("sgf,sfg->sg", design, regression)
+        one_minus_leverage = (1.0 - leverage).clip(LEAST_ONE_MINUS_LEVERAGE)
+        residual_by_others = (distance - change) / one_minus_leverage
+        log_determinant = np.linalg.slogdet(covariance)[1]
+        return IntervalFit(
+            value=value + change,
+            value_by_others=value + (distance - residual_by_others),
+            one_minus_leverage=one_minus_leverage,
+            log_density=0.5 * (log_determinant - np.sum(point**2, axis=-1)),
         )
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
@@ -315,100 +470,71 @@ class GaussianSensorModel(QuantityModel):
         with np.errstate(over="ignore"):  # an absurd observation is what this is for
             residual = (observation - predicted) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
-            best = int(np.argmin(distance.sum(axis=1)))
-        order = np.argsort(-distance[best])[:_WORST_SHOWN]
-        return {f"sensor {index + 1}": float(residual[best, index]) for index in order}
+            best_state = int(np.argmin(distance.sum(axis=1)))
+        worst_first = np.argsort(-distance[best_state])
+        return {
+            f"sensor {index + 1}": float(residual[best_state, index])
+            for index in worst_first[:_WORST_LISTED]
+        }
 
     def noise(self, joint: ArrayLike, _rows: Float | None = None) -> Float:
-        """Return the standard deviation (..., G) of what beliefs (..., S, U) leave unsaid of a sensor, SI.
+        """Return the standard deviation (..., G) of sensors about their values under beliefs, SI.
 
-        It is noise, model error, what a sensor changes by within the interval of a state, and what rows that
-        were observed (..., G + I) say of their own.
+        It contains noise, model error and the change within the interval of the state.
+
+        Parameters
+        ----------
+        joint : (..., S, U) array
+            The joint beliefs over states and controls.
+        _rows : (..., G + I) array, optional
+            What was observed; only sensors with a covariance of their own use it.
         """
-        return np.asarray(
-            np.sqrt(np.tensordot(self.weights(joint), self.total_standard_deviation**2, axes=2))
-        )
+        variance = np.tensordot(self.check_joint(joint), self.total_standard_deviation**2, axes=2)
+        return np.asarray(np.sqrt(variance))
 
 
 def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequence[str]) -> None:
-    """Check that the noise of no sensor hides all that the sensors of its unit can show.
+    """Check that the noise of no sensor hides everything that the sensors of its unit can show.
 
-    Such a noise is a unit that was forgotten. The sensors of a unit are taken together, because a single one
-    may well be insensitive to everything.
+    Such a noise is a unit that was forgotten. The sensors of a unit are taken together, because a
+    single one may be insensitive to everything.
 
     Parameters
     ----------
     key : str
-        Where the noise stands in the scenario.
-    deviation : float or (G,)
+        The key of the noise in the scenario.
+    deviation : float or (G,) array
         Its standard deviation, SI.
-    predicted : (E, S, U, G)
-        What the sensors show without noise, SI.
-    units : (G,)
-        Unit of each sensor.
+    predicted : (E, S, U, G) array
+        The sensor values without noise, SI.
+    units : sequence of str
+        The unit of each of the G sensors.
 
     Raises
     ------
     InvalidModelError
-        It does; the sentence names the sensor, what it can show, and the likely unit.
+        If it does; the message names the sensor, what it can show, and the likely unit.
     """
     noise = np.broadcast_to(np.asarray(deviation, dtype=np.float64), len(units))
-    low, high = predicted.min(axis=(0, 1, 2)), predicted.max(axis=(0, 1, 2))
-    for sensor, (unit, given) in enumerate(zip(units, noise.tolist(), strict=True)):
-        alike = [index for index, other in enumerate(units) if other == unit]
-        least, largest = float(low[alike].min()), float(high[alike].max())
-        reach = max(largest - least, abs(least), abs(largest))
-        if given <= reach:
+    lowest = predicted.min(axis=(0, 1, 2))
+    highest = predicted.max(axis=(0, 1, 2))
+    for sensor, (unit, sensor_noise) in enumerate(zip(units, noise.tolist(), strict=True)):
+        same_unit = [index for index, other_unit in enumerate(units) if other_unit == unit]
+        low = float(lowest[same_unit].min())
+        high = float(highest[same_unit].max())
+        largest_signal = max(high - low, abs(low), abs(high))
+        if sensor_noise <= largest_signal:
             continue
-        advice = f"give it in {unit}, the unit of the sensor"
-        if unit == "1":
+        if unit != "1":
+            advice = f"give it in {unit}, the unit of the sensor"
+        elif sensor_noise * 1e-6 <= largest_signal:
+            advice = (
+                f"it is likely meant in microstrain: write `{key}_microstrain = {sensor_noise:g}`"
+            )
+        else:
             advice = "give it as a strain, without unit"
-            if given * 1e-6 <= reach:
-                advice = f"it is likely meant in microstrain: write `{key}_microstrain = {given:g}`"
-        which, ends = f"{given:g} for sensor {sensor + 1}", (least, largest)
         raise InvalidModelError(
-            said("network.noise", key=key, which=which, unit=unit, ends=ends, advice=advice)
+            f"`{key}` is {sensor_noise:g} for sensor {sensor + 1}, and all that sensors of its "
+            f"unit ({unit}) can show by the twin's model lies between {low:.3g} and {high:.3g}: "
+            f"such a sensor tells nothing; {advice}."
         )
-
-
-SAMPLES = 1500
-"""Observations that are drawn for each control, the same number in each state."""
-CLASSES = 64
-"""Classes that they are joined to at most."""
-_LOST = 0.005
-"""Bits that may be lost where fewer classes do."""
-
-
-def observation_classes(
-    sensor_model: GaussianSensorModel, generator: np.random.Generator, classes: int = CLASSES
-) -> tuple[Float, ...]:
-    """Return for each control the probability of each class of observations in each state: (K, S).
-
-    Observations are drawn in each state, and those are joined that tell the same of the state: whose
-    posterior beliefs, from all states alike, are close in the distance of Hellinger. The probability of a
-    class is that of its members, weighed by their likelihood in each state. There are as few as tell of the
-    state what all observations do, by doubling their number.
-    """
-    from scipy.cluster.vq import kmeans2  # reads a second of modules that a flight does not need
-
-    states = sensor_model.state_count
-    drawn = np.repeat(np.arange(states), -(-SAMPLES // states))
-    result = []
-    for control in range(sensor_model.control_count):
-        rows = sensor_model.sampled(drawn, control, generator)
-        log_likelihood = sensor_model.log_likelihood_sequence(rows, np.full(len(rows), control))
-        told = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
-        told /= told.sum(axis=1, keepdims=True)
-        number, every, joined = 1, _information(told), told.sum(axis=0, keepdims=True)
-        while number < min(classes, len(rows)) and _information(joined) < every - _LOST:
-            number *= 2
-            _, label = kmeans2(np.sqrt(told), min(number, classes), minit="++", rng=generator)
-            joined = np.array([told[label == place].sum(axis=0) for place in np.unique(label)])
-        result.append(joined / joined.sum(axis=0))
-    return tuple(result)
-
-
-def _information(joint: Float) -> float:
-    """Return what observations (K, S) tell of the state, in proportion to their joint probability [bit]."""
-    seen, state = joint.sum(axis=1, keepdims=True), joint.sum(axis=0)
-    return float(rel_entr(joint, seen * state / joint.sum()).sum() / joint.sum() / np.log(2.0))

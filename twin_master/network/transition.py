@@ -1,9 +1,11 @@
-"""Transitions between states: one table, or the product of tables of factors that move independently.
+"""Transitions between states: one table, or the product of tables of independent factors.
 
-A table of S states has S² entries, the tables of its factors together a few hundred. What is small is kept as
-one table, whose loops are the shortest; what is not, as the tables of the factors, each applied along its own
-axis. Distributions, stochastic matrices, the shapes of arrays, and whether they fit in memory, are checked
-where they come in.
+A table of S states has S² entries, while the tables of its factors have a few hundred together. If
+the joint table has few non-zero entries, it is kept as one table, whose loops are the shortest.
+Otherwise the tables of the factors are kept, and each is applied along its own axis.
+
+Distributions, stochastic matrices, the shapes of arrays, and whether arrays fit in memory are
+checked here.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,48 +14,70 @@ from functools import cached_property, reduce
 from math import prod
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from reporting.memory import available_memory
-from twin_master.errors import InvalidModelError, TwinMasterError, said
-from twin_master.network.kernels import Lists
+from reporting.words import comma_list
+from twin_master.errors import InvalidModelError, TwinMasterError
+from twin_master.network.kernels import PredecessorLists
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
+NUMBER = 8
+"""Bytes of a number."""
+TRANSITION_COPIES = 3
+"""Copies of a joint table while it is built: of each control, of all of them, and the checked."""
+JOINT_NON_ZEROS = 512
+"""Non-zero transitions of a control up to which one table is used: it takes some microseconds."""
 
 
 def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
-    """Return `rows` as a checked, read-only array of probability distributions along the last axis.
+    """Return rows of probabilities as a checked, read-only array.
 
     Parameters
     ----------
-    rows : (..., n) dimensionless
-        Finite, non-negative, each row summing to one within `ROW_SUM_TOLERANCE`.
+    rows : (..., n) array
+        Distributions along the last axis: finite, not negative, and each with a sum of one within
+        `ROW_SUM_TOLERANCE`.
     name : str
-        What the matrix is, for the error message.
+        What the matrix is, for the message.
 
     Raises
     ------
     InvalidModelError
-        With the index of the first row that is no distribution.
+        If a row is no distribution; the message has the index of the first.
     """
     matrix = np.array(rows, dtype=np.float64, order="C")
     if matrix.ndim == 0 or matrix.size == 0:
-        raise InvalidModelError(said("network.no_rows", name=name, shape=matrix.shape))
-    for bad, reason in (
-        (~np.isfinite(matrix).all(axis=-1), "holds a value that is not finite"),
-        ((matrix < 0.0).any(axis=-1), "holds a negative probability"),
-        (np.abs(matrix.sum(axis=-1) - 1.0) > ROW_SUM_TOLERANCE, "does not sum to one"),
-    ):
-        if np.any(bad):
-            where = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0]) if matrix.ndim > 1 else ()
-            row = matrix[where]
-            label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
-            sizes, what = (row.sum(), row.min()), f"{name}: {label} {reason}"
-            raise InvalidModelError(said("network.no_distribution", what=what, sizes=sizes))
+        raise InvalidModelError(
+            f"{name}: expected rows of probabilities, got an array of shape {matrix.shape}"
+        )
+    is_infinite = np.asarray(~np.isfinite(matrix).all(axis=-1))
+    _check_rows(matrix, is_infinite, name, "holds a value that is not finite")
+    is_negative = np.asarray((matrix < 0.0).any(axis=-1))
+    _check_rows(matrix, is_negative, name, "holds a negative probability")
+    misses_one = np.abs(matrix.sum(axis=-1) - 1.0) > ROW_SUM_TOLERANCE
+    _check_rows(matrix, misses_one, name, "does not sum to one")
     matrix.setflags(write=False)
     return matrix
+
+
+def _check_rows(matrix: Float, is_wrong: NDArray[np.bool_], name: str, fault: str) -> None:
+    """Refuse a matrix (..., n) of which some rows (...) are wrong, and name the first of them."""
+    if not np.any(is_wrong):
+        return
+    if matrix.ndim == 1:
+        row = matrix
+        label = "the distribution"
+    else:
+        position = tuple(int(i) for i in np.argwhere(is_wrong)[0])
+        row = matrix[position]
+        label = f"row {position[0] if len(position) == 1 else position}"
+    raise InvalidModelError(
+        f"{name}: {label} {fault} (sum {row.sum():.15g}, smallest {row.min():.6g}); every row must "
+        "be non-negative and sum to one within 1e-12"
+    )
 
 
 def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
@@ -65,45 +89,46 @@ def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
         If it has another shape, or does not pass `stochastic_matrix`.
     """
     vector = stochastic_matrix(probabilities, name=name)
-    expect_shape(name, vector.shape, size)
+    check_shape(name, vector.shape, size)
     return vector
 
 
-def expect_shape(
-    what: str, shape: Sequence[int], *wanted: int | str, error: type[TwinMasterError] = InvalidModelError
+def check_shape(
+    what: str,
+    shape: Sequence[int],
+    *expected: int | str,
+    error: type[TwinMasterError] = InvalidModelError,
 ) -> None:
     """Refuse an array of another shape.
 
     Parameters
     ----------
     what : str
-        What it is, for the sentence.
+        What the array is, for the message.
     shape : tuple of int
-        That it has.
-    *wanted : int or str
-        Lengths of its axes; a word stands for any length.
+        Its shape.
+    *expected : int or str
+        The expected length of each axis; a word stands for any length.
     error : type
-        What is raised.
+        The error that is raised.
     """
-    pairs = zip(wanted, shape, strict=False)
-    if len(shape) != len(wanted) or any(isinstance(length, int) and length != has for length, has in pairs):
-        told = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
-        raise error(f"expected {what} of shape ({told}), got {tuple(shape)}")
+    pairs = zip(expected, shape, strict=False)
+    differs = any(isinstance(wanted, int) and wanted != length for wanted, length in pairs)
+    if len(shape) != len(expected) or differs:
+        lengths = ", ".join(map(str, expected))
+        if len(expected) == 1:
+            lengths += ","  # as Python writes a tuple of one entry
+        raise error(f"expected {what} of shape ({lengths}), got {tuple(shape)}")
 
 
-def expect_controls(index: int | Index, count: int) -> None:
-    """Refuse indices of controls, an array of any shape, that are none of `count`."""
-    low, high = np.min(index, initial=0), np.max(index, initial=0)
+def check_controls(index: int | Index, count: int) -> None:
+    """Refuse indices of controls, an array of any shape, that are not between 0 and count - 1."""
+    low = np.min(index, initial=0)
+    high = np.max(index, initial=0)
     if low < 0 or high >= count:
-        raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")
-
-
-NUMBER = 8
-"""Bytes of a number."""
-TRANSITION_COPIES = 3
-"""The tables of the controls, the array of all of them, and the checked copy."""
-JOINT_NON_ZEROS = 512
-"""Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
+        raise InvalidModelError(
+            f"expected control indices between 0 and {count - 1}, got {low} to {high}"
+        )
 
 
 def check_fits(parts: Mapping[str, float], advice: str) -> None:
@@ -112,20 +137,23 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     Parameters
     ----------
     parts : dict of str to float
-        What is to be built, in words with its numbers, and its size [bytes].
+        The size of each array [bytes], by a description in words.
     advice : str
-        What makes it smaller.
+        What makes them smaller.
 
     Raises
     ------
     InvalidModelError
-        They do not; the sentence has all sizes.
+        If they do not fit; the message has all sizes.
     """
-    needed, there = sum(parts.values()), available_memory()
-    if needed > there:
+    needed = sum(parts.values())
+    available = available_memory()
+    if needed > available:
         listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
-        sizes = [f"{size / 1e9:.3g} GB" for size in (needed, there)]
-        raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
+        raise InvalidModelError(
+            f"this does not fit in memory: {listed}, together {needed / 1e9:.3g} GB, and "
+            f"{available / 1e9:.3g} GB are left: {advice}."
+        )
 
 
 def transition_bytes(states: int, controls: int) -> float:
@@ -133,45 +161,55 @@ def transition_bytes(states: int, controls: int) -> float:
     return float(NUMBER * controls * states * states)
 
 
-def predecessor_lists(blocks: Sequence[Float]) -> Lists:
-    """Return the predecessors of each level of blocks (U, L, L), one block after the other, for the loops.
+def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
+    """Return the predecessors of each level of blocks (U, L, L), one block after the other.
 
-    Unsigned indices spare the loops the test for negative ones.
+    Unsigned indices spare the compiled loops the test for negative ones.
     """
+    # One row for each control and level: the probabilities to come from each level.
     rows = [block.transpose(0, 2, 1).reshape(-1, block.shape[1]) for block in blocks]
-    start = np.cumsum([0, *np.concatenate([np.count_nonzero(own, axis=1) for own in rows])])
-    probability = np.concatenate([own[own != 0.0] for own in rows])
-    return (
-        np.array([block.shape[1] for block in blocks], dtype=np.int64),
-        np.cumsum([0, *map(len, rows)])[:-1],
-        start.astype(np.uint64),
-        np.concatenate([np.nonzero(own)[1] for own in rows]).astype(np.uint64),
-        probability,
-        np.log(probability),
+    non_zero_counts = np.concatenate([np.count_nonzero(table, axis=1) for table in rows])
+    probability = np.concatenate([table[table != 0.0] for table in rows])
+    predecessor = np.concatenate([np.nonzero(table)[1] for table in rows])
+    first_row = np.cumsum([0, *map(len, rows)])[:-1]
+    start = np.cumsum([0, *non_zero_counts])
+    return PredecessorLists(
+        levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
+        first_row=first_row,
+        start=start.astype(np.uint64),
+        predecessor=predecessor.astype(np.uint64),
+        probability=probability,
+        log_probability=np.log(probability),
     )
 
 
 @dataclass(frozen=True)
 class TransitionModel:
-    """p(D_t | D_{t-1}, U_{t-1}), row-stochastic for each control: Kapteyn et al. 2021, eqs. (28)-(29).
+    """p(D_t | D_{t-1}, U_{t-1}), row-stochastic for each control: Kapteyn et al. 2021, (28)-(29).
 
     The joint state is that of the blocks in C order; its transition is the product of theirs.
 
     Attributes
     ----------
-    blocks : tuple of (U, L, L), dimensionless
-        ``block[u, i, j]`` is the probability to go from level i to level j of the block under control u. A
-        single block is the table (U, S, S) of all states.
+    blocks : tuple of (U, L, L) array
+        ``block[u, i, j]`` is the probability to go from level i to level j of the block under
+        control u. A single block is the table (U, S, S) of all states.
     """
 
     blocks: tuple[Float, ...]
 
     def __post_init__(self) -> None:
-        checked = tuple(stochastic_matrix(block, name="transition[control, state]") for block in self.blocks)
+        checked = tuple(
+            stochastic_matrix(block, name="transition[control, state]") for block in self.blocks
+        )
         for block in checked:
-            expect_shape("a transition", block.shape, "controls", block.shape[-1], block.shape[-1])
-        if len({len(block) for block in checked}) != 1:
-            raise InvalidModelError(said("network.blocks", counts=[len(block) for block in checked]))
+            levels = block.shape[-1]
+            check_shape("a transition", block.shape, "controls", levels, levels)
+        control_counts = [len(block) for block in checked]
+        if len(set(control_counts)) != 1:
+            raise InvalidModelError(
+                f"transition: every block needs the same controls, got {comma_list(control_counts)}"
+            )
         object.__setattr__(self, "blocks", checked)
 
     @classmethod
@@ -180,28 +218,36 @@ class TransitionModel:
 
         Parameters
         ----------
-        tables : for each control, for each factor, (levels, levels)
-            Row-stochastic; the joint matrix is their Kronecker product in the order of the factors.
+        tables : sequence of sequence of (L, L) array
+            For each control and each factor its row-stochastic table. The joint matrix is their
+            Kronecker product in the order of the factors.
 
         Raises
         ------
         InvalidModelError
-            A table is none of transitions, or the controls have other states.
+            If a table is no square matrix of transitions, or if the controls have other states.
         """
-        checked = [
-            [
+        checked = []
+        for control, factor_tables in enumerate(tables):
+            row = [
                 stochastic_matrix(table, name=f"transition of control {control}, factor {factor}")
                 for factor, table in enumerate(factor_tables)
             ]
-            for control, factor_tables in enumerate(tables)
-        ]
+            checked.append(row)
         shapes = {tuple(table.shape for table in row) for row in checked}
-        if len(shapes) != 1 or not all(shapes) or any(s != s[:1] * 2 for row in shapes for s in row):
-            raise InvalidModelError(said("network.squares", shapes=sorted(shapes)))
-        factors = [np.stack(factor) for factor in zip(*checked, strict=True)]
-        counts = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
-        small = np.prod(counts, axis=0, dtype=np.float64).max() <= JOINT_NON_ZEROS
-        return cls((_joint(factors),) if small else tuple(factors))
+        are_same = len(shapes) == 1 and all(shapes)
+        are_square = all(_is_square(shape) for row in shapes for shape in row)
+        if not are_same or not are_square:
+            raise InvalidModelError(
+                "expected for every control a square table for each factor, of the same states, "
+                f"got shapes {sorted(shapes)}"
+            )
+        factors = [np.stack(factor) for factor in zip(*checked, strict=True)]  # (U, L, L) each
+        non_zeros = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
+        joint_non_zeros = np.prod(non_zeros, axis=0, dtype=np.float64).max()
+        if joint_non_zeros <= JOINT_NON_ZEROS:
+            return cls((_joint_table(factors),))
+        return cls(tuple(factors))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -211,7 +257,7 @@ class TransitionModel:
 
     @property
     def is_product(self) -> bool:
-        """Whether it is the product of several blocks."""
+        """Whether the transition is the product of several blocks."""
         return len(self.blocks) > 1
 
     @cached_property
@@ -221,70 +267,81 @@ class TransitionModel:
         Raises
         ------
         InvalidModelError
-            It does not fit in memory.
+            If it does not fit in memory.
         """
         if not self.is_product:
             return self.blocks[0]
         controls, states, _ = self.shape
+        size = TRANSITION_COPIES * transition_bytes(states, controls)
         check_fits(
-            {
-                f"the table of {states} states under {controls} controls": TRANSITION_COPIES
-                * transition_bytes(states, controls)
-            },
+            {f"the table of {states} states under {controls} controls": size},
             "take fewer levels or state factors, or apply the transition instead",
         )
-        table = _joint(self.blocks)
+        table = _joint_table(self.blocks)
         table.setflags(write=False)
         return table
 
     @cached_property
-    def forward_lists(self) -> Lists:
+    def forward_lists(self) -> PredecessorLists:
         """The predecessors of each level of each block."""
         return predecessor_lists(self.blocks)
 
     @cached_property
-    def backward_lists(self) -> Lists:
+    def backward_lists(self) -> PredecessorLists:
         """The successors of each level of each block."""
         return predecessor_lists([block.transpose(0, 2, 1) for block in self.blocks])
 
     def row(self, control: int, state: int) -> Float:
         """Return p(D_t | D_{t-1} = state, control): (S,)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
-        return _kronecker(block[control, level] for block, level in zip(self.blocks, levels, strict=True))
+        return _kronecker_product(
+            block[control, level] for block, level in zip(self.blocks, levels, strict=True)
+        )
 
     def rows(self, control: Index, state: Index) -> Float:
-        """Return p(D_t | D_{t-1} = state, control) of N pairs (N,) of control and state: (N, S)."""
+        """Return p(D_t | D_{t-1} = state, control) of N pairs of a control and a state: (N, S)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
         result = np.ones((len(state), 1))
         for block, level in zip(self.blocks, levels, strict=True):
-            following = block[control, level]
-            states = result.shape[1] * following.shape[1]
-            result = (result[:, :, None] * following[:, None, :]).reshape(len(state), states)
+            next_level = block[control, level]
+            states = result.shape[1] * next_level.shape[1]
+            products = result[:, :, None] * next_level[:, None, :]
+            result = products.reshape(len(state), states)
         return result
 
     def forward(self, control: int, belief: Float) -> Float:
-        """Return beliefs (..., S) one step later, in the linear domain."""
+        """Return beliefs (..., S) one step later, without logarithms."""
         if not self.is_product:
             return np.asarray(belief @ self.blocks[0][control])
-        return self._applied([block[control].T for block in self.blocks], belief)
+        return _apply_along_axes([block[control].T for block in self.blocks], belief)
 
-    def expected(self, control: int, value: Float) -> Float:
-        """Return the mean of a function of the state one step later, from each state: (S,) -> (S,)."""
+    def expected_value(self, control: int, value: Float) -> Float:
+        """Return the mean of a function (S,) of the state one step later, from each state: (S,)."""
         if not self.is_product:
             return np.asarray(self.blocks[0][control] @ value)
-        return self._applied([block[control] for block in self.blocks], value)
-
-    def _applied(self, matrices: Sequence[Float], vector: Float) -> Float:
-        shape, inner = vector.shape, vector.shape[-1]
-        for matrix in matrices:
-            inner //= len(matrix)
-            vector = np.matmul(matrix, vector.reshape(-1, len(matrix), inner)).ravel()
-        return vector.reshape(shape)
+        return _apply_along_axes([block[control] for block in self.blocks], value)
 
 
-def _kronecker(arrays: Iterable[Float]) -> Float:
-    return reduce(lambda first, second: np.asarray(np.kron(first, second)), arrays)
+def _is_square(shape: tuple[int, ...]) -> bool:
+    """Return whether the shape of an array is that of a square matrix."""
+    return len(shape) == 2 and shape[0] == shape[1]
 
 
-def _joint(factors: Sequence[Float]) -> Float:
-    return np.stack([_kronecker(tables) for tables in zip(*factors, strict=True)])
+def _apply_along_axes(matrices: Sequence[Float], vectors: Float) -> Float:
+    """Apply a matrix (L, L) along each axis of joint states, and return vectors (..., S)."""
+    shape = vectors.shape
+    inner = shape[-1]
+    for matrix in matrices:
+        inner //= len(matrix)  # states behind one level of this axis
+        vectors = np.matmul(matrix, vectors.reshape(-1, len(matrix), inner)).ravel()
+    return vectors.reshape(shape)
+
+
+def _kronecker_product(arrays: Iterable[Float]) -> Float:
+    """Return the Kronecker product of arrays, from the first to the last."""
+    return reduce(lambda product, array: np.asarray(np.kron(product, array)), arrays)
+
+
+def _joint_table(factors: Sequence[Float]) -> Float:
+    """Return the joint table (U, S, S) of factors (U, L, L)."""
+    return np.stack([_kronecker_product(tables) for tables in zip(*factors, strict=True)])

@@ -1,10 +1,12 @@
-"""The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
+"""The twin: it receives observations and the control in force, and decides on the next control.
+
+It never has the truth.
+"""
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -15,8 +17,7 @@ from fe.runtime.errors import ReducedModelFileError
 from reporting.arrays import Float
 from reporting.choices import require_one_of
 from reporting.words import brief
-from twin_master.errors import InvalidModelError, InvalidObservationError, said
-from twin_master.network import graphical_model
+from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -26,70 +27,87 @@ from twin_master.network.estimator import (
     SensorModel,
     Suspicion,
 )
-from twin_master.network.graphical_model import GraphicalModel, worsening_table
+from twin_master.network.graphical_model import (
+    GraphicalModel,
+    leaving_table,
+    repaired_table,
+    worsening_table,
+)
 from twin_master.network.inference import Predicted, predict
-from twin_master.network.planner import BeliefPolicy, decision
-from twin_master.network.transition import expect_controls
+from twin_master.network.planner import BeliefPolicy, decision_probability
+from twin_master.network.transition import check_controls
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
-_LARGEST = np.float64(1e150)
-"""What is carried is below this, so that what follows from it are numbers, too."""
+_LARGEST_CARRIED = np.float64(1e150)
+"""Carried numbers are below this, so that numbers that follow from them are finite, too."""
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DecisionBasis = Literal["filtered", "predicted"]
-"""Belief that the twin decides on: of the present step, or of the next one."""
+"""Belief on which the twin decides: that of the present step, or of the next one."""
 DEFAULT_LAG = 50
-"""Steps back that a twin smooths and may be revised."""
+"""Steps back over which a twin smooths and which may be revised."""
 _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
-"""The name that the arrays `steps` had in the saved states of earlier versions, also behind a prefix."""
+"""Former name of the arrays `steps` in saved states, also behind a prefix."""
 
 
 def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
-    """Return the transitions (levels, levels) of each factor under each control, with what actions repair."""
-    tables: dict[str, dict[str, Float]] = {}
-    for control in scenario.control_names:
-        if scenario.transition.kind == "independent_tables":
-            given = scenario.transition.tables[control]
-            tables[control] = {name: np.asarray(given[name], np.float64) for name in scenario.state_names}
-        else:
-            probability = partial(probability_of, scenario.transition.probability, control)
-            tables[control] = {
-                factor.name: worsening_table(len(factor.levels), probability(factor.name))
-                for factor in scenario.state
-            }
-    if leaving != 1.0:
-        tables = {
-            control: {name: graphical_model.leaving_table(table, leaving) for name, table in rows.items()}
-            for control, rows in tables.items()
-        }
-    for action in scenario.action:
-        for name in action.repairs:
-            tables[action.name][name] = graphical_model.repaired_table(
-                tables[action.name][name], action.success
-            )
-    return tables
-
-
-def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
-    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
-
-    Its factors move independently given the control, and are independent before the first observation.
+    """Return the transitions (levels, levels) of each factor under each control, with repairs.
 
     Parameters
     ----------
     scenario : Scenario
+        The scenario.
     leaving : float
-        Factor on the probabilities of each factor of the state to leave a level.
+        The factor on the probabilities of each factor of the state to leave a level.
+    """
+    tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
+    if leaving != 1.0:
+        for control_tables in tables.values():
+            for name, table in control_tables.items():
+                control_tables[name] = leaving_table(table, leaving)
+    for action in scenario.action:
+        action_tables = tables[action.name]
+        for name in action.repairs:
+            action_tables[name] = repaired_table(action_tables[name], action.success)
+    return tables
+
+
+def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
+    """Return the transitions of each factor under a control, as the scenario states them."""
+    transition = scenario.transition
+    if transition.kind == "independent_tables":
+        stated = transition.tables[control]
+        return {name: np.asarray(stated[name], np.float64) for name in scenario.state_names}
+    tables = {}
+    for factor in scenario.state:
+        probability = probability_of(transition.probability, control, factor.name)
+        tables[factor.name] = worsening_table(len(factor.levels), probability)
+    return tables
+
+
+def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
+    """Return states, controls, prior and transitions of a scenario.
+
+    Kapteyn et al. 2021, eqs. (28)-(29): the factors of the state change independently given the
+    control, and are independent before the first observation.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    leaving : float
+        The factor on the probabilities of each factor of the state to leave a level.
 
     Raises
     ------
     InvalidModelError
-        The factor makes a probability larger than one.
+        If the factor makes a probability larger than one.
     """
-    levels = {factor.name: factor.levels for factor in scenario.state}
     return GraphicalModel.from_tables(
-        levels, factor_tables(scenario, leaving), {factor.name: factor.prior for factor in scenario.state}
+        levels={factor.name: factor.levels for factor in scenario.state},
+        tables=factor_tables(scenario, leaving),
+        prior={factor.name: factor.prior for factor in scenario.state},
     )
 
 
@@ -103,8 +121,8 @@ class TwinStep(Estimate):
         The number t, from 0.
     prediction : Predicted
         Beliefs and controls of the steps t + 1 ... t + H.
-    decision_probability : (U,)
-        policy(U | D) averaged over the belief that the twin decides on.
+    decision_probability : (U,) array
+        policy(U | D) averaged over the belief on which the twin decides.
     next_control : int
         Its mode, the first of equals: the control to fly in step t + 1.
     """
@@ -121,49 +139,62 @@ class TwinStep(Estimate):
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A step that is kept: what was observed and what the estimator carries on."""
+class _KeptStep:
+    """A step that is kept.
+
+    Attributes
+    ----------
+    observation : (G,) array
+        What was observed.
+    carried : Carried
+        What the estimator carries on from it.
+    """
 
     observation: Float
-    estimate: Carried
+    carried: Carried
 
 
 class Twin:
     """Belief about one asset, updated step by step, without end.
 
-    A step costs the same time and memory at the start and after years: what is kept are the last `lag` steps,
-    over which the twin smooths and into which it takes what comes late.
+    A step costs the same time and memory at the start and after years. Only the last `lag` steps
+    are kept: the twin smooths over them, and takes late observations into them.
 
     Parameters
     ----------
     name : str
-        Name of the twin, for messages.
+        The name of the twin, for messages.
     model : GraphicalModel
         S states, U controls.
     sensor_model : SensorModel
         Gives log p(o_t | D_t, u_t): a `GaussianSensorModel`, or anything with its `log_likelihood`.
-    policy : (S, U) or callable
-        p(U | D), row-stochastic, or a planner: called with the model, it returns the policy.
+    policy : (S, U) array or callable
+        p(U | D), row-stochastic; or a planner, which is called with the model and returns the
+        policy.
     prediction_steps : int
-        How far to predict.
+        The number of steps that are predicted.
     decide_on : {"filtered", "predicted"}
-        The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), the state last seen, as
-        in the paper's graph; or over p(D_{t+1} | o_0..o_t), as in the authors' published code.
+        The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), the belief of
+        this step, as in the paper's graph; or over p(D_{t+1} | o_0..o_t), as in the authors'
+        published code.
     lag : int or None
-        How many steps back the twin smooths and may be revised; None keeps all steps.
+        The number of steps back over which the twin smooths and which may be revised; None keeps
+        all steps.
     first_control : int or str
-        Control of the first step, where none is given with it.
+        The control of the first step, if none is given with it.
     estimator : Estimator, optional
-        What holds the belief in the place of the exact filter of model and sensor model.
+        Holds the belief in the place of the exact filter of model and sensor model.
     safest : int or str, optional
-        Control where no state is believed; without it the policy of what is believed decides alone.
+        The control if no state is believed. If left out, the policy under the hypotheses that
+        believe in a state decides alone.
     on_belief : BeliefPolicy, optional
-        Decides by p(D_{t+1} | o_0..o_t) in the place of the policy, which predicts.
+        Decides by p(D_{t+1} | o_0..o_t) in the place of `policy`, which then only predicts.
 
     Raises
     ------
     InvalidModelError
-        The policy has another shape or is none, there is no such control, or the lag is negative.
+        If the policy has another shape or is no policy, there is no such control, or the lag is
+        negative.
     InvalidChoiceError
         If `decide_on` is another word.
     """
@@ -185,7 +216,9 @@ class Twin:
     ) -> None:
         require_one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
-            raise InvalidModelError(f"expected a lag of 0 or more steps, or None for all, got {lag}")
+            raise InvalidModelError(
+                f"expected a lag of 0 or more steps, or None for all, got {lag}"
+            )
         self.name = name
         self.sensor_model = sensor_model
         self.estimator: Estimator = estimator or ExactFilter(model, sensor_model, name)
@@ -194,7 +227,9 @@ class Twin:
         self.decide_on = decide_on
         self._on_belief = on_belief
         self.lag = lag
-        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)  # with the step before
+        # The present step, `lag` steps before it, and the step from which the first of these came.
+        most_kept = None if lag is None else lag + 2
+        self._kept_steps: deque[_KeptStep] = deque(maxlen=most_kept)
         self._steps = 0
         self._proposed = self._index_of(first_control)
         self._safest: Float | None = None
@@ -211,218 +246,300 @@ class Twin:
 
     @property
     def steps(self) -> int:
-        """Number of steps seen so far."""
+        """Number of steps so far."""
         return self._steps
 
     @property
     def proposed_control(self) -> int:
-        """Index of the control for the next step: that of the last decision, or the first control."""
+        """Index of the control for the next step: that of the last decision, or the first one."""
         return self._proposed
 
     @property
     def first_kept(self) -> int:
         """The first step of `smoothed`, and the first that may still be revised."""
-        return self._steps - len(self._recent())
+        return self._steps - len(self._smoothed_steps())
+
+    @property
+    def _first_in_memory(self) -> int:
+        """The number of the first kept step, which may lie one before `first_kept`."""
+        return self._steps - len(self._kept_steps)
 
     def step(self, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
         """Advance by one step, correct by an observation, predict and decide.
 
         Parameters
         ----------
-        observation : (G,)
-            What the sensors say, SI; NaN where nothing was received. All NaN predicts through the step.
+        observation : (G,) array
+            The sensor values, SI; NaN where nothing was received. If all are NaN, the belief is
+            predicted through the step.
         control : int or str, optional
-            Index or name of the control in force during this step; the one that was proposed if left out.
+            Index or name of the control in force during this step; the proposed one if left out.
 
         Raises
         ------
         ImpossibleObservation
-            If the observation is impossible in every state that the belief allows; the twin is unchanged.
+            If the observation is impossible in every state that the belief allows; the twin is
+            unchanged.
         InvalidObservationError, InvalidModelError
-            If the observation has another shape, is infinite or cannot be weighed, the twin is unchanged; if
-            there is no such control.
+            If the observation has another shape, is infinite or cannot be weighed, the twin is
+            unchanged; if there is no such control.
         """
-        given = np.array(observation, dtype=np.float64)
+        values = np.array(observation, dtype=np.float64)
         index = self._proposed if control is None else self._index_of(control)
-        return self._assimilated(len(self._seen), [(given, index)])
+        return self._assimilate_from(self._steps, [(values, index)])
 
-    def revise(self, step: int, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
-        """Put an observation that came late in its place, and filter anew from there.
+    def revise(
+        self, step: int, observation: ArrayLike, control: int | str | None = None
+    ) -> TwinStep:
+        """Take in an observation that came late, and filter anew from its step on.
 
-        The result is that of a twin which had it in time, to the last bit, where the controls in force were
-        the same.
+        The result is that of a twin which had the observation in time, to the last bit, if the
+        controls in force were the same.
 
         Parameters
         ----------
         step : int
-            Its step, not before `first_kept`.
+            The step of the observation, not before `first_kept`.
         observation, control
-            As in `step`; the control that was assumed for that step if left out.
+            As in `step`; if left out, the control is the one that was assumed for that step.
 
         Returns
         -------
         TwinStep
-            What the twin now concludes in its last step, with the notices of all steps filtered anew: what
-            the late observation brings to light in a step before would never be told.
+            What the twin now concludes in its last step, with the notices of all steps that were
+            filtered anew. Without these, what the late observation reveals about an earlier step
+            would never be reported.
 
         Raises
         ------
         IndexError
-            The step is not kept any more, or has not been.
+            If the step is not kept any more, or is still to come.
         ImpossibleObservation, InvalidObservationError, InvalidModelError
             As in `step`; the twin is unchanged.
         """
         if not self.first_kept <= step < self._steps:
-            raise IndexError(said("network.revised", step=step, first=self.first_kept, seen=self._steps))
-        at = step - self._steps + len(self._seen)
-        index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
+            raise IndexError(
+                f"step {step} cannot be revised: the twin keeps the steps from {self.first_kept} "
+                f"on and has seen {self._steps}"
+            )
+        index = self.control_of(step) if control is None else self._index_of(control)
         rows = [(np.array(observation, dtype=np.float64), index)]
-        rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
-        return self._assimilated(at, rows)
+        for later_step in range(step + 1, self._steps):
+            rows.append((self.observed(later_step), self.control_of(later_step)))
+        return self._assimilate_from(step, rows)
 
-    def _assimilated(self, at: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
-        """Filter observations under their controls from a place of what is kept on, and decide."""
-        first, anew, notices = self._steps - len(self._seen) + at, list[_Seen](), list[Notice]()
-        before = self._seen[at - 1].estimate if at else None
-        for number, (given, in_force) in enumerate(rows, start=first):
-            estimate = self._estimate(before, given, in_force, number)
+    def _assimilate_from(self, first: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
+        """Filter observations under their controls from a step on, and decide.
+
+        Parameters
+        ----------
+        first : int
+            The step of the first observation; it and later steps are replaced.
+        rows : sequence of (G,) array and int
+            The observation and the control in force of each step.
+        """
+        steps_before = first - self._first_in_memory
+        before = self._kept_steps[steps_before - 1].carried if steps_before else None
+        new_steps: list[_KeptStep] = []
+        notices: list[Notice] = []
+        for step, (observation, control_index) in enumerate(rows, start=first):
+            estimate = self._estimate(before, observation, control_index, step)
             before = estimate.carried
-            anew.append(_Seen(given, before))
+            new_steps.append(_KeptStep(observation, before))
             notices += estimate.notices
-        for _ in range(len(self._seen) - at):
-            self._seen.pop()
-        self._seen.extend(anew)
+        # From here on nothing fails, so that a refused observation leaves the twin unchanged.
+        for _ in range(len(self._kept_steps) - steps_before):
+            self._kept_steps.pop()
+        self._kept_steps.extend(new_steps)
         self._steps = first + len(rows)
-        return self._decided(replace(estimate, notices=tuple(notices)))
+        return self._decide(replace(estimate, notices=tuple(notices)))
 
     def observed(self, step: int) -> Float:
-        """Return what was observed in a step that is kept: (G,), NaN where nothing was received."""
-        return self._seen[step - self._steps + len(self._seen)].observation
+        """Return what was observed in a kept step: (G,), NaN where nothing was received."""
+        return self._kept_steps[step - self._first_in_memory].observation
 
     def control_of(self, step: int) -> int:
-        """Return the index of the control in force in a step that is kept."""
-        return self._seen[step - self._steps + len(self._seen)].estimate.control_index
+        """Return the index of the control in force in a kept step."""
+        return self._kept_steps[step - self._first_in_memory].carried.control_index
 
     def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
-        """Predict through the policy from any belief (S,) under a control in force: eqs. (37)-(39)."""
-        ahead = self.prediction_steps if steps is None else steps
-        return predict(self.model, belief, self._index_of(control), self.policy, ahead)
+        """Predict through the policy from any belief (S,) under a control in force: (37)-(39)."""
+        horizon = self.prediction_steps if steps is None else steps
+        return predict(self.model, belief, self._index_of(control), self.policy, horizon)
 
     def smoothed(self) -> Float:
         """Return p(D_k | o_0..o_t) for the steps k = `first_kept`..t: (n, S).
 
-        The decision does not need it, and after each step it would cost as much as all steps that are kept.
+        The decision does not need it. After each step it would cost as much as all kept steps.
         """
         return self.estimator.smoothed(self.carried)
 
     @property
     def carried(self) -> tuple[Carried, ...]:
         """What the estimator carried on from the steps `first_kept`..t."""
-        return tuple(seen.estimate for seen in self._recent())
+        return tuple(kept.carried for kept in self._smoothed_steps())
 
     def save_state(self) -> bytes:
-        """Return all that the twin has seen and keeps, for `restore_state`."""
-        return self._packed(self._steps, self._seen)
+        """Return everything that the twin keeps, for `restore_state`."""
+        return self._state_of(self._steps, self._kept_steps)
 
     def settled(self) -> tuple[int, bytes] | None:
-        """Return the last step that cannot be revised any more, and the state behind it, for `restore_state`.
+        """Return the last step that cannot be revised any more, and the state after it.
 
-        All later steps follow from it; None before there is such a step.
+        All later steps follow from that state, which `restore_state` takes. Before there is such a
+        step, None is returned.
         """
         step = self.first_kept - 1
-        return None if step < 0 else (step, self._packed(step + 1, [self._seen[0]]))
+        if step < 0:
+            return None
+        return step, self._state_of(step + 1, [self._kept_steps[0]])
 
-    def _packed(self, steps: int, kept: Iterable[_Seen]) -> bytes:
+    def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
+        """Return the state after a number of steps, with some of them kept."""
         arrays: dict[str, NDArray[Any]] = {"steps": np.array([steps, self._proposed])}
-        for place, seen in enumerate(kept):
-            arrays[f"{place}/observation"] = seen.observation
-            arrays[f"{place}/control"] = np.array(seen.estimate.control_index)
-            arrays |= {f"{place}/carried/{name}": value for name, value in seen.estimate.arrays.items()}
+        for index, kept in enumerate(kept_steps):
+            arrays[f"{index}/observation"] = kept.observation
+            arrays[f"{index}/control"] = np.array(kept.carried.control_index)
+            for name, value in kept.carried.arrays.items():
+                arrays[f"{index}/carried/{name}"] = value
         return arrays_to_bytes(arrays)
 
     def restore_state(self, state: bytes) -> None:
-        """Go on from a saved state of a twin of the same model, sensors and estimator, to the last bit.
+        """Go on from the saved state of a twin of the same model, sensors and estimator.
+
+        The twin goes on to the last bit as the saved one would.
 
         Raises
         ------
         InvalidModelError
-            It is no such state.
+            If the bytes are no such state.
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
         with InvalidModelError.instead_of(*causes, before="this is no saved state of a twin: "):
-            arrays = {
-                _FORMER_COUNT.sub("steps", name): value
-                for name, value in arrays_from_bytes(state, "the state of the twin").items()
-            }
+            stored = arrays_from_bytes(state, "the state of the twin")
+            arrays = {_FORMER_COUNT.sub("steps", name): value for name, value in stored.items()}
             steps, proposed = arrays["steps"].tolist()
-            seen: list[_Seen] = []
-            while f"{len(seen)}/control" in arrays:
-                prefix = f"{len(seen)}/carried/"
-                own = {
-                    name.removeprefix(prefix): value
-                    for name, value in arrays.items()
-                    if name.startswith(prefix)
-                }
-                control = int(arrays[f"{len(seen)}/control"])
-                seen.append(_Seen(arrays[f"{len(seen)}/observation"], Carried(control, own)))
-        self._steps, self._proposed = steps, proposed
-        self._seen.clear()
-        self._seen.extend(seen)
+            kept_steps: list[_KeptStep] = []
+            while f"{len(kept_steps)}/control" in arrays:
+                kept_steps.append(_kept_step_from_arrays(arrays, len(kept_steps)))
+        self._steps = steps
+        self._proposed = proposed
+        self._kept_steps.clear()
+        self._kept_steps.extend(kept_steps)
 
-    def _recent(self) -> list[_Seen]:
-        seen = list(self._seen)
-        return seen if self.lag is None else seen[-(self.lag + 1) :]
+    def _smoothed_steps(self) -> list[_KeptStep]:
+        """Return the kept steps over which the twin smooths."""
+        kept_steps = list(self._kept_steps)
+        return kept_steps if self.lag is None else kept_steps[-(self.lag + 1) :]
 
-    def _estimate(self, before: Carried | None, given: Float, control: int, step: int) -> Estimate:
-        """Return what the estimator concludes, of which nothing is NaN or too large to be squared."""
+    def _estimate(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
+        """Return the estimate of a step, or refuse an observation that leaves no finite belief.
+
+        Parameters are those of `Estimator.step`.
+        """
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                estimate = self.estimator.step(before, given, control, step)
-            found = (estimate.log_evidence, estimate.filtered, *estimate.carried.arrays.values())
-            held = all(np.all(np.asarray(values) < _LARGEST) for values in found)
+                estimate = self.estimator.step(before, observation, control_index, step)
+            numbers = (
+                estimate.log_evidence,
+                estimate.filtered,
+                *estimate.carried.arrays.values(),
+            )
+            # False for NaN as well.
+            is_finite = all(np.all(np.asarray(part) < _LARGEST_CARRIED) for part in numbers)
         except (ArithmeticError, np.linalg.LinAlgError):
-            held = False
-        if not held:
-            raise InvalidObservationError(said("network.no_belief", name=self.name, step=step))
+            is_finite = False
+        if not is_finite:
+            raise InvalidObservationError(
+                f"twin {self.name!r}, step {step}: the observation cannot be weighed, for beside "
+                "what was observed before its numbers leave no belief; check the sensors and the "
+                "control in force"
+            )
         return estimate
 
     def _index_of(self, control: int | str) -> int:
+        """Return the index of a control that is given by index or name."""
         controls = self.model.controls
         if isinstance(control, str):
             if control not in controls:
-                raise InvalidModelError(f"no control is named {control!r}; there are {', '.join(controls)}")
+                raise InvalidModelError(
+                    f"no control is named {control!r}; there are {', '.join(controls)}"
+                )
             return controls.index(control)
-        expect_controls(control, len(controls))
+        check_controls(control, len(controls))
         return int(control)
 
-    def _decided(self, estimate: Estimate) -> TwinStep:
+    def _decide(self, estimate: Estimate) -> TwinStep:
+        """Return an estimate with prediction and decision, and propose the next control."""
         control_index = estimate.carried.control_index
-        prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
-        decision_probability = self._decision(estimate.filtered, control_index)
+        prediction = predict(
+            self.model, estimate.filtered, control_index, self.policy, self.prediction_steps
+        )
+        probability = self._control_probability(estimate.filtered, control_index)
         if self._safest is not None:
-            none = estimate.unexplained
-            decision_probability = (1.0 - none) * decision_probability + none * self._safest
-            prediction = prediction.mixed(none, self._safest)
-        self._proposed = int(np.argmax(decision_probability))
-        own = vars(estimate) | {"suspicion": self._with_decision(estimate)}
+            unexplained = estimate.unexplained
+            probability = (1.0 - unexplained) * probability + unexplained * self._safest
+            prediction = prediction.mix_control(unexplained, self._safest)
+        self._proposed = int(np.argmax(probability))
         return TwinStep(
-            **own, step=self._steps - 1, prediction=prediction, decision_probability=decision_probability,
+            forecast=estimate.forecast,
+            filtered=estimate.filtered,
+            log_evidence=estimate.log_evidence,
+            carried=estimate.carried,
+            learnt=estimate.learnt,
+            notices=estimate.notices,
+            suspicion=self._suspicion_with_decision(estimate),
+            hypotheses=estimate.hypotheses,
+            step=self._steps - 1,
+            prediction=prediction,
+            decision_probability=probability,
             next_control=self._proposed,
-        )  # fmt: skip
+        )
 
-    def _with_decision(self, estimate: Estimate) -> Suspicion | None:
-        """Return what is suspected, with the hypothesis that adds most to the probability of the decision."""
-        share = {}
-        for one in estimate.hypotheses:
-            chosen = self._safest
-            if one.belief is not None:
-                chosen = self._decision(one.belief, estimate.carried.control_index)
-            share[one.name] = 0.0 if chosen is None else one.probability * float(chosen[self._proposed])
-        if estimate.suspicion is None or not share:
+    def _suspicion_with_decision(self, estimate: Estimate) -> Suspicion | None:
+        """Return the suspicion of an estimate, with the hypothesis that decided.
+
+        It is the hypothesis that adds most to the probability of the proposed control.
+        """
+        if estimate.suspicion is None or not estimate.hypotheses:
             return estimate.suspicion
-        return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
+        contribution = {}
+        for hypothesis in estimate.hypotheses:
+            if hypothesis.belief is None:
+                controls = self._safest
+            else:
+                controls = self._control_probability(
+                    hypothesis.belief, estimate.carried.control_index
+                )
+            contribution[hypothesis.name] = 0.0
+            if controls is not None:
+                proposed = float(controls[self._proposed])
+                contribution[hypothesis.name] = hypothesis.probability * proposed
+        decided_by = max(contribution, key=contribution.__getitem__)
+        return replace(estimate.suspicion, decided_by=decided_by)
 
-    def _decision(self, belief: Float, control_index: int) -> Float:
-        """Return the probability of each control (U,), by the belief of this step or the next."""
-        alone = belief[None], np.array([control_index]), self.policy, self._on_belief
-        return np.asarray(decision(self.model.transition, *alone, ahead=self.decide_on == "predicted")[0])
+    def _control_probability(self, belief: Float, control_index: int) -> Float:
+        """Return the probability of each next control (U,) by the belief (S,) of this step."""
+        probability = decision_probability(
+            self.model.transition,
+            belief[None],
+            np.array([control_index]),
+            self.policy,
+            self._on_belief,
+            ahead=self.decide_on == "predicted",
+        )
+        return np.asarray(probability[0])
+
+
+def _kept_step_from_arrays(arrays: Mapping[str, NDArray[Any]], index: int) -> _KeptStep:
+    """Return the kept step of an index among the arrays of a saved state."""
+    prefix = f"{index}/carried/"
+    carried_arrays = {
+        name.removeprefix(prefix): value
+        for name, value in arrays.items()
+        if name.startswith(prefix)
+    }
+    control_index = int(arrays[f"{index}/control"])
+    return _KeptStep(arrays[f"{index}/observation"], Carried(control_index, carried_arrays))

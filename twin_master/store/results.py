@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from reporting.arrays import Float
 from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
-from twin_master.learning.expectation import Expected, joined
+from twin_master.learning.expectation import Expectation, concatenate_expectations
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
 from twin_master.mission.steps import SensorStatus, Truth
 from twin_master.scenario.observation import ObservationSection
@@ -226,7 +226,7 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
         expected_of_part, control_probability = expected_ahead(part, knowledge, predicted[span])
         expected_parts.append(expected_of_part)
         control_probabilities.append(control_probability)
-    values = _belief_variables(result, predicted, joined(expected_parts))
+    values = _belief_variables(result, predicted, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
     fields = {
         "lead": "step horizon",
@@ -235,18 +235,18 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
     return builder.group("predicted", _entries_of(values), fields)
 
 
-def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool) -> Expected:
+def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool) -> Expectation:
     """Return what is expected in all steps under a belief (T, S), by the believed models."""
     flight = result.flight
     expected_parts = []
     for knowledge, span in result.spans:
         part = replace(flight, steps=flight.steps[span])
         expected_parts.append(expected_in_steps(part, knowledge, belief[span], smoothed=smoothed))
-    return joined(expected_parts)
+    return concatenate_expectations(expected_parts)
 
 
 def _belief_variables(
-    result: MissionResult, belief: Float, expected: Expected
+    result: MissionResult, belief: Float, expected: Expectation
 ) -> dict[str, ArrayLike]:
     """Return the variables that all groups of a belief share."""
     states = result.knowledge.model.states

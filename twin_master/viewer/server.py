@@ -1,157 +1,244 @@
-"""The server of the page: on the loopback only, everything from the package, nothing from outside."""
+"""The server of the page of a flight, for browsers of this machine only.
+
+Everything comes from the package, and nothing from other hosts.
+"""
 
 import asyncio
 import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
+from tornado.routing import Rule, URLSpec
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.page import script_source
-from twin_master.errors import ViewError, said
-from twin_master.viewer.flight import Flight, Request, Teller
+from twin_master.errors import ViewError
+from twin_master.viewer.flight import Flight
+from twin_master.viewer.flight_page import FlightPage, Request
 
 ADDRESS = "127.0.0.1"
 POLL_SECONDS = 0.015
-"""Between two looks at the run folder; a look takes some microseconds."""
+"""Seconds between two looks at the run folder; a look takes some microseconds."""
 LONGEST_REQUEST = 4096
-"""Bytes."""
+"""Greatest length of a request [bytes]."""
+_INVALID_MESSAGE = 1003
+"""The code with which a WebSocket is closed after a message that is no request."""
 
-OWN_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
-"""A page of another site that lets its name point here would come with that name, and is not answered."""
+HOST_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
+"""The host names that are answered.
+
+The page of another site may let its own name point to this machine. Its requests come with that
+name, and are not answered.
+"""
 HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws:; img-src 'self' data: blob:; "
-    "style-src 'self' 'unsafe-inline'; script-src 'self' " + script_source() + "; frame-ancestors 'none'",
+    "Content-Security-Policy": (
+        "default-src 'self'; connect-src 'self' ws:; img-src 'self' data: blob:; "
+        f"style-src 'self' 'unsafe-inline'; script-src 'self' {script_source()}; "
+        "frame-ancestors 'none'"
+    ),
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
 
 
-class _StepsSocket(WebSocketHandler):
-    """One open page."""
+class ServedText(NamedTuple):
+    """A text of a server.
 
-    def initialize(self, teller: Teller) -> None:
-        self._teller = teller
+    Attributes
+    ----------
+    read : callable
+        Returns the text. It takes what the groups of its path match, as strings.
+    media_type : str
+        The type of the text, such as "text/html".
+    """
+
+    read: Callable[..., str]
+    media_type: str
+
+
+class _StepsSocket(WebSocketHandler):
+    """The connection of one open page."""
+
+    def initialize(self, page: FlightPage) -> None:
+        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        self._page = page
 
     def on_message(self, message: str | bytes) -> None:
+        """Answer a request; close the connection if the message is no request."""
         try:
-            self._teller.ask(self.tell, Request.model_validate_json(message))
+            self._page.ask(self.send, Request.model_validate_json(message))
         except ValueError as error:
-            self.close(1003, str(error)[:100])
+            self.close(_INVALID_MESSAGE, str(error)[:100])
 
     def on_close(self) -> None:
-        self._teller.leave(self.tell)
+        """Forget the viewer, who has left."""
+        self._page.forget(self.send)
 
-    def tell(self, text: str) -> None:
+    def send(self, text: str) -> None:
+        """Send an answer; forget the viewer if it has left."""
         try:
             self.write_message(text)
         except WebSocketClosedError:
-            self._teller.leave(self.tell)
+            self._page.forget(self.send)
 
 
-class _Answer(RequestHandler):
-    """A text that is asked for."""
+class _TextHandler(RequestHandler):
+    """Answers requests for one text."""
 
-    def initialize(self, answer: Callable[..., str], kind: str) -> None:
-        self._answer, self._kind = answer, kind
+    def initialize(self, text: ServedText) -> None:
+        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        self._text = text
 
     def set_default_headers(self) -> None:
+        """Set the headers that keep a page from loading anything from other hosts."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
-    def get(self, *found: str) -> None:
-        self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
+    def get(self, *groups: str) -> None:
+        """Answer with the text, or with 404 if there is none.
+
+        Parameters
+        ----------
+        *groups : str
+            What the groups of the path match.
+        """
+        self.set_header("Content-Type", f"{self._text.media_type}; charset=utf-8")
         try:
-            self.write(self._answer(*found))
+            self.write(self._text.read(*groups))
         except (IndexError, OSError) as error:
             raise HTTPError(404) from error
 
 
-def text_of(package: str, name: str) -> Callable[[], str]:
-    """Return what reads a file of a package."""
-    return lambda: resources.files(package).joinpath(name).read_text(encoding="utf-8")
-
-
-def serve_page(
-    texts: Mapping[str, tuple[Callable[..., str], str]], port: int, ready: Callable[[str], None],
-    wanted: Callable[[], bool], handlers: Sequence[Any] = (), look: Callable[[], None] = lambda: None,
-) -> None:  # fmt: skip
-    """Serve texts on the loopback as long as they are wanted, see `serve`.
+def package_text(package: str, name: str, media_type: str) -> ServedText:
+    """Return a file of a package as a text of a server; it is read when it is asked for.
 
     Parameters
     ----------
-    texts : mapping
-        What gives the text of a path, told what is in brackets there; and its kind.
-    port, ready, wanted
-        See `serve`.
-    handlers : sequence
-        Further handlers of tornado.
-    look : callable
-        Called every few milliseconds.
+    package : str
+        The package, such as "twin_master.viewer".
+    name : str
+        The name of the file in the folder of the package.
+    media_type : str
+        The type of the text, such as "text/css".
     """
-    answers = [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
-    application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    application.add_handlers(OWN_NAMES, [*answers, *handlers])
+    file = resources.files(package).joinpath(name)
+    return ServedText(lambda: file.read_text(encoding="utf-8"), media_type)
 
-    async def serving() -> None:
+
+def _do_nothing() -> None:
+    """Stand for what is done every few milliseconds if nothing is to be done."""
+
+
+def _is_always_wanted() -> bool:
+    """Say that a server goes on until its process is interrupted."""
+    return True
+
+
+def serve_texts(
+    texts: Mapping[str, ServedText],
+    port: int,
+    on_ready: Callable[[str], None],
+    is_wanted: Callable[[], bool],
+    handlers: Sequence[Rule] = (),
+    poll: Callable[[], None] = _do_nothing,
+) -> None:
+    """Serve texts to browsers of this machine as long as they are wanted.
+
+    Parameters
+    ----------
+    texts : mapping of str to ServedText
+        The texts by their paths, which are regular expressions.
+    port : int
+        The port; 0 for any that is free.
+    on_ready : callable
+        Called with the address once it answers.
+    is_wanted : callable
+        Called now and then; once it returns False the server ends.
+    handlers : sequence of tornado.routing.Rule
+        Further handlers.
+    poll : callable
+        Called every few milliseconds.
+
+    Raises
+    ------
+    ViewError
+        If the port is taken.
+    """
+    rules: list[Rule] = [
+        URLSpec(path, _TextHandler, {"text": text}) for path, text in texts.items()
+    ]
+    application = Application(
+        websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20
+    )
+    application.add_handlers(HOST_NAMES, [*rules, *handlers])
+
+    async def serve_until_unwanted() -> None:
         server = HTTPServer(application, max_body_size=LONGEST_REQUEST)
         try:
             sockets = bind_sockets(port, ADDRESS)
         except OSError as error:
             reason = os.strerror(error.errno or 0)
-            raise ViewError(said("watch.port", port=port, address=ADDRESS, reason=reason)) from error
+            raise ViewError(
+                f"port {port} of {ADDRESS} cannot be taken ({reason}): choose another --port."
+            ) from error
         server.add_sockets(sockets)
-        ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
+        _, bound_port = sockets[0].getsockname()
+        on_ready(f"http://{ADDRESS}:{bound_port}/")
         try:
-            while wanted():
-                look()
+            while is_wanted():
+                poll()
                 await asyncio.sleep(POLL_SECONDS)
         finally:
             server.stop()
 
-    asyncio.run(serving())
+    asyncio.run(serve_until_unwanted())
 
 
 def serve(
-    folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
+    folder: Path,
+    port: int,
+    on_ready: Callable[[str], None],
+    is_wanted: Callable[[], bool] = _is_always_wanted,
 ) -> None:
-    """Show the flight of a run folder to browsers of this machine, until the process is interrupted.
+    """Show the flight of a run folder to browsers of this machine.
 
     Parameters
     ----------
     folder : Path
-        With a flight that is finished or goes on.
+        The folder of a flight that has ended or goes on.
     port : int
-        0 for any that is free.
-    ready : callable
+        The port; 0 for any that is free.
+    on_ready : callable
         Called with the address once it answers.
-    wanted : callable
-        Asked now and then; once it says no, the server ends.
+    is_wanted : callable
+        Called now and then; once it returns False the server ends. If left out, the server goes on
+        until its process is interrupted.
 
     Raises
     ------
     NotResumableError, RunFolderError
-        There is no such run, or it is damaged.
+        If there is no such run, or if it is damaged.
     ViewError
-        The port is taken.
+        If the port is taken.
     """
     flight = Flight(folder)
-    teller = Teller(flight)
-    page = teller.page()
+    page = FlightPage(flight)
+    html = page.render_html()
 
-    def picture(number: str) -> str:
-        return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")
+    def read_drawing(number: str) -> str:
+        return flight.drawings[int(number)].path.read_text(encoding="utf-8")
 
-    texts: dict[str, tuple[Callable[..., str], str]] = {
-        "/": (lambda: page, "text/html"),
-        "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
-        "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
-        "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
-        r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
+    texts = {
+        "/": ServedText(lambda: html, "text/html"),
+        "/plots.js": package_text("twin_master.viewer", "plots.js", "text/javascript"),
+        "/view.js": package_text("twin_master.viewer", "view.js", "text/javascript"),
+        "/view.css": package_text("twin_master.viewer", "view.css", "text/css"),
+        r"/missing_force_(\d+)\.svg": ServedText(read_drawing, "image/svg+xml"),
     }
-    serve_page(texts, port, ready, wanted, [("/steps", _StepsSocket, {"teller": teller})], teller.look)
+    socket = URLSpec("/steps", _StepsSocket, {"page": page})
+    serve_texts(texts, port, on_ready, is_wanted, [socket], page.update)

@@ -1,1 +1,1 @@
-"""Watching a real asset: observations from files, standard input or a broker, one loop with missions."""
+"""Watching a real asset: its observations come from files, standard input or a broker."""

@@ -1,27 +1,25 @@
-"""A watch: its folder, begun or taken up again, its loop, and what it leaves."""
+"""A watch: its folder, its loop over the steps, its journal, and the patches that it adopts."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibration_sentence
+from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     check_header,
-    last_step,
     records_backwards,
 )
 from twin_master.mission.loop import operate
@@ -30,21 +28,60 @@ from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import PICTURE, TEACHING, VERDICT, record_inputs, remove_half_written_files
+from twin_master.run_folder import (
+    PICTURE,
+    TEACHING,
+    VERDICT,
+    record_inputs,
+    remove_half_written_files,
+)
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import FigureGroup
-from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
-from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
+from twin_master.watch.feed import Feed
+from twin_master.watch.intake import Counts, Intake
+from twin_master.watch.patch_trial import (
+    NO_STEPS,
+    ComparedSteps,
+    PatchOutcome,
+    merge_patches,
+    outcome_of_patch,
+    patched_model,
+)
+from twin_master.watch.records import (
+    Decision,
+    DecisionSink,
+    JournalLine,
+    JsonObject,
+    ModelRecord,
+)
+from twin_master.watch.rejected import REJECTED_NAME
+from twin_master.watch.signals import call_on_end_signal
+from twin_master.watch.teaching import Teaching
 
-WATCHED = "watched asset"
-STORED_STEPS = 1_000
-"""The last steps that `run.nc` and the report show if not told otherwise; the journal has all of them."""
+WATCHED_ASSET = "watched asset"
 FLUSH_SECONDS = 1.0
-"""Of a recorded file, which is read again after a power failure; live steps are flushed one by one."""
-Patched = tuple[Path, int]
-"""A patch of the twin's model, and the step from which on it is believed."""
+"""Seconds between two flushes of the journal to the disk while a recording is watched.
+
+After a power failure the recording is read again. The steps of a live watch are flushed one by one.
+"""
+
+
+class GivenPatch(NamedTuple):
+    """A patch of the model that the user wants the twin to believe.
+
+    Attributes
+    ----------
+    file : Path
+        The file of the patch.
+    from_step : int
+        The first step that is filtered with the patched model.
+    """
+
+    file: Path
+    from_step: int
+
+
+def _do_nothing() -> None:
+    """Stand for what is done between two steps if nothing is to be done."""
 
 
 class Watch:
@@ -53,22 +90,34 @@ class Watch:
     Parameters
     ----------
     folder : Path
-        Of the watch.
+        The folder of the watch.
     config : dict
-        Its `config.json`.
+        The content of its `config.json`.
     scenario : Scenario
-        Located in the folder.
+        The scenario, whose paths are in the folder.
     progress : Progress
         Shows stages and notes.
-    like : Watch, optional
+    sibling : Watch, optional
         A watch of the same scenario, whose model and plan this one shares.
 
     Attributes
     ----------
-    journal, intake, twin
-        From `begun` on; another twin where it was taught.
-    filtered : (S,) or None
-        What was believed after the last step; None before the first one of this process.
+    source : AssetSource
+        What the twin believes of the asset.
+    journal_path : Path
+        The path of the journal.
+    models : list of BelievedModel
+        The model of the beginning, and the patched models that were adopted.
+    teaching : Teaching
+        The state of teaching after the last line of the journal.
+    journal : JournalFile
+        The journal, from `begin` on.
+    intake : Intake
+        The messages that come, from `begin` on.
+    twin : Twin
+        The twin, from `begin` on. It is replaced when a patched model is adopted.
+    filtered : (S,) array or None
+        The belief after the last step; None before the first step of this process.
     is_quiet : bool
         Whether the operator was told that no step comes any more.
     """
@@ -80,287 +129,372 @@ class Watch:
     is_quiet: bool
 
     def __init__(
-        self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress,
-        like: "Watch | None" = None,
-    ) -> None:  # fmt: skip
-        self.folder, self.scenario, self._progress = folder, scenario, progress
+        self,
+        folder: Path,
+        config: JsonObject,
+        scenario: Scenario,
+        progress: Progress,
+        sibling: "Watch | None" = None,
+    ) -> None:
+        self.folder = folder
+        self.scenario = scenario
+        self.progress = progress
         remove_half_written_files(folder)
-        self._source: AssetSource = believed_source(scenario) if like is None else like._source
-        prepared = self._source.prepare(folder, progress) if like is None else like._inputs
-        self._inputs: Mapping[str, str] = prepared
-        self._config = record_inputs(folder, config, self._inputs)
-        self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
-        self._path = folder / JOURNAL_NAME
-        self._hash = hash_record(self._config)
-        self._take_up()
-        if like is not None and len(self.models) == len(like.models) == 1:
-            link_knowledge(like.folder, folder)
+        if sibling is None:
+            self.source: AssetSource = believed_source(scenario)
+            self._inputs: Mapping[str, str] = self.source.prepare(folder, progress)
         else:
-            save_knowledge(folder, self.models[-1].knowledge)
+            self.source = sibling.source
+            self._inputs = sibling._inputs
+        self.config = record_inputs(folder, config, self._inputs)
+        self.models: list[BelievedModel] = []
+        self.models.append(self._prepare_model() if sibling is None else sibling.models[0])
+        self.journal_path = folder / JOURNAL_NAME
+        self._config_hash = hash_record(self.config)
+        self.update_from_journal()
+        self._keep_knowledge(sibling)
+
+    def _prepare_model(self) -> BelievedModel:
+        """Return the model of the beginning, calibrated and planned with."""
+        with self.progress.stage("Calibrating and planning"):
+            knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
+        remark = calibration_sentence(
+            knowledge.draws.record or {}, WATCHED_ASSET, self.source.origin.model, self._inputs
+        )
+        if remark is not None:
+            self.progress.note(remark)
+        patch = getattr(self.scenario.belief, "patch", None)
+        return BelievedModel(0, knowledge, Path(patch) if patch else None)
+
+    def _keep_knowledge(self, sibling: "Watch | None") -> None:
+        """Write the knowledge of all models into the folder, where viewers find it."""
+        # Without adopted patches both have the knowledge of the beginning
+        has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
+        if sibling is not None and has_same_knowledge:
+            link_knowledge(sibling.folder, self.folder)
+        else:
+            save_knowledge(self.folder, self.models[-1].knowledge)
         for number, model in enumerate(self.models[:-1]):
-            save_knowledge(folder, model.knowledge, number)
+            save_knowledge(self.folder, model.knowledge, number)
 
-    def _prepared(self) -> BelievedModel:
-        """Calibrate and plan."""
-        with self._progress.stage("Calibrating and planning"):
-            knowledge = prepare_knowledge(self.scenario, self._source, self.scenario.mission.seed)
-        origin = self._source.origin.model
-        told = calibration_sentence(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
-        if told is not None:
-            self._progress.note(told)
-        own = getattr(self.scenario.belief, "patch", None)
-        return BelievedModel(0, knowledge, Path(own) if own else None)
-
-    def _take_up(self) -> None:
-        """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
-        check_header(self._path, self._hash)
+    def update_from_journal(self) -> None:
+        """Read the state of teaching from the journal, and load the models adopted there."""
+        check_header(self.journal_path, self._config_hash)
         notice = self.scenario.notice
-        self.teaching = Teaching(1.0 if notice is None else notice.threshold)
-        self.teaching.read(self._path)
-        for model in self.teaching.adopted[len(self.models) - 1 :]:
-            first, file = model["from_step"], self.folder / model["patch"]
-            self.models.append(patched_model(self.scenario, file, first, self._progress))
+        threshold = 1.0 if notice is None else notice.threshold  # without notices: of no effect
+        self.teaching = Teaching(threshold)
+        self.teaching.read_journal(self.journal_path)
+        loaded_count = len(self.models) - 1  # the first model was not adopted
+        for record in self.teaching.adopted_models[loaded_count:]:
+            patch = self.folder / record["patch"]
+            model = patched_model(self.scenario, patch, record["from_step"], self.progress)
+            self.models.append(model)
 
     def run(
-        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object],
-        between: Callable[[], None] = lambda: None, *, steps: int | None = None,
-        patched: Patched | None = None, untold: Mapping[str, Any] | None = None,
-    ) -> Counts:  # fmt: skip
-        """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two steps.
+        self,
+        feed: Feed,
+        decide: DecisionSink,
+        between_steps: Callable[[], None] = _do_nothing,
+        *,
+        step_limit: int | None = None,
+        patch: GivenPatch | None = None,
+        unconfirmed: Decision | None = None,
+    ) -> Counts:
+        """Watch until the feed ends, or until SIGINT or SIGTERM comes.
 
         Parameters
         ----------
         feed : Feed
-            Of the observations.
+            The feed of the observations, to which the decisions are sent.
         decide : callable
-            Told each decision, once its step is written down.
-        between : callable, optional
-            Called before the first step and behind each; it may teach the twin.
-        steps : int, optional
-            Steps in all after which to end.
-        patched : Patched, optional
-            To believe from a step on.
-        untold : dict, optional
-            The last decision, to be told again first.
+            Called with each decision, once its step is in the journal.
+        between_steps : callable, optional
+            Called before the first step and after each; it may teach the twin.
+        step_limit : int, optional
+            The number of steps, with those of earlier processes, after which to end.
+        patch : GivenPatch, optional
+            A patch to adopt before the first step.
+        unconfirmed : dict, optional
+            The last decision, if a kill may have kept it from being sent; it is sent first.
+
+        Returns
+        -------
+        Counts
+            How many messages came, and what became of them.
         """
 
-        def tell(decision: Mapping[str, Any]) -> None:
+        def send(decision: Decision) -> None:
             decide(decision)
-            feed.decide(decision)
+            feed.send_decision(decision)
 
-        with self.begun(feed, patched):
-            self.intake.steps, self.intake.look = steps, lambda: self.quiet(tell)
-            with listening(self.intake.ask):
-                if untold is not None:
-                    tell(untold)
-                between()
+        with self.begin(feed, patch):
+            self.intake.step_limit = step_limit
+            self.intake.on_poll = lambda: self.report_silence(send)
+            with call_on_end_signal(self.intake.request_end):
+                if unconfirmed is not None:
+                    send(unconfirmed)
+                between_steps()
                 for decision in self.decisions():
-                    tell(decision)
-                    between()
+                    send(decision)
+                    between_steps()
         return self.intake.counts
 
     @contextmanager
-    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[None]:
-        """Open the journal, and take up the twin as it stands after it; see `run`."""
+    def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
+        """Open the journal, and take up the twin as it is after the last line.
+
+        Parameters
+        ----------
+        feed : Feed
+            The feed of the observations.
+        patch : GivenPatch, optional
+            A patch to adopt before the first step.
+        """
         intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         intake.stops_at_refusals = True
-        seconds = FLUSH_SECONDS if feed.replayable else 0.0
-        with JournalFile(self.folder, self._hash, seconds) as self.journal:
-            self._take_up()
-            found, last = replay(self._path, self.models, self.scenario.watch.lag)
-            intake.restore(last.get("intake"))
-            if last:
-                self._progress.note(
-                    f"The watch goes on at {self.scenario.mission.step_name} {found.twin.steps}."
-                )
-            self.intake, self.twin, self.filtered = intake, found.twin, None
-            self.is_quiet, self._heard = "quiet" in last, time.monotonic()
-            self._told = intake.state()
-            if patched is not None:
-                self._patch(*patched)
+        flush_seconds = FLUSH_SECONDS if feed.replayable else 0.0
+        with JournalFile(self.folder, self._config_hash, flush_seconds) as self.journal:
+            self.update_from_journal()
+            history, last_line = replay(self.journal_path, self.models, self.scenario.watch.lag)
+            self.twin = history.twin
+            intake.restore(last_line.get("intake"))
+            if last_line:
+                step_name = self.scenario.mission.step_name
+                self.progress.note(f"The watch goes on at {step_name} {self.twin.steps}.")
+            self.intake = intake
+            self.filtered = None
+            self.is_quiet = "quiet" in last_line
+            self._time_of_last_step = time.monotonic()
+            self._written_intake = intake.state()
+            if patch is not None:
+                self._adopt_given(patch)
             yield
-            if self.intake.state()["counts"] != self._told["counts"]:  # of messages behind the last step
-                with suppress(FileNotWrittenError):  # which is no loss of what was observed
-                    self.write()
+            self._write_last_counts()
 
-    def decisions(self) -> Iterator[dict[str, Any]]:
-        """Yield what the operator is told of each step, once it is written down, until no more comes.
+    def _write_last_counts(self) -> None:
+        """Write down the counts of the messages after the last step."""
+        if self.intake.state()["counts"] == self._written_intake["counts"]:
+            return
+        with suppress(FileNotWrittenError):  # no observation is lost
+            self.write_event()
 
-        Also the last decision again, with a notice, where the messages behind it are refused.
+    def decisions(self) -> Iterator[JsonObject]:
+        """Yield the decision of each step, once it is in the journal, until no more comes.
+
+        If the messages after a step are refused, its decision is given again with a notice.
         """
         while True:
             twin = self.twin
             for step in operate(twin, self.intake):
-                yield self.decision_of(self._kept(step))
-                if twin is not self.twin:  # it was taught meanwhile: another one goes on
+                yield self.decision_of(self._write_step(step))
+                if twin is not self.twin:  # a patched model was adopted meanwhile
                     break
-            if self.intake.stream.refusals_are_untold:
-                yield self._refusals()
+            if self.intake.stream.has_refusals_to_report:
+                yield self._report_refusals()
             elif twin is self.twin:
                 return
 
-    def decision_of(self, line: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
+    def decision_of(self, line: JournalLine) -> JsonObject:
+        """Return the decision in a line of the journal; empty if the line has none."""
         return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
-    def _kept(self, step: MissionStep) -> dict[str, Any]:
-        """Write down a reading and what became of it; return the line."""
-        record, told = self.intake.line(step, self.twin), self.teaching.untold
+    def _write_step(self, step: MissionStep) -> JsonObject:
+        """Write a step into the journal; return its line."""
+        line = self.intake.journal_line(step, self.twin)
+        notices = list(self.teaching.pending_notices)
         if self.is_quiet:
-            when = f"{self.scenario.mission.step_name.capitalize()} {record['step']}"
-            sentence = f"{when}: observations come again, after {self.silence:.0f} s."
-            told = [*told, Notice("heard", sentence).as_record()]
-        if told:
-            record["notices"] = record.get("notices", []) + told
-        self._append(record)
-        self.filtered, self.is_quiet, self._heard = step.twin_step.filtered, False, time.monotonic()
-        return record
+            when = f"{self.scenario.mission.step_name.capitalize()} {line['step']}"
+            silence = self.seconds_since_step
+            sentence = f"{when}: observations come again, after {silence:.0f} s."
+            notices.append(Notice("heard", sentence).as_record())
+        if notices:
+            line["notices"] = line.get("notices", []) + notices
+        self._append_line(line)
+        self.filtered = step.twin_step.filtered
+        self.is_quiet = False
+        self._time_of_last_step = time.monotonic()
+        return line
 
-    def write(self, **record: Any) -> None:
-        """Write down something else than a step."""
-        state = {"next_control": self.twin.proposed_control, "intake": self.intake.state()}
-        self._append({"step": self.twin.steps - 1, **state, **record})
+    def write_event(self, **fields: object) -> None:
+        """Write a line that is no step into the journal, such as a verdict or a model."""
+        line = {
+            "step": self.twin.steps - 1,
+            "next_control": self.twin.proposed_control,
+            "intake": self.intake.state(),
+        }
+        self._append_line(line | fields)
 
-    def _append(self, record: Mapping[str, Any]) -> None:
-        """Add a line to the journal, and take it in."""
-        standing = {"begin": self.journal.size, "teaching": vars(self.teaching)}
-        self.journal.append({**record, "standing": standing})
-        self._told = record["intake"]
-        self.teaching.take(record)
+    def _append_line(self, line: JournalLine) -> None:
+        """Add a line to the journal, and update the state of teaching with it."""
+        state_before = {"begin": self.journal.size, "teaching": self.teaching.as_record()}
+        self.journal.append({**line, "standing": state_before})
+        self._written_intake = line["intake"]
+        self.teaching.take_line(line)
 
     @property
-    def silence(self) -> float:
-        """How long no step has come [s]."""
-        return time.monotonic() - self._heard
+    def seconds_since_step(self) -> float:
+        """The time since the last step of this process, or since its beginning [s]."""
+        return time.monotonic() - self._time_of_last_step
 
-    def last_decision(self) -> dict[str, Any] | None:
+    def last_decision(self) -> JsonObject | None:
         """Return the last decision in the journal; None without any.
 
-        A kill may have left it untold, and nobody knows: it has `told_again`.
+        It has `told_again`, because a kill may have kept it from being sent, and nobody knows.
         """
-        lines = (line for line, *_ in records_backwards(self._path) if "filtered" in line)
-        last = next(lines, None)
-        return None if last is None else {**self.decision_of(last), "told_again": True}
+        for line, _, _ in records_backwards(self.journal_path):
+            if "filtered" in line:
+                return {**self.decision_of(line), "told_again": True}
+        return None
 
-    def quiet(self, decide: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the last decision with the notice that it grows old, once no step has come for too long."""
-        longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
-        if longest is None or self.is_quiet or self.silence < longest:
+    def report_silence(self, send: Callable[[JsonObject], None]) -> None:
+        """Send the last decision with a notice, once no step has come for too long."""
+        longest_silence = self.scenario.watch.quiet_after_seconds
+        if longest_silence is None or self.is_quiet or self.seconds_since_step < longest_silence:
             return
-        since = f"since {step} {self.twin.steps - 1}" if self.twin.steps else "and none before"
-        sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
+        step_name = self.scenario.mission.step_name
+        since = "and none before"
+        if self.twin.steps:
+            since = f"since {step_name} {self.twin.steps - 1}"
+        sentence = (
+            f"No {step_name} has come for {longest_silence:g} s, {since}: see whether logger and "
+            "broker are there."
+        )
         decision = self._last_decision_with(Notice("quiet", sentence))
-        self.write(notices=decision["notices"], quiet=decision)
+        self.write_event(notices=decision["notices"], quiet=decision)
         self.is_quiet = True
-        decide(decision)
+        send(decision)
 
-    def _refusals(self) -> dict[str, Any]:
-        """Write down that messages are refused; return the last decision with the notice that says so."""
-        decision = self._last_decision_with(self.intake.stream.refusals(self.twin.steps))
-        self.write(notices=decision["notices"], refused=decision)
+    def _report_refusals(self) -> JsonObject:
+        """Write down that messages are refused; return the last decision with this notice."""
+        decision = self._last_decision_with(self.intake.stream.report_refusals(self.twin.steps))
+        self.write_event(notices=decision["notices"], refused=decision)
         return decision
 
-    def _last_decision_with(self, notice: Notice) -> dict[str, Any]:
-        """Return the last decision, or what stands for it before the first one, with a notice alone."""
-        return {**(self.last_decision() or {"step": -1}), "notices": [notice.as_record()]}
+    def _last_decision_with(self, notice: Notice) -> JsonObject:
+        """Return the last decision with a notice in the place of its own ones.
 
-    def trial(self, file: Path, from_step: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
-        """Return what tells what comes of a patch from a step on, after all lines of the journal so far."""
+        Before the first step there is no decision: then it has the step -1 and no control.
+        """
+        decision = self.last_decision() or {"step": -1}
+        return {**decision, "notices": [notice.as_record()]}
+
+    def trial_of(
+        self, patch: Path, from_step: int, compared: ComparedSteps = NO_STEPS
+    ) -> Callable[..., PatchOutcome]:
+        """Return a function that computes the outcome of a patch; it takes `progress`.
+
+        The function uses the lines that the journal has now. So it may be called in a thread while
+        the watch goes on.
+
+        Parameters
+        ----------
+        patch : Path
+            The file of the patch.
+        from_step : int
+            The first step that would be filtered with the patched model.
+        compared : ComparedSteps
+            The steps in which the evidence with and without the patch is compared.
+        """
         models = tuple(self.models)
-        believed = [model for model in models if model.from_step <= from_step][-1]
-        patch = both_patches(believed.patch, file)
+        earlier_models = [model for model in models if model.from_step <= from_step]
         return partial(
-            judged, self._path, self.journal.size, self.scenario, models, patch, from_step, compared
+            outcome_of_patch,
+            self.journal_path,
+            self.journal.size,
+            self.scenario,
+            models,
+            merge_patches(earlier_models[-1].patch, patch),
+            from_step,
+            compared,
         )
 
-    def _patch(self, file: Path, first: int) -> None:
-        """Believe a patch that is given from a step on."""
+    def _adopt_given(self, patch: GivenPatch) -> None:
+        """Adopt a patch that the user gives."""
         steps = self.twin.steps
-        if not steps or not 0 <= first <= steps:
-            raise MissionInputError(said("watch.from_step", steps=steps))
-        outcome = self.trial(file, first)(progress=self._progress)
-        # The missing force that its verdict shows is kept for viewers.
-        kept, shown = f"{TEACHING}/given_{len(self.models)}", [file.with_name(VERDICT), file.parent / PICTURE]
-        found = all(path.is_file() for path in shown)
-        for path in shown if found else ():
-            place = self.folder / kept / path.relative_to(file.parent)
-            atomic_write_bytes(place, path.read_bytes())
-        self.adopt(outcome, None, kept * found)
+        if not steps or not 0 <= patch.from_step <= steps:
+            raise MissionInputError(
+                f"--from-step names one of the {steps} steps watched so far, or the next one."
+            )
+        outcome = self.trial_of(patch.file, patch.from_step)(progress=self.progress)
+        self.adopt(outcome, None, self._copy_verdict_of(patch.file))
 
-    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> None:
-        """Believe a patched model: with its twin it is gone on."""
-        name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_step
-        atomic_write_bytes(self.folder / name, outcome.patch)
-        again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
-        alarms = [n for step, n in again.notices if step >= first and n.kind == "alarm"]
-        self.twin = again.twin
-        self.models.append(replace(outcome.model, patch=self.folder / name))
-        model: dict[str, Any] = {
-            "patch": name, "from_step": first, "alarms": [vars(alarm) for alarm in alarms], **outcome.record,
-            **({} if notice is None else {"notice": dict(notice)}),
-            **({"verdict": verdict} if verdict else {}),
-        }  # fmt: skip
-        # Before viewers read the line; they show earlier steps as they were told.
-        save_knowledge(self.folder, self.models[-2].knowledge, len(self.models) - 2)
-        save_knowledge(self.folder, outcome.model.knowledge)
-        self.write(model=model)
-        gaps = [
-            f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"
-            for name, value in model["before"].items()
-            if value is not None
-        ]
-        since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
-        self._progress.note(f"{since}: {', '.join(gaps)}. {model['policy_change']}".rstrip())
+    def _copy_verdict_of(self, patch: Path) -> str:
+        """Copy the verdict beside a given patch, and its drawing of the missing force, for viewers.
 
-    def store(self, counts: Counts, *, last: int = STORED_STEPS, report: bool = True) -> None:
-        """Write `run.nc`, tables, summary and report of the last steps."""
-        steps = last_step(self._path)[0] + 1
-        if not steps:
-            self._progress.note("Nothing was observed: there is nothing to report.")
-            return
-        result, attributes = self.result(steps, last), {}
-        for model in self.teaching.adopted[-1:]:
-            attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_step"]}
-        origin = FlownAndBelieved(WATCHED, self._source.origin.model)
-        with self._progress.stage("Storing"):
-            store_flight(
-                self.folder, self._config, result, origin, steps=steps,
-                figures=self._figures(counts, steps), attributes=attributes,
-            )  # fmt: skip
-        if report:
-            from twin_master.report.page import write_report
-
-            with self._progress.stage("Writing the report"):
-                write_report(self.folder)
-
-    def result(self, steps: int, last: int) -> MissionResult:
-        """Return the last of so many steps, as a mission."""
-        first = max(0, steps - last)
-        found, _ = replay(self._path, self.models, None, first_step=first)
-        flight = replace(found.without_first(first - found.first_step), notices=self.told(first))
-        return MissionResult(self.scenario, self.models[-1].knowledge, flight, models=self.models)
-
-    def told(self, first: int) -> list[tuple[int, Notice]]:
-        """Return what the operator was told in the steps from `first` on, each sentence once.
-
-        What was told before the first step counts to it. The first alarm is told whenever it was raised.
+        Returns
+        -------
+        str
+            The folder of the copy, relative to that of the watch; empty if there is no drawing.
         """
-        early, told = self.teaching.first_alarm, dict[str, tuple[int, Notice]]()
-        lines = takewhile(lambda line: max(line[0].get("step", 0), 0) >= first, records_backwards(self._path))
-        found = [early] if early is not None and early[0] < first else []
-        for record in reversed([record for record, *_ in lines if "notices" in record]):
-            found += [(max(record["step"], 0), notice) for notice in record["notices"]]
-        for step, notice in found:
-            known = Notice(**{**notice, "sensors": tuple(notice["sensors"])})
-            told.setdefault(known.sentence, (step, known))
-        return [*told.values()]
+        verdict = patch.with_name(VERDICT)
+        drawing = patch.parent / PICTURE
+        if not verdict.is_file() or not drawing.is_file():
+            return ""
+        relative_folder = f"{TEACHING}/given_{len(self.models)}"
+        for path in (verdict, drawing):
+            copy = self.folder / relative_folder / path.relative_to(patch.parent)
+            atomic_write_bytes(copy, path.read_bytes())
+        return relative_folder
 
-    def _figures(self, counts: Counts, steps: int) -> list[FigureGroup]:
-        """Return what the summary tells of a watch."""
-        step = {"step": self.scenario.mission.step_name, "file": REJECTED_NAME}
-        came = [steps, counts.missing, counts.late, counts.duplicates, counts.rejected]
-        told = [FigureGroup("watch", step, came)]
-        for model in self.teaching.adopted:
-            gaps = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-            told.append(FigureGroup("patch", step | {"first": model["from_step"]}, gaps))
-        return told
+    def adopt(
+        self, outcome: PatchOutcome, notice: JsonObject | None, verdict_folder: str = ""
+    ) -> None:
+        """Believe a patched model, and go on with its twin.
+
+        Parameters
+        ----------
+        outcome : PatchOutcome
+            The patched model, and what it changes.
+        notice : dict or None
+            The notice to the operator, as it stands in a journal.
+        verdict_folder : str
+            The folder of the verdict, relative to that of the watch, if the user gave the patch.
+        """
+        patch = f"asset/model_patch_{len(self.models)}.json"
+        from_step = outcome.model.from_step
+        atomic_write_bytes(self.folder / patch, outcome.patch)
+
+        # Filter the steps again with the patched model
+        history, _ = replay(
+            self.journal_path, self.models, self.scenario.watch.lag, question=outcome.model
+        )
+        self.twin = history.twin
+        alarms = []
+        for step, new_notice in history.notices:
+            if step >= from_step and new_notice.kind == "alarm":
+                alarms.append(dict(vars(new_notice)))
+        self.models.append(replace(outcome.model, patch=self.folder / patch))
+        record: ModelRecord = {
+            "patch": patch,
+            "from_step": from_step,
+            "alarms": alarms,
+            "before": outcome.record["before"],
+            "after": outcome.record["after"],
+            "policy_change": outcome.record["policy_change"],
+        }
+        if notice is not None:
+            record["notice"] = notice
+        if verdict_folder:
+            record["verdict"] = verdict_folder
+
+        # Before viewers read the line of the model: they show earlier steps with the old knowledge
+        former_number = len(self.models) - 2
+        save_knowledge(self.folder, self.models[former_number].knowledge, former_number)
+        save_knowledge(self.folder, outcome.model.knowledge)
+        self.write_event(model=record)
+        self._show_adoption(record)
+
+    def _show_adoption(self, model: ModelRecord) -> None:
+        """Show how well the patched model fits, beside the former one."""
+        comparisons = []
+        for name, value in model["before"].items():
+            if value is not None:
+                after = model["after"][name]
+                comparisons.append(
+                    f"{name.replace('_', ' ')} {value:.4g} before, {after:.4g} after"
+                )
+        step_name = self.scenario.mission.step_name
+        self.progress.note(
+            f"The patched model is believed from {step_name} {model['from_step']} on: "
+            f"{', '.join(comparisons)}. {model['policy_change']}".rstrip()
+        )

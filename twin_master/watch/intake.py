@@ -1,12 +1,9 @@
-"""From messages to readings: steps in order, gaps predicted through, late ones in their place."""
+"""From messages to readings: steps in order, missing steps, and late messages."""
 
-import json
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,75 +11,44 @@ from typing import Any
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_text, explained_write_errors
 from reporting.words import counted, one_line
-from twin_master.errors import TwinMasterError, said
+from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import encode_state, step_record
 from twin_master.mission.steps import MissionStep, Reading
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.clock import Clock
-from twin_master.watch.lines import Place
-from twin_master.watch.message import Fed, Message, Refused
+from twin_master.watch.feed import Feed
+from twin_master.watch.lines import Position
+from twin_master.watch.message import FeedItem, Message, Refused
+from twin_master.watch.records import JsonObject
+from twin_master.watch.rejected import RejectedFile
+from twin_master.watch.step_status import StepStatus
 from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices, unit_advice
 
 POLL_SECONDS = 0.05
-"""Between two looks at a feed that may go on."""
-REJECTED_NAME = "rejected.jsonl"
-REJECTED_KEPT = 10_000
-"""Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
-_TEXT_KEPT = 200
+"""Seconds between two looks at a feed that may go on."""
 SNAPSHOT_STEPS = 32
-"""Steps between two lines of the journal that also hold the state of the twin."""
-MISSING, _ASSUMED, GIVEN = 0, 1, 2
-"""Of a step: not received; received with a control that was assumed and may be corrected; with its own."""
-
-
-class Feed:
-    """Where messages come from; of itself one that is not read twice: it goes on where it is.
-
-    Parameters
-    ----------
-    fed : iterable of Fed
-        Its messages.
-    """
-
-    replayable = False
-    """Whether it begins anew with every process, so that what was read before is read again."""
-    place: Place | None = None
-    """Where it stands behind the message that it gave last."""
-
-    def __init__(self, fed: Iterable[Fed] = ()) -> None:
-        self._fed = fed
-
-    def holds(self, place: Place) -> bool:
-        """Return whether a place is one of it, and not of another source."""
-        return False
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return the messages behind a place, or all of them."""
-        return iter(self._fed)
-
-    def decide(self, decision: Mapping[str, Any]) -> None:
-        """Tell whoever sends the messages what was decided, where they listen."""
-
-    def close(self) -> None:
-        """Let go of whoever sends the messages."""
+"""Number of steps between two lines of the journal that also have the state of the twin."""
 
 
 @dataclass
 class Counts:
-    """What came, and what became of it.
+    """How many messages came, and what became of them.
 
     Attributes
     ----------
     received : int
-        Messages read.
+        The messages that were read.
     missing : int
-        Steps that were predicted through because nothing came, less those that came late.
-    late, duplicates, rejected : int
-        Messages that were put in their place later, that said nothing new, and that were refused.
+        The steps that were predicted through because no message came, minus those that came late.
+    late : int
+        The messages that came late and were assimilated in their step.
+    duplicates : int
+        The messages that said nothing new.
+    rejected : int
+        The messages that were refused.
     """
 
     received: int = 0
@@ -92,93 +58,143 @@ class Counts:
     rejected: int = 0
 
 
-class Intake:
-    """The messages of a feed as the source of a twin.
+@dataclass(frozen=True)
+class _QueuedReading:
+    """A reading that waits for its assimilation.
 
-    A message belongs to the step that it names, or to that of its time, or to the next one. One about a step
-    that was received before must agree with it: what it has beyond is taken in, a contradiction is refused.
-    Nothing that was received can be changed afterwards.
+    Attributes
+    ----------
+    step : int
+        The step of the reading.
+    reading : Reading
+        The reading.
+    status : StepStatus
+        What was received of its step.
+    """
+
+    step: int
+    reading: Reading
+    status: StepStatus
+
+
+class _EndRequested(BaseException):
+    """The end of the watch was requested while it waited for a message."""
+
+
+class Intake:
+    """The messages of a feed as the source of observations of a twin.
+
+    A message belongs to the step that it names, or to that of its time, or to the next one. A
+    message about a step that was received before must agree with it: readings that the step lacks
+    are taken in, and a contradiction is refused. What was received can never be changed.
 
     Parameters
     ----------
     scenario : Scenario
-        Sensors, and how late and how far ahead a message may be.
+        The sensors, and how late and how far ahead a message may be.
     feed : Feed
-        Of the messages.
+        The feed of the messages.
     rejected : Path or None
-        `rejected.jsonl`, where refused ones are written down; None keeps none.
+        The file `rejected.jsonl`, to which refused messages are written; None writes none.
 
     Attributes
     ----------
     counts : Counts
-        What came so far, up to the last reading.
+        The messages up to the last reading.
     observation_step : int
         The step of the last reading.
     notices : list of Notice
-        Of the last reading: sensors of which no number came any more, or came again; what is wrong with the
-        stream of messages, see `StreamNotices`.
+        The notices of the last reading: sensors of which no number comes any more, or comes again,
+        and those of `StreamNotices`.
     stream : StreamNotices
-        What the operator was told of the stream.
+        The notices about the stream of messages.
     stops_at_refusals : bool
-        Whether `read` returns None once where the operator is to be told that messages are refused.
-    ended : bool
-        Whether the feed has ended; if not, more may come after `read` has returned None.
-    look : callable or None
-        Called now and then while nothing comes; without it nothing is waited for.
-    steps : int or None
-        In all, after which it ends.
-    asked : bool
-        Whether the end was asked for.
+        Whether `read` returns None once when the operator is to be told that messages are refused.
+    has_ended : bool
+        Whether the feed has ended. If not, more may come after `read` has returned None.
+    on_poll : callable or None
+        Called now and then while nothing comes. Without it `read` does not wait.
+    step_limit : int or None
+        The number of steps after which the watch ends.
+    end_is_requested : bool
+        Whether the end of the watch was requested.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
-        self._section, self._words = scenario.watch, Words.of(scenario)
+        self._section = scenario.watch
+        self._words = NoticeWording.of(scenario)
         self._width = scenario.row_width
-        self._feed = feed
-        self._rejected, self._kept = rejected, 0
-        self._messages: Iterator[Fed] | None = None
-        self._place: Place | None = None  # behind the last message, and behind the one before it
-        self._before_last: Place | None = None
-        self._pending: deque[tuple[int, Reading, int]] = deque()
-        self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
         self._clock = Clock(scenario.watch)
-        self._text = ""
-        self._unreadable = self._known = set[int]()  # after the last reading, and before it
+
+        # The feed, and the positions after the last message and after the one before it
+        self._feed = feed
+        self._messages: Iterator[FeedItem] | None = None
+        self._position: Position | None = None
+        self._previous_position: Position | None = None
+        self._text = ""  # the beginning of the last message
+        self._is_waiting = False  # for the next message
+
+        # Readings to come, and the status of the steps that may still be revised
+        self._queue: deque[_QueuedReading] = deque()
+        self._statuses: deque[StepStatus] = deque(maxlen=scenario.watch.lag + 1)
+        self._row_before_revision: Float = np.empty(0)
+
+        # What the operator is told
         self.notices: list[Notice] = []
         self.stream = StreamNotices(self._words)
-        self._stream_before: dict[str, Any] = {}  # its state before the last reading
         self.stops_at_refusals = False
-        self._came = self._useful = 0  # messages in this process, and those that told something of a sensor
-        self._before: Float = np.empty(0)
+        self._unreadable: set[int] = set()  # sensors, after the last reading
+        self._previous_unreadable: set[int] = set()  # sensors, before the last reading
+        self._previous_stream_state: JsonObject = {}
+
+        # Counts: of the watch, and of the messages of this process
         self.counts = Counts()
+        self._rejected = RejectedFile(rejected)
+        self._received_here = 0
+        self._with_readings_here = 0
+
+        # Progress and end
         self.observation_step = -1
-        self.ended = self.asked = self._waiting = False
-        self.look: Callable[[], None] | None = None
-        self.steps: int | None = None
+        self.has_ended = False
+        self.end_is_requested = False
+        self.on_poll: Callable[[], None] | None = None
+        self.step_limit: int | None = None
 
     @property
-    def settled(self) -> bool:
-        """Whether no reading of the last message is still to come."""
-        return not self._pending
+    def has_queued_readings(self) -> bool:
+        """Whether readings of the last message are still to be given."""
+        return bool(self._queue)
 
-    def state(self) -> dict[str, Any]:
-        """Return what is needed to go on, as JSON."""
-        # The message behind a gap is read again, until its own step is written down.
-        waiting = bool(self._pending)
-        counts = vars(self.counts) | {"received": self.counts.received - waiting}
-        stream = self.stream.state(waiting=waiting)
-        return {
-            "counts": counts,
-            "given": "".join(map(str, self._given)),
+    def state(self) -> JsonObject:
+        """Return the state from which a resumed watch goes on, for the journal."""
+        # The message after a gap is read again until its own step is in the journal
+        is_read_again = self.has_queued_readings
+        received = self.counts.received - 1 if is_read_again else self.counts.received
+        state: JsonObject = {
+            "counts": vars(self.counts) | {"received": received},
+            "given": "".join(str(int(status)) for status in self._statuses),
             "origin": self._clock.origin,
-            "source": self._before_last if waiting else self._place,
-            **({} if self._clock.only_step is None else {"first_timed": self._clock.only_step}),
-            **({"unreadable": sorted(self._unreadable)} if self._unreadable else {}),
-            **({"stream": stream} if stream else {}),
+            "source": self._previous_position if is_read_again else self._position,
         }
+        if self._clock.only_step is not None:
+            state["first_timed"] = self._clock.only_step
+        if self._unreadable:
+            state["unreadable"] = sorted(self._unreadable)
+        stream_state = self.stream.state(waiting=is_read_again)
+        if stream_state:
+            state["stream"] = stream_state
+        return state
 
-    def line(self, step: MissionStep, twin: Twin) -> dict[str, Any]:
-        """Return what a line of the journal says of the last reading and what became of it."""
+    def journal_line(self, step: MissionStep, twin: Twin) -> JsonObject:
+        """Return the line of the journal with the last reading and what the twin concluded.
+
+        Parameters
+        ----------
+        step : MissionStep
+            The last reading, and the conclusions of the twin.
+        twin : Twin
+            The twin after this step.
+        """
         concluded = step.twin_step
         record = step_record(step) | {
             "observation_step": self.observation_step,
@@ -187,172 +203,232 @@ class Intake:
         }
         if step.reading.revises is not None:
             record["control_in_force"] = concluded.control_index
-        elif (concluded.step + 1) % SNAPSHOT_STEPS == 0 and (settled := twin.settled()):
-            record["settled"] = {"step": settled[0], "state": encode_state(settled[1])}
-        known = {(notice.kind, notice.sensors) for notice in concluded.notices}
-        if told := [n.as_record() for n in self.notices if (n.kind, n.sensors) not in known]:
-            record["notices"] = record.get("notices", []) + told
+        elif (concluded.step + 1) % SNAPSHOT_STEPS == 0:
+            settled = twin.settled()
+            if settled:
+                settled_step, settled_state = settled
+                record["settled"] = {"step": settled_step, "state": encode_state(settled_state)}
+        given_by_twin = {(notice.kind, notice.sensors) for notice in concluded.notices}
+        new_notices = []
+        for notice in self.notices:
+            if (notice.kind, notice.sensors) not in given_by_twin:
+                new_notices.append(notice.as_record())
+        if new_notices:
+            record["notices"] = record.get("notices", []) + new_notices
         return record
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
-        """Go on from a state; None is the begin.
+        """Go on from a state, see `state`; None is the beginning of a watch.
 
-        A file that was read before is read on; another one is read from its first message.
+        A file that was read before is read on. Another one is read from its first message.
         """
-        again = self._feed.replayable
+        feed_is_read_again = self._feed.replayable
         if state is not None:
             self.counts = Counts(**state["counts"])
             self._clock.origin = state["origin"]
             self._clock.only_step = state.get("first_timed")
-            self._given.extend(map(int, state["given"]))
+            self._statuses.extend(StepStatus(int(digit)) for digit in state["given"])
             self._unreadable = set(state.get("unreadable", ()))
             self.stream.restore(state.get("stream", {}))
-            again &= state["source"] is not None and self._feed.holds(state["source"])
-            self._place = state["source"] if again else None
-        if self._rejected is not None and self._rejected.exists():
-            lines = self._rejected.read_text(encoding="utf-8").splitlines(keepends=True)
-            kept = lines[: self.counts.rejected] if again else lines  # those behind are read again
-            kept = [line for line in kept if line.endswith("\n")]  # not cut off by a kill
-            self._kept = len(kept)
-            untold = max(len(kept) - self.counts.rejected, 0)  # behind the last step
-            self.counts.rejected += untold
-            self.counts.received += untold
-            if kept != lines:
-                atomic_write_text(self._rejected, "".join(kept))
+            position = state["source"]
+            if position is None or not self._feed.contains_position(position):
+                feed_is_read_again = False
+            self._position = position if feed_is_read_again else None
+        rejected_later = self._rejected.resume(
+            self.counts.rejected, feed_is_read_again=feed_is_read_again
+        )
+        self.counts.rejected += rejected_later
+        self.counts.received += rejected_later
 
-    def ask(self) -> None:
-        """Ask for the end: between two steps, never within one."""
-        self.asked = True
-        if self._waiting:
-            raise _Asked
+    def request_end(self) -> None:
+        """Request the end of the watch: between two steps, never within one."""
+        self.end_is_requested = True
+        if self._is_waiting:
+            raise _EndRequested
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading, see `Source.read`; None also where the end was asked for."""
-        with suppress(_Asked):
-            while not self.asked and (self.steps is None or twin.steps < self.steps):
-                if self.stops_at_refusals and self.stream.refusals_are_untold:  # also as no state could show
+        """Return the next reading; see `Source.read`.
+
+        None also if the end was requested, and if nothing has come and there is no `on_poll`.
+        """
+        with suppress(_EndRequested):
+            while not self.end_is_requested and not self._has_all_steps(twin):
+                # Looked at before each message, because an impossible observation is refused, too
+                if self.stops_at_refusals and self.stream.has_refusals_to_report:
                     return None
                 begin = time.monotonic()
-                came = bool(self._pending) or self._took(twin)
-                if self._pending:
-                    return self._next(twin)
-                if self.ended or not (came or self.look):
+                has_message = self.has_queued_readings or self._receive_message(twin)
+                if self._queue:
+                    return self._next_reading(twin)
+                if self.has_ended or not (has_message or self.on_poll):
                     return None
-                if self.look is not None:  # there may be silence among messages that are not taken, too
-                    self.look()
-                if not came:
+                # Also after a message without a reading: no step may come for a long time
+                if self.on_poll is not None:
+                    self.on_poll()
+                if not has_message:
                     time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
         return None
 
-    def _took(self, twin: Twin) -> bool:
-        """Take in the next message; return whether one has come."""
-        if self._messages is None:
-            self._messages = self._feed.messages(self._place)
-        self._waiting = self.look is not None
-        try:
-            came = next(self._messages, None)
-        finally:
-            self._waiting = False
-        self.ended = came is None
-        message, self._text = came or (None, "")
+    def _has_all_steps(self, twin: Twin) -> bool:
+        """Return whether the twin has the steps after which the watch ends."""
+        return self.step_limit is not None and twin.steps >= self.step_limit
+
+    def _receive_message(self, twin: Twin) -> bool:
+        """Take in the next message of the feed; return whether one has come."""
+        item = self._next_item()
+        self.has_ended = item is None
+        message, self._text = item or (None, "")
         if message is None:
             return False
         self.counts.received += 1
-        self._came += 1
-        self._before_last, self._place = self._place, self._feed.place
+        self._received_here += 1
+        self._previous_position = self._position
+        self._position = self._feed.position
         step: int | None = None
         try:
             if isinstance(message, Refused):
                 raise message
             step = self._step_of(twin, message)
-            self._sort(twin, message, step)
+            self._enqueue(twin, message, step)
         except Refused as refusal:
             self._refuse(str(refusal), step)
         return True
 
-    def _next(self, twin: Twin) -> Reading:
-        """Return the next of the readings that have come."""
-        step, reading, given = self._pending.popleft()
-        self.observation_step = step
-        self._known = self._unreadable
-        self._stream_before = self.stream.state(waiting=False)
-        self.notices = [*self._noticed(reading)]
-        if given == MISSING:
-            self.notices += self.stream.coming()
+    def _next_item(self) -> FeedItem | None:
+        """Return what the feed gives next; None if it has ended."""
+        if self._messages is None:
+            self._messages = self._feed.messages(self._position)
+        self._is_waiting = self.on_poll is not None
+        try:
+            return next(self._messages, None)
+        finally:
+            self._is_waiting = False
+
+    def _next_reading(self, twin: Twin) -> Reading:
+        """Return the first reading of the queue, and count it."""
+        queued = self._queue.popleft()
+        reading = queued.reading
+        self.observation_step = queued.step
+        self._previous_unreadable = self._unreadable
+        self._previous_stream_state = self.stream.state(waiting=False)
+        self.notices = self._note_unreadable_sensors(reading)
+        if queued.status is StepStatus.MISSING:
+            self.notices += self.stream.pop_pending()
         else:
-            self.notices += self._taken(step, reading)
+            self.notices += self._note_accepted(queued.step, reading)
         if reading.revises is None:
-            self._given.append(given)
-            self.counts.missing += given == MISSING
+            self._statuses.append(queued.status)
+            if queued.status is StepStatus.MISSING:
+                self.counts.missing += 1
         else:
-            place = step - twin.steps
-            self.counts.missing -= self._given[place] == MISSING
-            self.counts.late += 1
-            self._given[place] = max(given, self._given[place])
+            self._note_revision(queued.step - twin.steps, queued.status)
         return reading
 
-    def _taken(self, step: int, reading: Reading) -> list[Notice]:
-        """Take in that a message is assimilated; return what is to be told of the stream of messages."""
+    def _note_revision(self, index: int, status: StepStatus) -> None:
+        """Count a late message.
+
+        Parameters
+        ----------
+        index : int
+            The step of the message minus the next step: -1 is the last step, whose status is the
+            last one of the list.
+        status : StepStatus
+            What the message has of its step.
+        """
+        self.counts.late += 1
+        if self._statuses[index] is StepStatus.MISSING:
+            self.counts.missing -= 1
+        self._statuses[index] = max(status, self._statuses[index])
+
+    def _note_accepted(self, step: int, reading: Reading) -> list[Notice]:
+        """Note that a message is assimilated; return the notices about the stream."""
         is_blind = bool(np.isnan(reading.observed).all())
-        self._useful += not is_blind
-        passed_over = reading.passed_over if isinstance(reading, Message) else {}
-        if reading.revises is not None:  # it says nothing of how the sensors are now
+        if not is_blind:
+            self._with_readings_here += 1
+        ignored = reading.ignored if isinstance(reading, Message) else {}
+        if reading.revises is not None:  # a late message does not show how the sensors are now
             is_blind = self.stream.is_blind
-        return self.stream.take(step, is_blind=is_blind, passed_over=passed_over)
+        return self.stream.accept(step, is_blind=is_blind, ignored=ignored)
 
     def complaint(self) -> str:
-        """Return why the messages of this process were of no use, in a sentence; empty where they were.
+        """Return why the messages of this process were of no use, in a sentence.
 
-        That is so where no message told the reading of a sensor, or those at the end were all refused.
+        It is empty if they were of use: if a message had the reading of a sensor, and those at the
+        end were not all refused.
         """
+        received = counted(self._received_here, "message")
         refused = self.stream.refused_in_a_row
-        if self._came and refused and (refused >= REFUSALS_IN_A_ROW or not self._useful):
+        has_no_readings = self._with_readings_here == 0
+        if not self._received_here:
+            return ""
+        if refused and (refused >= REFUSALS_IN_A_ROW or has_no_readings):
             return (
-                f"The watch ended while messages were refused: the last {refused} of "
-                f"{counted(self._came, 'message')}, the last one because {self.stream.last_reason}."
+                f"The watch ended while messages were refused: the last {refused} of {received}, "
+                f"the last one because {self.stream.last_reason}."
             )
-        if self._came and not self._useful:
+        if has_no_readings:
             return (
-                f"None of {counted(self._came, 'message')} has a reading of any {self._words.sensor}: what "
-                "is told rests on the transitions alone."
+                f"None of {received} has a reading of any {self._words.sensor}: what is told rests "
+                "on the transitions alone."
             )
         return ""
 
-    def _noticed(self, reading: Reading) -> Iterator[Notice]:
-        """Say of each sensor once that it is unreadable, and once that it is back."""
-        if reading.revises is not None:
-            return  # it says nothing of how the sensors are now
-        came, words = reading.unreadable, self._words
+    def _note_unreadable_sensors(self, reading: Reading) -> list[Notice]:
+        """Return a notice for each sensor that becomes unreadable, or that is readable again."""
+        if reading.revises is not None:  # a late message does not show how the sensors are now
+            return []
+        notices = []
+        words = self._words
         when = f"{words.step.capitalize()} {self.observation_step}"
-        for g in sorted(came.keys() - self._unreadable):
-            sentence = said("watch.left_out", when=when, sensor=words.sensors([g]), came=came[g])
-            yield Notice("gauge_left_out", sentence, (g + 1,))
-        back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
-        for g in sorted(back):
-            sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
-            yield Notice("gauge_back", sentence, (g + 1,))
-        self._unreadable = (self._unreadable | came.keys()) - back
+        unreadable = reading.unreadable
+        for sensor in sorted(unreadable.keys() - self._unreadable):
+            sentence = (
+                f"{when}: {words.name_sensors([sensor])} shows no reading, and is left out until "
+                f"readings of it come back: {unreadable[sensor]}."
+            )
+            notices.append(Notice("gauge_left_out", sentence, (sensor + 1,)))
+        readable_again = set()
+        for sensor in sorted(self._unreadable - unreadable.keys()):
+            if not np.isnan(reading.observed[sensor]):
+                readable_again.add(sensor)
+                name = words.name_sensors([sensor])
+                sentence = f"{when}: the readings of {name} are back, and used again."
+                notices.append(Notice("gauge_back", sentence, (sensor + 1,)))
+        self._unreadable = (self._unreadable | unreadable.keys()) - readable_again
+        return notices
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Refuse an observation that no state allows; its step is predicted through, or stays as it was."""
-        self.stream.restore(self._stream_before)
-        self._useful -= 1
+        """Refuse an observation that has probability zero in every state.
+
+        Parameters
+        ----------
+        reading : Reading
+            The observation.
+        error : TwinMasterError
+            The error of the twin, which becomes the reason of the refusal.
+
+        Returns
+        -------
+        Reading
+            The reading in its place: none for the next step, which is predicted through; for an
+            earlier step the row that it had before.
+        """
+        # Undo what was noted when the message was accepted
+        self.stream.restore(self._previous_stream_state)
+        self._unreadable = self._previous_unreadable
+        self._with_readings_here -= 1
         self._refuse(str(error), self.observation_step)
+        # Only the notice that two times disagree still holds
         self.notices = [notice for notice in self.notices if notice.kind == "clock"]
-        self._unreadable = self._known
         if reading.revises is not None:
-            return Reading(self._before, None, reading.revises)
+            return Reading(self._row_before_revision, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)
 
     def _refuse(self, reason: str, step: int | None) -> None:
+        """Count the last message as refused, and write it down."""
         self.counts.rejected += 1
-        self.stream.refuse(step, one_line(reason))
-        if self._rejected is None or self._kept >= REJECTED_KEPT:
-            return
-        self._kept += 1
-        record = {"message": self.counts.received, "reason": reason, "text": self._text[:_TEXT_KEPT]}
-        with explained_write_errors(self._rejected), self._rejected.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record, ensure_ascii=True) + "\n")
+        self.stream.note_refusal(step, one_line(reason))
+        self._rejected.append(self.counts.received, reason, self._text)
 
     def _step_of(self, twin: Twin, message: Message) -> int:
         """Return the step that a message names, or that of its time, or the next one."""
@@ -362,56 +438,64 @@ class Intake:
             return twin.steps
         return self._clock.step_of(message.time, twin.steps, self.stream)
 
-    def _sort(self, twin: Twin, message: Message, step: int) -> None:
-        """Take in a message: the next step, one ahead with the gap before it, or one that was before."""
-        most = self._section.longest_gap
-        ahead, told = step - twin.steps, message.control is not None and not message.assumed
-        given = GIVEN if told else _ASSUMED
-        unit = ""
-        if message.step is None and message.time is not None:
-            unit = self._clock.slipped_unit(message.time, twin.steps)
-        if ahead > most:
-            far = f"step {step} is {ahead} steps ahead of the next one, {twin.steps}"
-            raise Refused(f"{far}, and `watch.longest_gap` is {most}{unit_advice(unit)}")
-        if step < twin.first_kept and ahead < 0:
-            raise Refused(said("watch.late", step=step, late=-1 - ahead, lag=self._section.lag))
-        if ahead > 0:
-            self.stream.gap(twin.steps, step, unit)
-        if ahead >= 0:
-            lost = Reading(np.full(self._width, np.nan))
-            self._pending += [(twin.steps + gap, lost, MISSING) for gap in range(ahead)]
-            self._pending.append((step, message, given))
+    def _enqueue(self, twin: Twin, message: Message, step: int) -> None:
+        """Put a message into the queue: that of the next step, of one ahead, or of an earlier one.
+
+        Raises
+        ------
+        Refused
+            If the step is too far ahead or too late, or if the message contradicts an earlier one.
+        """
+        steps_ahead = step - twin.steps
+        if steps_ahead > self._section.longest_gap:
+            raise Refused(
+                f"step {step} is {steps_ahead} steps ahead of the next one, {twin.steps}, and "
+                f"`watch.longest_gap` is {self._section.longest_gap}"
+                f"{unit_advice(self._likely_unit(twin, message))}"
+            )
+        if step < twin.first_kept and steps_ahead < 0:
+            raise Refused(
+                f"step {step} is {-1 - steps_ahead} steps late, and `watch.lag` is "
+                f"{self._section.lag}"
+            )
+        status = StepStatus.WITH_CONTROL
+        if message.control is None or message.assumed:
+            status = StepStatus.ASSUMED_CONTROL
+        if steps_ahead < 0:
+            self._enqueue_revision(twin, message, step, status)
             return
-        before = twin.observed(step)
-        both = ~np.isnan(before) & ~np.isnan(message.observed)
-        if not np.array_equal(before[both], message.observed[both]):
+        if steps_ahead > 0:
+            self.stream.note_gap(twin.steps, step, self._likely_unit(twin, message))
+        for missing_step in range(twin.steps, step):
+            no_reading = Reading(np.full(self._width, np.nan))
+            self._queue.append(_QueuedReading(missing_step, no_reading, StepStatus.MISSING))
+        self._queue.append(_QueuedReading(step, message, status))
+
+    def _likely_unit(self, twin: Twin, message: Message) -> str:
+        """Return the unit that the time of a message seems to have; see `Clock.likely_unit`."""
+        if message.step is not None or message.time is None:
+            return ""
+        return self._clock.likely_unit(message.time, twin.steps)
+
+    def _enqueue_revision(
+        self, twin: Twin, message: Message, step: int, status: StepStatus
+    ) -> None:
+        """Put a message about an earlier step into the queue, if it says something new of it."""
+        row = twin.observed(step)
+        is_in_both = ~np.isnan(row) & ~np.isnan(message.observed)
+        if not np.array_equal(row[is_in_both], message.observed[is_in_both]):
             raise Refused(f"it contradicts what was received of step {step} before")
-        another = message.control not in (None, twin.control_of(step))
-        if another and self._given[ahead] == GIVEN:
-            raise Refused(f"it contradicts the control of step {step}")
-        merged = np.where(np.isnan(before), message.observed, before)
-        if not another and np.array_equal(merged, before, equal_nan=True):
+        has_other_control = message.control not in (None, twin.control_of(step))
+        if has_other_control:
+            # Counted from the end: -1 is the status of the last step
+            former_status = self._statuses[step - twin.steps]
+            if former_status is StepStatus.WITH_CONTROL:
+                raise Refused(f"it contradicts the control of step {step}")
+        merged_row = np.where(np.isnan(row), message.observed, row)
+        if not has_other_control and np.array_equal(merged_row, row, equal_nan=True):
             self.counts.duplicates += 1
-            self._useful += 1
+            self._with_readings_here += 1  # a duplicate has readings, too
             return
-        self._before = before
-        self._pending.append((step, replace(message, observed=merged, revises=step), given))
-
-
-class _Asked(BaseException):
-    """Somebody asked the watch to end while it waited."""
-
-
-@contextmanager
-def listening(ask: Callable[[], None]) -> Iterator[None]:
-    """Call `ask` where SIGINT or SIGTERM ask for an end, in the main thread alone."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = {number: signal.signal(number, lambda *_: ask()) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        self._row_before_revision = row
+        revision = replace(message, observed=merged_row, revises=step)
+        self._queue.append(_QueuedReading(step, revision, status))

@@ -3,206 +3,345 @@
 import io
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from functools import lru_cache
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
 from select import select
-from typing import IO, Any, BinaryIO
+from typing import IO, BinaryIO, TypedDict
 
-from twin_master.errors import said
 from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
-Place = Mapping[str, Any]
-"""Where a feed stands behind a message, as JSON: in a file the hash of its `beginning`, and bytes `read`."""
 
-_PIECE = 65_536
-"""Bytes that are read at once; so many at its beginning tell a file from others, also under another name."""
-_NUMBER, _DATE = re.compile(r"\.\d{1,6}"), re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
+class Position(TypedDict):
+    """The position of a feed in a file, after a message, as a journal holds it.
 
-
-def rotated(path: Path) -> list[Path]:
-    """Return the files beside one that had its name before, and copies of them, the oldest first.
-
-    They have a number or a date behind the name, as logrotate and `logging.handlers` make them:
-    `log.csv.1`, `log.csv-20260501`, `log.csv.2026-05-01_12`.
+    Attributes
+    ----------
+    beginning : str
+        The SHA-256 of the first bytes of the file, which identifies it under any name.
+    read : int
+        The number of bytes up to the position.
     """
-    beside = path.parent.glob(f"{escape(path.name)}[.-]*")
-    endings = [file.name.removeprefix(path.name) for file in beside]
-    numbers = [ending for ending in endings if _NUMBER.fullmatch(ending)]
-    dates = [ending for ending in endings if _DATE.fullmatch(ending)]
-    ordered = sorted(dates) + sorted(numbers, key=lambda ending: -int(ending[1:]))
-    return [path.with_name(path.name + ending) for ending in ordered]
+
+    beginning: str
+    read: int
+
+
+_PIECE_BYTES = 65_536
+"""Number of bytes that are read at once, and of those at the beginning that identify a file."""
+_NUMBER_SUFFIX = re.compile(r"\.\d{1,6}")
+_DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
+
+
+def rotated_files(path: Path) -> list[Path]:
+    """Return the files that had the name of a log before, and copies of them, the oldest first.
+
+    Their names have a number or a date after that of the log, as logrotate and `logging.handlers`
+    make them: `log.csv.1`, `log.csv-20260501`, `log.csv.2026-05-01_12`.
+    """
+    dates = []
+    numbers = []
+    for file in path.parent.glob(f"{escape(path.name)}[.-]*"):
+        suffix = file.name.removeprefix(path.name)
+        if _DATE_SUFFIX.fullmatch(suffix):
+            dates.append(suffix)
+        elif _NUMBER_SUFFIX.fullmatch(suffix):
+            numbers.append(suffix)
+    dates.sort()
+    numbers.sort(key=_number_of_suffix, reverse=True)  # the largest number is the oldest
+    return [path.with_name(path.name + suffix) for suffix in dates + numbers]
+
+
+def _number_of_suffix(suffix: str) -> int:
+    """Return the number in a suffix such as `.12`."""
+    return int(suffix.removeprefix("."))
 
 
 def first_line(path: Path) -> bytes:
-    """Return the first line of a file, as far as it is there."""
+    """Return the first line of a file, as far as it is written; empty if there is no file."""
     with suppress(FileNotFoundError), path.open("rb") as file:
         return file.readline(LARGEST_MESSAGE)
     return b""
 
 
-def found(path: Path, place: Place | None, *, follow: bool) -> Path | None:
-    """Return the file that a place is in: that of the name, or where it is followed a rotated one."""
-    for file in [path, *reversed(rotated(path))] if follow else [path]:
+def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | None:
+    """Return the file that contains a position; None if there is none.
+
+    Parameters
+    ----------
+    path : Path
+        The file, which is looked at first.
+    position : Position or None
+        The position; None is in no file.
+    follow : bool
+        Whether to look at the rotated files, too, the newest first.
+    """
+    files = [path]
+    if follow:
+        files += reversed(rotated_files(path))
+    for file in files:
         with suppress(FileNotFoundError), file.open("rb", buffering=0) as opened:
-            if holds(opened, place):
+            if contains(opened, position):
                 return file
     return None
 
 
-def holds(opened: BinaryIO, place: Place | None) -> bool:
-    """Return whether a place is in an open file."""
-    if place is None or opened.seek(0, os.SEEK_END) < place["read"]:
+def contains(file: BinaryIO, position: Position | None) -> bool:
+    """Return whether an open file is the one that a position belongs to, and reaches up to it."""
+    if position is None or file.seek(0, os.SEEK_END) < position["read"]:
         return False
-    opened.seek(0)
-    return _hash(opened.read(min(place["read"], _PIECE))) == str(place["beginning"])
+    file.seek(0)
+    beginning = file.read(min(position["read"], _PIECE_BYTES))
+    return _hash_of_beginning(beginning) == str(position["beginning"])
 
 
 @lru_cache(1000)
-def _hash(beginning: bytes) -> str:
+def _hash_of_beginning(beginning: bytes) -> str:
+    """Return the SHA-256 of the beginning of a file, by which the file is known again."""
     return sha256(beginning).hexdigest()
 
 
 class Lines:
-    """Whole lines of what comes in pieces; what is too long is refused, and the rest at the end is a line.
+    """The lines of what comes in pieces; a line that is too long is refused.
+
+    What stands after the last line feed, at the very end, is a line, too.
 
     Attributes
     ----------
+    longest : float
+        The greatest length of a line [bytes].
     begin, end : int
-        Where the last line begins and ends, in bytes.
+        The beginning and the end of the last line [bytes].
     """
 
     longest: float = LARGEST_MESSAGE
-    begin = end = 0
+    begin = 0
+    end = 0
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Return what comes: None where nothing has come yet; nothing, `b""`, where no line goes on."""
+        """Yield the pieces as they come.
+
+        None means that nothing has come yet. An empty piece ends a line that was begun.
+        """
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[bytes | Refused | None]:
+        """Yield the lines, each with its line feed; None if no further line has come yet."""
         line: bytes | Refused = b""
-        for came in self.pieces():
-            if not isinstance(came, bytes):
-                yield came
+        for piece in self.pieces():
+            if not isinstance(piece, bytes):
+                yield piece
                 continue
-            if not came and line:
+            if not piece and line:
                 yield line
                 line = b""
-            for piece in io.BytesIO(came):
-                self.begin = self.begin if line else self.end
-                self.end += len(piece)
-                if isinstance(line, bytes) and len(line := line + piece) > self.longest:
-                    line = Refused(f"a message has at most {self.longest} bytes")
-                if piece.endswith(b"\n"):
+            for part in io.BytesIO(piece):
+                if not line:
+                    self.begin = self.end
+                self.end += len(part)
+                line = self._extend_line(line, part)
+                if part.endswith(b"\n"):
                     yield line
                     line = b""
         if isinstance(line, bytes) and line:
             yield line
 
+    def _extend_line(self, line: bytes | Refused, part: bytes) -> bytes | Refused:
+        """Return a line with a further part; a line that gets too long becomes a refusal."""
+        if isinstance(line, Refused):
+            return line
+        longer_line = line + part
+        if len(longer_line) > self.longest:
+            return Refused(f"a message has at most {self.longest} bytes")
+        return longer_line
+
 
 class Pipe(Lines):
-    """Lines of a stream; one that `looks` is not waited for while nothing has come."""
+    """The lines of a stream.
 
-    def __init__(self, stream: IO[bytes], *, looks: bool) -> None:
-        self._stream, self._looks = stream, looks
+    Parameters
+    ----------
+    stream : file
+        The stream.
+    polls : bool
+        Whether to yield None while nothing has come; if not, the next piece is waited for.
+    """
+
+    def __init__(self, stream: IO[bytes], *, polls: bool) -> None:
+        self._stream = stream
+        self._polls = polls
 
     def pieces(self) -> Iterator[bytes | None]:
-        """Return what comes until the stream ends."""
-        came: bytes | None = None
-        while came != b"":
-            silent = self._looks and not select([self._stream], [], [], 0.0)[0]
-            came = None if silent else self._stream.read1(_PIECE)  # type: ignore[attr-defined]
-            if came != b"":
-                yield came
+        """Yield the pieces until the stream ends."""
+        while True:
+            if self._polls and not self._is_readable():
+                yield None
+                continue
+            piece: bytes | None = self._stream.read1(_PIECE_BYTES)  # type: ignore[attr-defined]
+            if piece == b"":
+                return
+            yield piece
+
+    def _is_readable(self) -> bool:
+        """Return whether something has come, or the stream has ended."""
+        readable, _, _ = select([self._stream], [], [], 0.0)
+        return bool(readable)
 
 
 class GrowingFile(Lines):
-    """A file of lines, from a place in it on; one that is followed has no end.
+    """The lines of a file from a position on; a file that is followed has no end.
 
     Parameters
     ----------
     file : file
-        Open to be read.
-    place : mapping, optional
-        Where to begin; at the beginning of the file where it is not of this one.
-    path : Path, optional
-        Go on in the files that take the place of this one. A file that was renamed is read to its end, then
-        those that came after it; a copy of one that was cut is read to its end, then the file again.
+        The file, open to be read.
+    position : Position, optional
+        The position to begin at; the beginning of the file if the position is not in it.
+    followed_path : Path, optional
+        The name to follow: reading goes on in the files that get this name later. A file that was
+        renamed is read to its end, then those that came after it. A file that was cut is read on in
+        its copy, to the end of the copy, and then again from its own beginning.
     """
 
-    def __init__(self, file: BinaryIO, place: Place | None = None, path: Path | None = None) -> None:
-        self._path, self._copied = path, False
-        self._open(file, place)
+    def __init__(
+        self, file: BinaryIO, position: Position | None = None, followed_path: Path | None = None
+    ) -> None:
+        self._followed_path = followed_path
+        self._is_copy = False
+        self._start_reading(file, position)
 
-    def _open(self, file: BinaryIO, place: Place | None) -> None:
-        self.end = place["read"] if place and holds(file, place) else 0
+    def _start_reading(self, file: BinaryIO, position: Position | None) -> None:
+        """Go on with a file at a position."""
+        self.end = 0
+        if position is not None and contains(file, position):
+            self.end = position["read"]
         file.seek(0)
-        self._file, self._beginning = file, file.read(min(self.end, _PIECE))
+        self._file = file
+        self._beginning = file.read(min(self.end, _PIECE_BYTES))
         file.seek(self.end)
 
     @property
-    def place(self) -> Place:
-        """Where the last line ends."""
-        return {"beginning": _hash(self._beginning[: self.end]), "read": self.end}
+    def position(self) -> Position:
+        """The end of the last line."""
+        return {"beginning": _hash_of_beginning(self._beginning[: self.end]), "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Return what has come; a file that another one takes the place of is read to its end before."""
+        """Yield the pieces of the file, and of those that take its place."""
         try:
-            while (came := self._file.read(_PIECE)) or self._path:
-                if self._path and self._was_cut():
-                    copy = found(self._path, self.place, follow=True)
-                    if copy is None:
-                        yield Refused(said("watch.cut", name=self._path.name, byte=self.end))
-                    yield from self._go_on((copy or self._path).open("rb", buffering=0), copied=bool(copy))
-                    continue
-                if not came and self._path and (following := self._following(self._path)):
-                    came = self._file.read(_PIECE)  # the last that its writer has left
-                    if not came:
-                        yield from self._go_on(following)
-                        continue
-                    following.close()
-                if len(self._beginning) < _PIECE:
-                    self._beginning = (self._beginning + came)[:_PIECE]
-                yield came or None
+            if self._followed_path is None:
+                yield from self._pieces_to_end()
+            else:
+                yield from self._followed_pieces(self._followed_path)
         finally:
             self._file.close()
 
-    def _go_on(self, file: BinaryIO, *, copied: bool = False) -> Iterator[bytes]:
-        """Read another file; a line goes on there only where it is, or follows, a copy of this one."""
-        joined, place = self._copied or copied, self.place
+    def _pieces_to_end(self) -> Iterator[bytes]:
+        """Yield the pieces of the file up to its end."""
+        while True:
+            piece = self._file.read(_PIECE_BYTES)
+            if not piece:
+                return
+            self._note_beginning(piece)
+            yield piece
+
+    def _followed_pieces(self, path: Path) -> Iterator[bytes | Refused | None]:
+        """Yield what comes under a name, without end."""
+        while True:
+            piece = self._file.read(_PIECE_BYTES)
+            if self._was_cut():
+                yield from self._switch_after_cut(path)
+                continue
+            if not piece:
+                next_file = self._open_next(path)
+                if next_file is not None:
+                    # What its writer has left in the file before the other took its place
+                    piece = self._file.read(_PIECE_BYTES)
+                    if not piece:
+                        yield from self._switch_to(next_file)
+                        continue
+                    next_file.close()
+            self._note_beginning(piece)
+            yield piece or None
+
+    def _note_beginning(self, piece: bytes) -> None:
+        """Keep a piece, if it belongs to the beginning that identifies the file."""
+        if len(self._beginning) < _PIECE_BYTES:
+            self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
+
+    def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
+        """Go on in the copy of a file that was cut; without a copy, at its new beginning."""
+        copy = find_file(path, self.position, follow=True)
+        if copy is None:
+            yield Refused(
+                f"{path.name} was cut at byte {self.end}, and no copy is beside it: what stood "
+                "behind that and was not read yet is lost"
+            )
+        file = (copy or path).open("rb", buffering=0)
+        yield from self._switch_to(file, is_copy=copy is not None)
+
+    def _switch_to(self, file: BinaryIO, *, is_copy: bool = False) -> Iterator[bytes]:
+        """Go on with another file.
+
+        A line that was begun goes on there only if one of the two files is a copy of the other. If
+        not, an empty piece ends it.
+        """
+        line_goes_on = self._is_copy or is_copy
+        position = self.position
         self._file.close()
-        self._open(file, place)
-        self._copied = copied
-        if not joined:
+        self._start_reading(file, position)
+        self._is_copy = is_copy
+        if not line_goes_on:
             yield b""
 
     def _was_cut(self) -> bool:
-        """Return whether the file is not any more what was read of it, also where it has grown again."""
-        same = os.pread(self._file.fileno(), len(self._beginning), 0) == self._beginning
-        return not same or os.fstat(self._file.fileno()).st_size < self._file.tell()
+        """Return whether the file has lost what was read of it, even if it has grown again."""
+        beginning = os.pread(self._file.fileno(), len(self._beginning), 0)
+        if beginning != self._beginning:
+            return True
+        return os.fstat(self._file.fileno()).st_size < self._file.tell()
 
-    def _following(self, path: Path) -> BinaryIO | None:
-        """Return the file to go on with, once it holds something; None where this one still has its name."""
+    def _open_next(self, path: Path) -> BinaryIO | None:
+        """Return the file that follows this one under the name `path`, open to be read.
+
+        None if this file still has the name, or if nothing was written into the next one yet.
+        """
         with suppress(FileNotFoundError):  # in the middle of being renamed
-            here = os.fstat(self._file.fileno())
-            if os.path.samestat(here, path.stat()):
+            own = os.fstat(self._file.fileno())
+            if os.path.samestat(own, path.stat()):
                 return None
-            listed, again = _listed(path), _listed(path)
-            own = [number for number, inode in enumerate(listed.values()) if inode == here.st_ino]
-            behind = [*listed][own[0] + 1 :] if own else [path]
-            coming = next((file for file in behind if file.stat().st_size), None)
-            if coming is None:
+            inodes = _inodes_of_log(path)
+            inodes_again = _inodes_of_log(path)
+            next_path = _first_written_after(inodes, own.st_ino, path)
+            if next_path is None:
                 return None
             with ExitStack() as closing:
-                opened = closing.enter_context(coming.open("rb", buffering=0))
-                if listed == again == _listed(path):  # it still had that name when it was opened
+                file = closing.enter_context(next_path.open("rb", buffering=0))
+                # Only if no file was renamed meanwhile, the opened file is the one that was chosen
+                if inodes == inodes_again == _inodes_of_log(path):
                     closing.pop_all()
-                    return opened
+                    return file
         return None
 
 
-def _listed(path: Path) -> dict[Path, int]:
-    return {file: file.stat().st_ino for file in (*rotated(path), path)}
+def _inodes_of_log(path: Path) -> dict[Path, int]:
+    """Return the inode of each rotated file of a log, the oldest first, and of the log itself."""
+    return {file: file.stat().st_ino for file in (*rotated_files(path), path)}
+
+
+def _first_written_after(inodes: dict[Path, int], inode: int, path: Path) -> Path | None:
+    """Return the first file after that with an inode that is not empty.
+
+    If no file has the inode, only the log at `path` counts.
+    """
+    later_files = [path]
+    inodes_in_order = list(inodes.values())
+    if inode in inodes_in_order:
+        index = inodes_in_order.index(inode)
+        later_files = list(inodes)[index + 1 :]
+    for file in later_files:
+        if file.stat().st_size > 0:
+            return file
+    return None

@@ -1,6 +1,7 @@
-"""What a publisher sends: one observation, checked, in SI.
+"""Messages of a publisher: from JSON to one observation, checked and in SI units.
 
-A publisher is not trusted. Whatever it sends is an observation or a `Refused` with one sentence.
+A publisher is not trusted. Whatever it sends becomes an observation, or a `Refused` with one
+sentence that says why.
 """
 
 import json
@@ -10,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import lru_cache
+from typing import NamedTuple
 from unicodedata import normalize
 
 import numpy as np
@@ -23,26 +25,29 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 
 LARGEST_MESSAGE = 1_000_000
-"""Bytes of a message; a larger one is refused unread."""
+"""Largest message [bytes]; a larger one is refused without being parsed."""
 LARGEST_STRAIN = 0.5
-"""A strain beyond this is one whose unit was forgotten."""
-LARGEST = 1e30
-"""The same of any other sensor, SI: far beyond what exists, and its powers are still numbers."""
+"""Largest strain; beyond it the publisher has forgotten the unit."""
+LARGEST_VALUE = 1e30
+"""Largest value of any other sensor, SI; it exceeds what exists, and its powers are finite."""
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
-"""A unit whose first name has a power, which its prefix has, too: a mm2 is 1e-6 m2."""
-_WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
+"""A unit whose first name has a power. The prefix has this power, too: a mm2 is 1e-6 m2."""
+_FACTORS_WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 OTHER_KEYS = "step", "time", "control"
-"""What stands in a message beside its sensors."""
+"""The keys of a message that are no sensor."""
 PRESENT_NAMES = {"turn": "step"}
 """The present name of each key of a message, and of each column of a file, by its former name."""
-_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-"""A second in each unit of times."""
-_LIKELY = 0.8
-"""Ratio of `difflib` from which on a name is probably a slip of the pen of a known one."""
-_NAME_SHOWN, _NAMES_SHOWN = 60, 3
-"""Characters of a name, and names, that a refusal shows."""
-_NAMED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
+_UNITS_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""The length of a second in each unit of times."""
+_LEAST_SIMILARITY = 0.8
+"""Least ratio of `difflib` between a name and the known one that it was probably meant to be."""
+_SHOWN_CHARACTERS = 60
+"""Characters of an unknown name that a refusal shows."""
+_SHOWN_NAMES = 3
+"""Unknown names that a refusal shows."""
+_NAME_WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
+"""A name with its unit in brackets: `strain_7 [microstrain]`."""
 
 
 class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
@@ -51,118 +56,207 @@ class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
 
 @dataclass(frozen=True)
 class Message(Reading):
-    """An observation as it was sent, SI; where modes are observed, a row with their covariance.
+    """An observation as it was sent, in SI units; of modes, a row with their covariance.
 
     Attributes
     ----------
     step : int or None
-        Its step, if it says so.
+        The step that the message names.
     time : float or None
-        Its time [s], if it says so.
+        The time [s] that the message names.
     assumed : bool
-        Whether its control was not told where it was recorded.
-    passed_over : dict of str to str
-        Names in it that are no sensor; with each what it probably is, in words, where it looks like a slip.
+        Whether its control was assumed when it was recorded, because no message had told it.
+    ignored : dict of str to str
+        The names in it that are no sensor. The value of a name is the known name that it was
+        probably meant to be, in words; it is empty if there is none.
     """
 
     step: int | None = None
     time: float | None = None
     assumed: bool = False
-    passed_over: Mapping[str, str] = field(default_factory=dict)
+    ignored: Mapping[str, str] = field(default_factory=dict)
 
 
-Fed = tuple[Message | Refused | None, str]
-"""A message with the begin of its text; None where nothing more has come yet."""
+FeedItem = tuple[Message | Refused | None, str]
+"""A message with the beginning of its text; None if no further message has come yet."""
+MessageContent = bytes | Mapping[str, object] | Message | Refused
+"""The content of a message: JSON, a parsed object, or what was already read or refused."""
+
+
+class SensorColumn(NamedTuple):
+    """The meaning of a key of a message, or of a column of a file.
+
+    Attributes
+    ----------
+    sensor : int
+        The index of the sensor, from 0.
+    factor : float
+        The factor from the sent values to SI units.
+    """
+
+    sensor: int
+    factor: float
+
+
+@dataclass
+class _SensorReadings:
+    """The readings of all sensors in a message.
+
+    Attributes
+    ----------
+    observed : array of shape (G + I,)
+        The readings of the sensors and of the inspections, SI; NaN where none came.
+    sensors : set of int
+        The indices of the sensors that the message names.
+    unreadable : dict of int to str
+        What came in the place of a number, by the index of the sensor.
+    ignored : dict of str to str
+        As in `Message`.
+    nested_name : str
+        The first ignored name whose value is an object; empty if there is none.
+    """
+
+    observed: Float
+    sensors: set[int] = field(default_factory=set)
+    unreadable: dict[int, str] = field(default_factory=dict)
+    ignored: dict[str, str] = field(default_factory=dict)
+    nested_name: str = ""
 
 
 class MessageReader:
     """Reads the messages about the asset of a scenario.
 
-    A sensor goes by `ROLE_NUMBER` (`strain_7`) or its title, its unit behind it: `strain_7_microstrain`,
-    `strain_7 [microstrain]`; without a unit it is in that of the scenario. The reading of an inspection goes
-    by `ACTION_STATE` (`inspect_z1_percent`). All sensors together go by their role, as a list, with `unit`
-    beside it. A sensor of which no number comes, or an absurd one, is lost alone.
+    The key of a sensor is `ROLE_NUMBER` (`strain_7`) or its title, followed by its unit:
+    `strain_7_microstrain`, `strain_7 [microstrain]`. Without a unit the value is in that of the
+    scenario. The key of the reading of an inspection is `ACTION_STATE` (`inspect_z1_percent`). All
+    sensors together have the key of their role, with a list as value and `unit` beside it. A sensor
+    whose value is no number, or is too large, is lost; the others of the message count.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario with the sensors, the controls and the unit of times.
+
+    Attributes
+    ----------
+    allows_unknown : bool
+        Whether keys that are no sensor are ignored, and not refused.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._observation, self.allows_unknown = scenario.observation, scenario.watch.allow_unknown
-        self._second = _SECOND[scenario.watch.time_unit]
+        observation = scenario.observation
+        self._observation = observation
+        self.allows_unknown = scenario.watch.allow_unknown
+        self._units_per_second = _UNITS_PER_SECOND[scenario.watch.time_unit]
         self._controls = scenario.control_names
-        role, count = scenario.observation.role, scenario.observation.count
-        self._index = {f"{role}_{number + 1}": number for number in range(count)}
-        self._index |= {title: number for number, title in enumerate(scenario.observation.titles)}
-        units, self._width = scenario.observation.sensor_units, scenario.row_width
-        self._largest = [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
-        self._index |= {name: count + place for place, (*_, name, _) in enumerate(scenario.readings)}
-        self._units = [*units, *(scenario.state[place].unit for _, place, *_ in scenario.readings)]
-        self._largest += [LARGEST] * len(scenario.readings)
-        # Names that mean the same come without end.
-        self.column = lru_cache(maxsize=2 * len(self._index))(self._column)
-        self.likely_slip = lru_cache(maxsize=1000)(self._likely_slip)
+        self._width = scenario.row_width
 
-    def _column(self, name: str) -> tuple[int, float] | None:
-        """Return the index of the sensor that a name stands for, and what its values are multiplied by.
+        # Sensors
+        role = observation.role
+        count = observation.count
+        self._sensor_of_name = {f"{role}_{number + 1}": number for number in range(count)}
+        self._sensor_of_name |= {title: number for number, title in enumerate(observation.titles)}
+        self._units = list(observation.sensor_units)
+        self._largest_values = []
+        for unit in observation.sensor_units:
+            is_strain = role == "strain" and unit == "1"
+            self._largest_values.append(LARGEST_STRAIN if is_strain else LARGEST_VALUE)
 
-        None for a name that is no sensor.
+        # Readings of inspections, which follow the sensors in a row
+        for index, (_, state, name, _) in enumerate(scenario.readings):
+            self._sensor_of_name[name] = count + index
+            self._units.append(scenario.state[state].unit)
+            self._largest_values.append(LARGEST_VALUE)
+
+        # A stream repeats the same names in each message
+        cache_size = 2 * len(self._sensor_of_name)
+        self.find_column = lru_cache(maxsize=cache_size)(self._find_column)
+        self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
+
+    def _find_column(self, name: str) -> SensorColumn | None:
+        """Return the sensor and the factor that a name stands for; None if it is no sensor.
 
         Raises
         ------
         Refused
-            It is not in a unit of this sensor.
+            If the unit in the name is not one of this sensor.
         """
-        base, unit = name, ""
-        if name not in self._index:
-            named = _NAMED.match(name)
-            base, unit = named.groups() if named else name.rpartition("_")[::2]
-        if base not in self._index:
+        base = name
+        unit = ""
+        if name not in self._sensor_of_name:
+            match = _NAME_WITH_UNIT.match(name)
+            if match:
+                base, unit = match.groups()
+            else:
+                base, _, unit = name.rpartition("_")
+        if base not in self._sensor_of_name:
             return None
-        sensor = self._index[base]
-        own = self._units[sensor]
-        squared = _POWER.match(normalize("NFKC", own))
-        power = int(squared[1]) if squared else 1
-        known = {prefix + own: factor**power for prefix, factor in _PREFIXES.items()}
-        known = _WITHOUT_UNIT if own == "1" else known
-        if unit and unit not in known:
-            what = f"`{unit[:30]}` is no unit of sensor {sensor + 1}"
-            raise Refused(f"{what}: it is read in {listing(known, 'or')}")
-        return sensor, known[unit or own]
+        sensor = self._sensor_of_name[base]
+        factors = self._unit_factors(sensor)
+        if unit and unit not in factors:
+            raise Refused(
+                f"`{unit[:30]}` is no unit of sensor {sensor + 1}: it is read in "
+                f"{listing(factors, 'or')}"
+            )
+        return SensorColumn(sensor, factors[unit or self._units[sensor]])
 
-    def _likely_slip(self, name: str) -> str:
-        """Return the known name of which an unknown one is probably a slip of the pen; empty without any."""
-        likely = get_close_matches(name, (*OTHER_KEYS, *self._index), 1, cutoff=_LIKELY)
-        return likely[0] if likely else ""
+    def _unit_factors(self, sensor: int) -> dict[str, float]:
+        """Return the units in which a sensor is read, each with its factor to SI units."""
+        unit = self._units[sensor]
+        if unit == "1":
+            return _FACTORS_WITHOUT_UNIT
+        power_match = _POWER.match(normalize("NFKC", unit))
+        power = int(power_match[1]) if power_match else 1
+        return {prefix + unit: factor**power for prefix, factor in _PREFIXES.items()}
 
-    def unknown(self, names: Sequence[str], *, is_any_known: bool) -> str:
-        """Return what is wrong with names that are no sensor, and what to do, in words.
+    def _find_likely_name(self, name: str) -> str:
+        """Return the known name that an unknown one was probably meant to be; empty if none."""
+        known_names = (*OTHER_KEYS, *self._sensor_of_name)
+        matches = get_close_matches(name, known_names, 1, cutoff=_LEAST_SIMILARITY)
+        return matches[0] if matches else ""
+
+    def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
+        """Return a sentence with names that are no sensor, and what to do.
 
         Parameters
         ----------
         names : sequence of str
-            At least one.
-        is_any_known : bool
-            Whether there are sensors beside them; if not, to pass over the names leaves nothing.
+            At least one unknown name.
+        has_sensors : bool
+            Whether there are sensors beside them. If not, nothing is left when the names are
+            ignored, and the sentence does not advise it.
         """
-        shown = [name[:_NAME_SHOWN] for name in names[:_NAMES_SHOWN]]
-        further = f" (and {len(names) - len(shown)} more)" if names[_NAMES_SHOWN:] else ""
-        are = "is no sensor" if len(names) == 1 else f"are no sensors{further}"
-        near = _near(shown[0], *self._index)
+        shown_names = [name[:_SHOWN_CHARACTERS] for name in names[:_SHOWN_NAMES]]
+        quoted_names = listing(f"`{name}`" for name in shown_names)
+        verb = "is no sensor"
+        if len(names) > 1:
+            hidden_count = len(names) - len(shown_names)
+            verb = "are no sensors" + (f" (and {hidden_count} more)" if hidden_count else "")
+        examples = _similar_names(shown_names[0], *self._sensor_of_name)
         sentence = (
-            f"{listing(f'`{name}`' for name in shown)} {are}: a sensor is called such as {near}, its unit "
-            f"behind it, and there are {len(self._units)}"
+            f"{quoted_names} {verb}: a sensor is called such as {examples}, its unit behind it, "
+            f"and there are {len(self._units)}"
         )
-        if is_any_known and not any(map(self.likely_slip, shown)):
-            sentence += "; what is meant to be passed over begins with `_`, or is allowed by --allow-unknown"
+        if has_sensors and not any(map(self.likely_name, shown_names)):
+            sentence += (
+                "; what is meant to be passed over begins with `_`, or is allowed by "
+                "--allow-unknown"
+            )
         return sentence
 
-    def message(self, content: bytes | Mapping[str, object] | Message | Refused) -> Message | Refused:
-        """Return the observation in a JSON object, or in a record of one, or why there is none."""
+    def read(self, content: MessageContent) -> Message | Refused:
+        """Return the observation of a message, or the reason why there is none."""
         try:
-            content = self._parsed(content) if isinstance(content, bytes) else content
-            return content if isinstance(content, Message | Refused) else self._read(content)
+            if isinstance(content, bytes):
+                content = self._parse(content)
+            if isinstance(content, Message | Refused):
+                return content
+            return self._read_record(content)
         except Refused as refusal:
             return refusal
 
-    def _parsed(self, content: bytes) -> dict[str, object]:
+    def _parse(self, content: bytes) -> Mapping[str, object]:
+        """Return the JSON object in the text of a message."""
         if len(content) > LARGEST_MESSAGE:
             raise Refused(f"a message has at most {LARGEST_MESSAGE} bytes, and {len(content)} came")
         try:
@@ -173,105 +267,152 @@ class MessageReader:
             raise Refused("it is no JSON object")
         return record
 
-    def _read(self, record: Mapping[str, object]) -> Message:
+    def _read_record(self, record: Mapping[str, object]) -> Message:
+        """Return the observation in a parsed message."""
         record = with_present_names(record, PRESENT_NAMES, "A message", Refused)
-        observed = np.full(self._width, np.nan)
-        given: set[int] = set()
-        unreadable: dict[int, str] = {}
-        passed_over: dict[str, str] = {}
-        nested = ""
-        for name, value in self._readings(record):
-            if name == "covariance" and self._observation.modes is not None:
-                observed[self._observation.count :] = self._covariance(value)
-                continue
-            column = self.column(name)
-            if column is None:
-                likely = self.likely_slip(name[:_NAME_SHOWN])
-                passed_over[name] = f"probably `{likely}`" if likely else ""
-                nested = nested or (name if isinstance(value, dict) else "")
-                continue
-            sensor, factor = column
-            if sensor in given:
-                raise Refused(f"sensor {sensor + 1} is given twice")
-            given.add(sensor)
-            shown = self._value(sensor, factor, value)
-            if isinstance(shown, str):
-                unreadable[sensor] = shown
-            else:
-                observed[sensor] = shown
-        if passed_over and nested and not given:
-            example = next(iter(self._index))
-            raise Refused(
-                f"`{nested[:_NAME_SHOWN]}` holds an object, and no sensor stands beside it: sensors stand at "
-                f'the top level of a message, as in {{"step": 0, "{example}": 0.0}}'
-            )
-        if passed_over and not self.allows_unknown:
-            raise Refused(self.unknown([*passed_over], is_any_known=bool(given)))
-        step, time, control = (record.get(name) for name in OTHER_KEYS)
-        if step is not None and (type(step) is not int or not 0 <= step <= LARGEST_SEED):
-            raise Refused(f"`step` is a whole number from 0, and {step!r:.40} came")
-        time = float(time) if type(time) is int else time
-        if time is not None and not (isinstance(time, float) and math.isfinite(time)):
-            raise Refused("`time` is a number")
-        if control not in (None, *self._controls):
-            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
-        number = None if control is None else self._controls.index(str(control))
+        readings = self._read_sensors(record)
+        self._check_ignored_names(readings)
+        step = self._read_step(record.get("step"))
+        time = self._read_time(record.get("time"))
+        control = self._read_control(record.get("control"))
         return Message(
-            observed,
-            number,
-            unreadable=unreadable,
+            readings.observed,
+            control,
+            unreadable=readings.unreadable,
             step=step,
-            time=None if time is None else time / self._second,
-            passed_over=passed_over,
+            time=time,
+            ignored=readings.ignored,
         )
 
-    def _readings(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-        """Return names and values of a record; each of a list has the name of its sensor."""
-        unit, role = record.get("unit", ""), self._observation.role
+    def _read_sensors(self, record: Mapping[str, object]) -> _SensorReadings:
+        """Return the readings of all sensors in a parsed message."""
+        readings = _SensorReadings(np.full(self._width, np.nan))
+        for name, value in self._named_values(record):
+            if name == "covariance" and self._observation.modes is not None:
+                readings.observed[self._observation.count :] = self._read_covariance(value)
+                continue
+            column = self.find_column(name)
+            if column is None:
+                likely_name = self.likely_name(name[:_SHOWN_CHARACTERS])
+                readings.ignored[name] = f"probably `{likely_name}`" if likely_name else ""
+                if isinstance(value, dict):
+                    readings.nested_name = readings.nested_name or name
+                continue
+            sensor = column.sensor
+            if sensor in readings.sensors:
+                raise Refused(f"sensor {sensor + 1} is given twice")
+            readings.sensors.add(sensor)
+            number = self._number_in_si(value, column)
+            if abs(number) <= self._largest_values[sensor]:
+                readings.observed[sensor] = number
+            else:
+                readings.unreadable[sensor] = self._describe_unreadable(value, number, column)
+        return readings
+
+    def _check_ignored_names(self, readings: _SensorReadings) -> None:
+        """Refuse a message if it has names of no sensor that must not be ignored."""
+        if not readings.ignored:
+            return
+        if readings.nested_name and not readings.sensors:
+            example = next(iter(self._sensor_of_name))
+            raise Refused(
+                f"`{readings.nested_name[:_SHOWN_CHARACTERS]}` holds an object, and no sensor "
+                "stands beside it: sensors stand at the top level of a message, as in "
+                f'{{"step": 0, "{example}": 0.0}}'
+            )
+        if not self.allows_unknown:
+            has_sensors = bool(readings.sensors)
+            raise Refused(self.describe_unknown(list(readings.ignored), has_sensors=has_sensors))
+
+    def _read_step(self, value: object) -> int | None:
+        """Return the step of a message; None if it names none."""
+        if value is None:
+            return None
+        if type(value) is not int or not 0 <= value <= LARGEST_SEED:
+            raise Refused(f"`step` is a whole number from 0, and {value!r:.40} came")
+        return value
+
+    def _read_time(self, value: object) -> float | None:
+        """Return the time of a message [s]; None if it names none."""
+        if value is None:
+            return None
+        time = float(value) if type(value) is int else value
+        if not isinstance(time, float) or not math.isfinite(time):
+            raise Refused("`time` is a number")
+        return time / self._units_per_second
+
+    def _read_control(self, value: object) -> int | None:
+        """Return the index of the control in a message; None if it names none."""
+        if value is None:
+            return None
+        if value not in self._controls:
+            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
+        return self._controls.index(str(value))
+
+    def _named_values(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+        """Yield the names and values of sensors; each value of a list gets that of its sensor."""
+        role = self._observation.role
+        unit = record.get("unit", "")
         if not isinstance(unit, str):
             raise Refused("`unit` is the name of a unit")
         for name, value in record.items():
             if name == role and isinstance(value, list):
-                if len(value) != self._observation.count:
-                    raise Refused(f"{self._observation.count} values are expected, and {len(value)} came")
-                yield from ((f"{role}_{n}_{unit}".removesuffix("_"), one) for n, one in enumerate(value, 1))
+                count = self._observation.count
+                if len(value) != count:
+                    raise Refused(f"{count} values are expected, and {len(value)} came")
+                for number, element in enumerate(value, start=1):
+                    yield f"{role}_{number}_{unit}".removesuffix("_"), element
             elif name not in (*OTHER_KEYS, "unit") and not name.startswith("_"):
                 yield name, value
 
-    def _covariance(self, value: object) -> Float:
-        """Return the lower triangle of the covariance of all values, SI."""
+    def _read_covariance(self, value: object) -> Float:
+        """Return the lower triangle of the covariance (count, count) of all values, SI."""
         count = self._observation.count
         try:
             matrix = np.array(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
-        if matrix.shape != (count, count) or not np.all(np.abs(matrix) <= LARGEST):
-            raise Refused(f"`covariance` is {count} rows of {count} numbers, in SI units; null is none")
-        size = np.sqrt(np.abs(np.diag(matrix)))
-        size[size == 0.0] = 1.0
+        if matrix.shape != (count, count) or not np.all(np.abs(matrix) <= LARGEST_VALUE):
+            raise Refused(
+                f"`covariance` is {count} rows of {count} numbers, in SI units; null is none"
+            )
+        # Correlations in the place of covariances, so that the tolerances hold for any unit.
+        # A correlation is at most 1. A value with a variance of zero is not scaled.
+        standard_deviation = np.sqrt(np.abs(np.diag(matrix)))
+        standard_deviation[standard_deviation == 0.0] = 1.0
         with np.errstate(over="ignore"):
-            scaled = matrix / size / size[:, None]
-        wrong = np.abs(scaled).max() > 1.0 + 1e-6 or np.abs(scaled - scaled.T).max() > 1e-6
-        if wrong or np.linalg.eigvalsh(scaled)[0] < -1e-6:
+            correlation = matrix / standard_deviation / standard_deviation[:, None]
+        is_too_large = np.abs(correlation).max() > 1.0 + 1e-6
+        is_asymmetric = np.abs(correlation - correlation.T).max() > 1e-6
+        if is_too_large or is_asymmetric or np.linalg.eigvalsh(correlation)[0] < -1e-6:
             raise Refused("`covariance` is not symmetric with eigenvalues of zero or more")
         return matrix[np.tril_indices(count)]
 
-    def _value(self, sensor: int, factor: float, value: object) -> float | str:
-        """Return what a sensor shows, SI, or what came in the place of that; the one reader of readings."""
+    def _number_in_si(self, value: object, column: SensorColumn) -> float:
+        """Return the value of a sensor in SI units; NaN if it is no number."""
+        if isinstance(value, bool):
+            return math.nan
         try:
-            number = math.nan if isinstance(value, bool) else float(value) * factor  # type: ignore[arg-type]
+            return float(value) * column.factor  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
-            number = math.nan
-        if abs(number) <= self._largest[sensor]:
-            return number
+            return math.nan
+
+    def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
+        """Return what came in the place of a reading, and how to give its unit if it lacks one."""
         if not math.isfinite(number):
             return json.dumps(value)[:30]
-        forgotten = factor == 1.0 and self._largest[sensor] == LARGEST_STRAIN
-        unit = f"; give its unit, such as `strain_{sensor + 1}_microstrain`" if forgotten else ""
-        return f"{number:g}{unit}"
+        is_strain = self._largest_values[column.sensor] == LARGEST_STRAIN
+        advice = ""
+        if is_strain and column.factor == 1.0:
+            advice = f"; give its unit, such as `strain_{column.sensor + 1}_microstrain`"
+        return f"{number:g}{advice}"
 
 
 @lru_cache(maxsize=1000)
-def _near(name: str, *known: str) -> str:
-    """Return the names next to one, in words: kept, because finding them takes longer than a message."""
-    return listing(f"`{near}`" for near in get_close_matches(name, known, 3) or known[:1])
+def _similar_names(name: str, *known_names: str) -> str:
+    """Return the known names that are most similar to one, in words.
+
+    The result is cached, because the comparison takes longer than reading a message.
+    """
+    similar_names = get_close_matches(name, known_names, 3) or known_names[:1]
+    return listing(f"`{similar_name}`" for similar_name in similar_names)

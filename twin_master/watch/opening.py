@@ -1,9 +1,9 @@
-"""A watch from its sources to its report, begun or taken up again, and as it stood after a step."""
+"""A watch from its observations to its report, begun or resumed, and its run up to a step."""
 
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -18,16 +18,23 @@ from twin_master.assets.resolution import (
     believed_source,
     resolve_scenario,
 )
-from twin_master.errors import MissionInputError, NotResumableError, said
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_step
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
-from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
-from twin_master.watch.folder import STORED_STEPS, Watch
+from twin_master.store.writing import open_run as open_stored_run
+from twin_master.watch.broker_address import Broker
+from twin_master.watch.cause_search import CauseSearch
+from twin_master.watch.feed import Feed
+from twin_master.watch.feeds import Observations, choose_feed
+from twin_master.watch.folder import GivenPatch, Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
+from twin_master.watch.mqtt import MqttFeed
+from twin_master.watch.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
+from twin_master.watch.recorded_feeds import RecordedFeed
+from twin_master.watch.records import Decision, DecisionSink, JsonObject
+from twin_master.watch.result import STORED_STEPS, store_watch
 from twin_master.watch.teaching import check_teachable
 from twin_master.watch.tutor import Tutor
 
@@ -36,130 +43,198 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def begun_watch(
-    resolved: Scenario, file: Mapping[str, str], folder: Path, progress: Progress, *,
-    replace_run: bool = False, like: Watch | None = None,
-) -> Iterator[Watch]:  # fmt: skip
-    """Make the folder of a watch of a resolved scenario, and hold it; see `new_run_folder` and `Watch`."""
-    # A watch that takes the place of another ends its session at the broker: it comes under the same name.
-    files = {
-        path.name: path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
-        for path in folder.glob(f"*{CLIENT_SUFFIX}")
-    }
-    source = believed_source(resolved)
-    source.check()
-    files = source.files() | files
-    opened = run_folder.new_run_folder(resolved, file, folder, files, replace=replace_run, watched=True)
-    with opened as (config, located):
-        yield Watch(folder, config, located, progress, like)
-
-
-@contextmanager
-def resumed_watch(
-    folder: Path, loaded: LoadedScenario | None, progress: Progress, like: Watch | None = None
+def begin_watch(
+    resolved: Scenario,
+    file: Mapping[str, str],
+    folder: Path,
+    progress: Progress,
+    *,
+    replace_run: bool = False,
+    sibling: Watch | None = None,
 ) -> Iterator[Watch]:
-    """Take up the watch in a folder, and hold it.
+    """Make the folder of a watch, and hold it.
+
+    Parameters
+    ----------
+    resolved : Scenario
+        The scenario, resolved.
+    file : mapping of str to str
+        The name and the hash of the file of the scenario.
+    folder : Path
+        The folder to make.
+    progress : Progress
+        Shows stages and notes.
+    replace_run : bool
+        Whether to take the place of an existing folder.
+    sibling : Watch, optional
+        A watch of the same scenario, whose model and plan this one shares.
 
     Raises
     ------
-    NotResumableError
-        The folder holds no watch, or one of another scenario or version.
+    RunFolderError
+        If the folder exists and is not to be replaced.
     """
-    if not run_folder.read_config(folder).get("watched"):
-        raise NotResumableError(said("watch.run", folder=folder))
-    with run_folder.hold_run_folder(folder, loaded) as (config, scenario):
-        try:
-            run_folder.check_versions(folder, config, scenario.mission.seed)
-            watched = Watch(folder, config, scenario, progress, like)
-        except NotResumableError as error:
-            error.add_note(said("watch.another", folder=folder))
-            raise
-        yield watched
+    source = believed_source(resolved)
+    source.check()
+    files = source.files() | _client_files_to_discard(folder)
+    opened = run_folder.new_run_folder(
+        resolved, file, folder, files, replace=replace_run, watched=True
+    )
+    with opened as (config, located_scenario):
+        yield Watch(folder, config, located_scenario, progress, sibling)
+
+
+def _client_files_to_discard(folder: Path) -> dict[str, bytes]:
+    """Return the files with which a new watch ends the session that a former one has at a broker.
+
+    The new watch in the folder of a former one keeps its client name, because only under this name
+    the broker can end the former session.
+    """
+    files = {}
+    for path in folder.glob(f"*{CLIENT_SUFFIX}"):
+        client_name = path.read_bytes().partition(b"\n")[0]
+        files[path.name] = client_name + f"\n{DISCARD_SESSION}\n".encode()
+    return files
 
 
 @contextmanager
-def flown(folder: Path, first: int | None, last: int | None, progress: Progress) -> Iterator[Path]:
-    """Give the run folder of a flight up to a step: of a watch, which may go on, a copy that ended there.
+def resume_watch(
+    folder: Path, loaded: LoadedScenario | None, progress: Progress, sibling: Watch | None = None
+) -> Iterator[Watch]:
+    """Take up the watch in a folder, and hold the folder.
 
     Parameters
     ----------
     folder : Path
-        Of a run, which is given as it is, or of a watch, which is only read.
-    first, last : int or None
-        The first step that is wanted, and the last one; None for all that are in the journal.
+        The folder of the watch.
+    loaded : LoadedScenario or None
+        The scenario that the user expects in the folder; None takes any.
     progress : Progress
-        Shows stages.
+        Shows stages and notes.
+    sibling : Watch, optional
+        A watch of the same scenario, whose model and plan this one shares.
 
     Raises
     ------
     NotResumableError
-        The journal was changed or is damaged.
-    MissionInputError
-        There is no step from the first one on.
+        If the folder holds no watch, or one of another scenario or version.
     """
-    config = _config(folder)
+    if not run_folder.read_config(folder).get("watched"):
+        raise NotResumableError(
+            f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
+        )
+    with run_folder.hold_run_folder(folder, loaded) as (config, scenario):
+        try:
+            run_folder.check_versions(folder, config, scenario.mission.seed)
+            resumed = Watch(folder, config, scenario, progress, sibling)
+        except NotResumableError as error:
+            error.add_note(
+                "--replace would remove what was observed; another watch, in another folder, takes "
+                f"it in with `--observations {folder}`."
+            )
+            raise
+        yield resumed
+
+
+@contextmanager
+def copy_of_run_until(
+    folder: Path, first: int | None, last: int | None, progress: Progress
+) -> Iterator[Path]:
+    """Give the folder of a run that ended at a step.
+
+    A watch may go on meanwhile. So of a watch a temporary copy is given, which ends at the step.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a run, which is given as it is, or of a watch, which is only read.
+    first, last : int or None
+        The first and the last step that are wanted; None for the ends of the journal.
+    progress : Progress
+        Shows the stages of storing the copy.
+
+    Raises
+    ------
+    NotResumableError
+        If the journal was changed or is damaged.
+    MissionInputError
+        If there is no step from the first one on.
+    """
+    config = _watch_config(folder)
     if config is None:
         yield folder
         return
-    step, end = last_step(folder / JOURNAL_NAME, math.inf if last is None else last)
+    journal = folder / JOURNAL_NAME
+    step, journal_end = last_step(journal, math.inf if last is None else last)
     if first is not None and step < first:
-        known = f"the steps 0 to {step}" if step >= 0 else "no step"
+        available = f"the steps 0 to {step}" if step >= 0 else "no step"
         limit = "" if last is None else f" up to step {last}"
-        raise MissionInputError(f"{folder} has {known}{limit}, and none from {first} on.")
-    with TemporaryDirectory(prefix="uav_twin_") as place:
-        copy = Path(place) / folder.resolve().name
+        raise MissionInputError(f"{folder} has {available}{limit}, and none from {first} on.")
+    with TemporaryDirectory(prefix="uav_twin_") as parent:
+        copy = Path(parent) / folder.resolve().name
         copy.mkdir()
         shutil.copy(folder / run_folder.CONFIG_NAME, copy)
         shutil.copytree(folder / "asset", copy / "asset")
-        with (folder / JOURNAL_NAME).open("rb") as journal:
-            (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, run_folder.read_scenario(folder).with_paths_from(copy), progress).store(
-            Counts(), report=False
-        )
+        with journal.open("rb") as file:
+            (copy / JOURNAL_NAME).write_bytes(file.read(journal_end))
+        scenario = run_folder.read_scenario(folder).with_paths_from(copy)
+        store_watch(Watch(copy, config, scenario, progress), Counts(), report=False)
         yield copy
 
 
 def open_run(folder: Path | str) -> "xr.DataTree":
     """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
 
-    A watch that goes on, or was killed, is read as it would be had it ended after the last step of its
-    journal, and is not touched.
+    A watch that goes on, or was killed, is read as it would be if it had ended after the last step
+    of its journal. Its folder is not changed.
+
+    Parameters
+    ----------
+    folder : Path or str
+        The folder of the run or of the watch.
 
     Returns
     -------
     xarray.DataTree
-        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and `truth`; each
-        variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and
+        `truth`; each variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
 
     Raises
     ------
     RunFolderError
-        There is no ``run.nc``, or it is damaged; or nothing was observed yet.
+        If there is no ``run.nc``, if it is damaged, or if nothing was observed yet.
     NotResumableError
-        The journal of a watch was changed or is damaged.
+        If the journal of a watch was changed or is damaged.
     """
-    if _config(Path(folder)) is None or stored(Path(folder)):
-        return stored_run(folder)
-    with flown(Path(folder), None, None, SilentProgress()) as ended:
-        return stored_run(ended)
+    folder = Path(folder)
+    if _watch_config(folder) is None or is_stored(folder):
+        return open_stored_run(folder)
+    with copy_of_run_until(folder, None, None, SilentProgress()) as stored_copy:
+        return open_stored_run(stored_copy)
 
 
-def stored(folder: Path) -> bool:
-    """Return whether the files of a watch have the last step of its journal."""
+def is_stored(folder: Path) -> bool:
+    """Return whether `run.nc` and the summary of a watch have the last step of its journal."""
     try:
-        ended = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
+        stored_steps = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
     except (DamagedFileError, KeyError, TypeError):
         return False
-    return bool(ended == last_step(folder / JOURNAL_NAME)[0] + 1)
+    step, _ = last_step(folder / JOURNAL_NAME)
+    return bool(stored_steps == step + 1)
 
 
-def _config(folder: Path) -> dict[str, Any] | None:
-    """Return the configuration of a watch; None where the folder holds something else."""
+def _watch_config(folder: Path) -> JsonObject | None:
+    """Return the configuration of a watch; None if the folder holds something else."""
     config = run_folder.find_config(folder)
     return config if config is not None and config.get("watched") else None
 
 
-Decide = Callable[[Mapping[str, Any]], object]
+def _ignore_decision(decision: Decision) -> None:
+    """Stand for what is done with a decision if nobody asks for it."""
+
+
+def _ignore_watch(watch: Watch) -> None:
+    """Stand for what is done with a watch once its folder is held, if nothing is to be done."""
 
 
 def watch(
@@ -168,7 +243,7 @@ def watch(
     folder: Path | str | None = None,
     overrides: Overrides | Mapping[str, Any] | None = None,
     *,
-    decide: Decide = lambda _decision: None,
+    decide: DecisionSink = _ignore_decision,
     resume: bool = False,
     follow: bool = False,
     steps: int | None = None,
@@ -181,116 +256,215 @@ def watch(
     last: int = STORED_STEPS,
     report: bool = True,
     otherwise: str | None = None,
-    begun: Callable[[Watch], object] = lambda _watch: None,
+    begun: Callable[[Watch], object] = _ignore_watch,
+    cause_search: CauseSearch | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Watch a real asset until its observations end; return the folder, which `open_run` reads.
 
     Parameters
     ----------
-    scenario
-        The scenario, its shipped name, or its file; it may be left out where a watch is resumed.
-    observations
-        Messages as they come, mappings of the keys that `docs/watch.md` lists; a recording: a CSV or NetCDF
-        file, or the folder of another watch or run; ``mqtt://[USER@]HOST[:PORT]/TOPIC`` or ``mqtts://``,
-        where the decisions are published, too; ``-``: JSON lines on standard input. The recording of the
-        scenario if left out.
-    folder
+    scenario : LoadedScenario, str or Path, optional
+        The scenario, its shipped name, or its file; it may be left out if a watch is resumed.
+    observations : iterable of mapping, str or Path, optional
+        Messages as they come, mappings with the keys that `docs/watch.md` lists; or a recording: a
+        CSV or NetCDF file, or the folder of another watch or run; or the address of a broker,
+        ``mqtt://[USER@]HOST[:PORT]/TOPIC`` or ``mqtts://``, where the decisions are published, too;
+        or ``-`` for JSON lines on standard input. The recording of the scenario if left out.
+    folder : Path or str, optional
         The folder to make; ``runs/NAME`` by default.
-    overrides
-        What differs from the file: ``seed``, ``calibration``, ``library``, ``learnt``.
-    decide
-        Told the decision of each step, once the step is written down; first the last one again where a kill
-        may have left it untold.
-    resume
-        Take up the watch in the folder.
-    follow
-        Wait at the end of a CSV file for more.
-    steps
-        Steps in all after which to end.
-    model_patch, from_step
-        A patch, such as `patch.json` of `discrepancy run`, and the step from which on it is believed; with
-        `resume`.
-    teach
-        Look for the cause of an alarm, and believe what is named and proved on later steps.
-    allow_unknown
-        Pass over keys and columns that are no sensor.
-    ca_file
-        Certificate of the authority of an ``mqtts://`` broker.
-    replace
-        Take the place of an existing folder.
-    last
-        Steps, the last ones, in `run.nc` and report.
-    report
-        Draw the report.
-    otherwise
-        Observations where neither they nor a scenario with a recording are given.
-    begun
-        Told the watch once its folder is held, before anything is read.
-    progress
-        Shows the stages, and tells of brokers.
+    overrides : Overrides or mapping, optional
+        What differs from the file of the scenario: ``seed``, ``calibration``, ``library``,
+        ``learnt``.
+    decide : callable
+        Called with the decision of each step, once the step is in the journal. If a kill may have
+        kept the last decision of a resumed watch from being sent, it is called with that one first.
+    resume : bool
+        Whether to take up the watch in the folder.
+    follow : bool
+        Whether to wait at the end of a CSV file for more.
+    steps : int, optional
+        The number of steps, with those of earlier processes, after which to end.
+    model_patch : Path or str, optional
+        A patch of the model to believe, such as `patch.json` of `discrepancy run`; with `resume`
+        and `from_step`.
+    from_step : int, optional
+        The first step in which the patch is believed.
+    teach : bool
+        Whether to look for the cause of an alarm, and to believe in later steps what is named and
+        proved.
+    allow_unknown : bool
+        Whether to ignore keys and columns that are no sensor.
+    ca_file : Path or str, optional
+        The certificate of the authority of an ``mqtts://`` broker.
+    replace : bool
+        Whether to take the place of an existing folder.
+    last : int
+        The number of last steps in `run.nc` and report.
+    report : bool
+        Whether to write the report.
+    otherwise : str, optional
+        The observations if neither `observations` nor the scenario names any.
+    begun : callable
+        Called with the watch once its folder is held, before anything is read.
+    cause_search : CauseSearch, optional
+        What looks for the cause of an alarm. `uav_twin.watch` gives `uav-twin discrepancy run` in a
+        process of its own; only a watch with `teach` needs it.
+    progress : Progress, optional
+        Shows the stages, and notes about brokers.
 
     Raises
     ------
     RunFolderError, NotResumableError
-        The folder exists, or holds no such watch.
+        If the folder exists, or holds no such watch.
     MissionInputError
-        There are no observations, they cannot be read, what is asked does not go together, or `teach` is
-        asked of an asset that cannot be taught.
+        If there are no observations, if they cannot be read, if the arguments do not go together,
+        or if `teach` is asked of an asset that cannot be taught.
     TwinMasterError, FiniteElementError, CalibrationError
-        With one clear sentence; what was observed is kept.
+        If the watch cannot go on, with one clear sentence; what was observed is kept.
     """
     loaded = None if scenario is None else load_scenario(scenario)
-    given, progress = as_overrides(overrides), progress or SilentProgress()
-    patch = None if model_patch is None or from_step is None else (Path(model_patch), from_step)
-    if (model_patch, from_step) != (None, None) and (patch is None or not resume):
-        raise MissionInputError("--model-patch and --from-step go together, with --resume.")
+    overrides = as_overrides(overrides)
+    progress = progress or SilentProgress()
+    patch = _given_patch(model_patch, from_step, resume=resume)
     if loaded is None and (folder is None or not resume):
         raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
-    folder, known = _read(loaded, folder, allow_unknown=allow_unknown)
+    folder = _folder_of_watch(loaded, folder)
+    reading_scenario = _scenario_for_reading(loaded, folder, allow_unknown=allow_unknown)
     if teach:
-        check_teachable(known)
-    # Slips of the pen are found before a model is built and a folder made.
-    feed = feed_of(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
-    if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
-        raise MissionInputError(said("watch.replace", path=feed.path))
-    if resume and (replace or given != Overrides()):
-        raise MissionInputError(said("watch.resume"))
-    if resume or loaded is None:
-        opened = resumed_watch(folder, loaded, progress)
-    else:
-        resolved = resolve_scenario(loaded, given)
-        opened = begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
-        if loaded.remark:
-            progress.note(loaded.remark)
+        _check_teaching(reading_scenario, cause_search)
+
+    # Mistakes in the arguments are found before a model is built and a folder made
+    feed = choose_feed(
+        observations,
+        reading_scenario,
+        follow=follow,
+        authority=None if ca_file is None else Path(ca_file),
+        default=otherwise,
+    )
+    if replace:
+        _check_recording_is_kept(feed, folder)
+    opened = _open_watch(loaded, folder, overrides, progress, resume=resume, replace=replace)
     with opened as watched:
         try:
             begun(watched)
             if isinstance(feed, Broker):
-                feed = MqttFeed(feed, watched, progress.note, known)
-            # A kill may have left the last decision untold.
-            untold = None if stored(watched.folder) else watched.last_decision()
-            with closing(feed), closing(Tutor(watched, wait=feed.replayable)) as tutor:
-                between = tutor.act if teach else lambda: None
-                counts = watched.run(feed, decide, between, steps=steps, patched=patch, untold=untold)
-            watched.store(counts, last=last, report=report)
+                feed = MqttFeed(feed, watched, progress.note, reading_scenario)
+            teacher = cause_search if teach else None
+            counts = _run(watched, feed, decide, teacher, step_limit=steps, patch=patch)
+            store_watch(watched, counts, last=last, report=report)
         except Exception as error:
-            kept = watched.teaching.step >= 0
-            error.add_note(said("watch.kept", folder=watched.folder) if kept else said("watch.begun"))
+            error.add_note(_advice_after_error(watched))
             raise
     return watched.folder
 
 
-def _read(
-    loaded: LoadedScenario | None, folder: Path | str | None, *, allow_unknown: bool
-) -> tuple[Path, Scenario]:
-    """Return the folder of a watch, and the scenario by which observations are read."""
+def _given_patch(
+    model_patch: Path | str | None, from_step: int | None, *, resume: bool
+) -> GivenPatch | None:
+    """Return the patch that the user gives for a resumed watch; None if none is given."""
+    if model_patch is None and from_step is None:
+        return None
+    if model_patch is None or from_step is None or not resume:
+        raise MissionInputError("--model-patch and --from-step go together, with --resume.")
+    return GivenPatch(Path(model_patch), from_step)
+
+
+def _folder_of_watch(loaded: LoadedScenario | None, folder: Path | str | None) -> Path:
+    """Return the folder that the user names, or the default one of the scenario."""
+    if folder is not None:
+        return Path(folder)
+    assert loaded is not None, "a watch without a scenario is resumed in a folder"
+    return Path("runs", loaded.scenario.mission.name)
+
+
+def _scenario_for_reading(
+    loaded: LoadedScenario | None, folder: Path, *, allow_unknown: bool
+) -> Scenario:
+    """Return the scenario by which observations are read, with its paths located."""
     if loaded is None:
-        folder = Path(str(folder))
         scenario = run_folder.read_scenario(folder).with_paths_from(folder)
     else:
-        folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.with_paths_from(loaded.path.parent)
     if allow_unknown:
         scenario = scenario.with_changes("watch", allow_unknown=True)
-    return folder, scenario
+    return scenario
+
+
+def _check_teaching(scenario: Scenario, cause_search: CauseSearch | None) -> None:
+    """Refuse to teach if no search for causes is given, or none could find a cause."""
+    check_teachable(scenario)
+    if cause_search is None:
+        raise MissionInputError("`teach` needs a `cause_search`, as `uav_twin.watch` has it.")
+
+
+def _check_recording_is_kept(feed: Feed | Broker, folder: Path) -> None:
+    """Refuse to replace a folder that contains the observations to be read."""
+    if isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
+        raise MissionInputError(
+            f"--replace would remove the observations in {feed.path} before they are read: choose "
+            "another --out."
+        )
+
+
+def _open_watch(
+    loaded: LoadedScenario | None,
+    folder: Path,
+    overrides: Overrides,
+    progress: Progress,
+    *,
+    resume: bool,
+    replace: bool,
+) -> AbstractContextManager[Watch]:
+    """Return the watch that is begun or resumed, as a context that holds its folder."""
+    if resume and (replace or overrides != Overrides()):
+        raise MissionInputError(
+            "a watch is taken up with what its folder holds: give nothing beside --resume that "
+            "changes it."
+        )
+    if resume or loaded is None:
+        return resume_watch(folder, loaded, progress)
+    resolved = resolve_scenario(loaded, overrides)
+    opened = begin_watch(resolved, loaded.file, folder, progress, replace_run=replace)
+    if loaded.remark:
+        progress.note(loaded.remark)
+    return opened
+
+
+def _run(
+    watched: Watch,
+    feed: Feed,
+    decide: DecisionSink,
+    cause_search: CauseSearch | None,
+    *,
+    step_limit: int | None,
+    patch: GivenPatch | None,
+) -> Counts:
+    """Run a watch until its feed ends; it is taught if there is a search for causes."""
+    # A kill may have kept the last decision from being sent
+    unconfirmed = None if is_stored(watched.folder) else watched.last_decision()
+    with closing(feed):
+        if cause_search is None:
+            return watched.run(
+                feed, decide, step_limit=step_limit, patch=patch, unconfirmed=unconfirmed
+            )
+        with closing(Tutor(watched, cause_search, wait=feed.replayable)) as tutor:
+            return watched.run(
+                feed,
+                decide,
+                tutor.teach,
+                step_limit=step_limit,
+                patch=patch,
+                unconfirmed=unconfirmed,
+            )
+
+
+def _advice_after_error(watched: Watch) -> str:
+    """Return how to go on after an error ended a watch."""
+    has_steps = watched.teaching.step >= 0
+    if has_steps:
+        return (
+            "What was observed is kept: go on with "
+            f"`uav-twin watch --resume --out {watched.folder}`."
+        )
+    return "Nothing was observed yet: once this is mended, watch again with --replace."

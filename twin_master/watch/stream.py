@@ -1,232 +1,277 @@
-"""What is wrong with a stream of messages as a whole: notices, each given once until it is over."""
+"""Notices about a stream of messages as a whole, each given once until its cause is over."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from reporting.words import counted, listing
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
+from twin_master.watch.records import JsonObject
 
 REFUSALS_IN_A_ROW = 3
-"""Refused messages, with none between them that was taken, of which the operator is told."""
+"""Refused messages without an accepted one between them after which the operator is told."""
 TIME_UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-"""Units of times, each a thousandth of the one before it, and what they are called."""
-_NAMES_TOLD = 24
-"""Names of which the operator is told that they were passed over: a flood of them fills no journal."""
+"""Units of times, each a thousandth of the one before it, and their names."""
+_MOST_SLIPS = 24
+"""Largest number of ignored names in notices, so that a flood of them does not fill the journal."""
 
 
 def unit_advice(unit: str) -> str:
-    """Return what to do about times that seem to have a unit, behind another clause; or nothing."""
+    """Return a clause with the option that fits the unit which times seem to have.
+
+    Parameters
+    ----------
+    unit : str
+        The unit that the times of the messages seem to have; empty if the stated one fits, in
+        which case the clause is empty.
+    """
     if not unit:
         return ""
     return f'; its times look like {TIME_UNITS[unit]}: give `watch.time_unit = "{unit}"`'
 
 
 class StreamNotices:
-    """Notices about the messages of a stream: gaps, clocks, refusals, and names that are no sensor.
+    """Notices about the messages of a stream: gaps, clocks, refusals, and names of no sensor.
 
     Parameters
     ----------
-    words : Words
-        How sentences speak of steps and sensors.
+    words : NoticeWording
+        The words for steps and sensors.
 
     Attributes
     ----------
     is_blind : bool
         Whether the last message of a next step had no reading of any sensor.
     refused_in_a_row : int
-        Messages that were refused since one was taken.
+        The number of messages that were refused since one was accepted.
     last_reason : str
-        Why the last of them was refused.
+        The reason why the last of them was refused.
     """
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: NoticeWording) -> None:
         self._words = words
-        self._coming: list[Notice] = []  # with the next reading
-        self._gap_end = -1  # the step behind the last gap that was told
-        self._clock_is_told = False
+        self._pending: list[Notice] = []  # given with the next reading
+        self._gap_end = -1  # the step after the last gap that was reported
+        self._clock_is_reported = False
         self.is_blind = False
-        self._names_told: list[str] = []
+        self._reported_slips: list[str] = []
         self.refused_in_a_row = 0
         self.last_reason = ""
         self._refused_steps: list[int | None] = []
-        self._refusals_are_told = False
+        self._refusals_are_reported = False
 
-    def state(self, *, waiting: bool) -> dict[str, Any]:
-        """Return what is needed to tell nothing twice, as JSON.
+    def state(self, *, waiting: bool) -> JsonObject:
+        """Return the state that keeps a resumed watch from giving a notice twice, for a journal.
 
         Parameters
         ----------
         waiting : bool
-            Whether the message behind a gap is to be read again.
+            Whether the message after a gap will be read again.
         """
         refused = {
             "count": self.refused_in_a_row,
             "steps": self._refused_steps,
             "reason": self.last_reason,
-            "told": self._refusals_are_told,
+            "told": self._refusals_are_reported,
         }
-        state: dict[str, Any] = {
+        state = {
             "gap_end": self._gap_end if waiting else None,
-            "clock": self._clock_is_told,
+            "clock": self._clock_is_reported,
             "blind": self.is_blind,
-            "names": list(self._names_told),
+            "names": list(self._reported_slips),
             "refused": refused if self.refused_in_a_row else None,
         }
+        # A journal leaves out what is zero, false or empty
         return {key: value for key, value in state.items() if value}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state."""
+        """Take over a state, see `state`."""
         self._gap_end = state.get("gap_end", -1)
-        self._clock_is_told = state.get("clock", False)
+        self._clock_is_reported = state.get("clock", False)
         self.is_blind = state.get("blind", False)
-        self._names_told = list(state.get("names", ()))
+        self._reported_slips = list(state.get("names", ()))
         refused = state.get("refused", {})
         self.refused_in_a_row = refused.get("count", 0)
         self._refused_steps = list(refused.get("steps", ()))
         self.last_reason = refused.get("reason", "")
-        self._refusals_are_told = refused.get("told", False)
+        self._refusals_are_reported = refused.get("told", False)
 
-    def gap(self, first: int, end: int, unit: str) -> None:
-        """Take in that nothing came of the steps from `first` on to the one before `end`.
+    def note_gap(self, first_missing: int, next_step: int, unit: str) -> None:
+        """Add a notice about steps of which no message came.
 
         Parameters
         ----------
-        first, end : int
-            The first step that is missing, and the one that has come.
+        first_missing : int
+            The first step without a message.
+        next_step : int
+            The first step after it with a message.
         unit : str
-            The unit that the times of the messages seem to have, see `Clock.slipped_unit`.
+            The unit that the times of the messages seem to have, see `Clock.likely_unit`.
         """
-        if end == self._gap_end:  # told before the watch was taken up again
+        if next_step == self._gap_end:  # reported before the watch was taken up again
             return
-        self._gap_end = end
-        step, count = self._words.step, end - first
+        self._gap_end = next_step
+        step_name = self._words.step
+        count = next_step - first_missing
         if count == 1:
-            sentence = f"{step.capitalize()} {first}: no message came, and the belief is predicted through"
+            sentence = (
+                f"{step_name.capitalize()} {first_missing}: no message came, and the belief is "
+                "predicted through"
+            )
         else:
             sentence = (
-                f"{step.capitalize()}s {first} to {end - 1}: no message came, and the belief is predicted "
-                f"through {count} {step}s by what the transitions say alone"
+                f"{step_name.capitalize()}s {first_missing} to {next_step - 1}: no message came, "
+                f"and the belief is predicted through {count} {step_name}s by what the transitions "
+                "say alone"
             )
-        self._coming.append(Notice("gap", f"{sentence}{unit_advice(unit)}.", value=float(count)))
+        notice = Notice("gap", f"{sentence}{unit_advice(unit)}.", value=float(count))
+        self._pending.append(notice)
 
-    def clock(self, step: int, steps: float, unit: str) -> None:
-        """Take in that a time lies too far from the only one before it; the message is the next step.
+    def note_clock_jump(self, next_step: int, distance: float, unit: str) -> None:
+        """Add a notice that a time lies too far from the only one before it.
+
+        The message is taken as the next step.
 
         Parameters
         ----------
-        step : int
+        next_step : int
             The next step.
-        steps : float
-            Steps by which the time lies behind the other one.
+        distance : float
+            The number of steps by which the time lies after the other one.
         unit : str
             The unit that the times seem to have.
         """
-        if self._clock_is_told:
+        if self._clock_is_reported:
             return
-        self._clock_is_told = True
-        word = self._words.step
-        where = f"{abs(steps):.4g} {word}s {'behind' if steps > 0.0 else 'before'} that of the message before"
+        self._clock_is_reported = True
+        step_name = self._words.step
+        side = "behind" if distance > 0.0 else "before"
         cause = unit_advice(unit) or "; see whether the clock of the logger was set"
         sentence = (
-            f"{word.capitalize()} {step}: the time of the message lies {where}{cause}. Until two times "
-            f"agree, each message is taken as the next {word}, and no gap can be seen."
+            f"{step_name.capitalize()} {next_step}: the time of the message lies "
+            f"{abs(distance):.4g} {step_name}s {side} that of the message before{cause}. Until two "
+            f"times agree, each message is taken as the next {step_name}, and no gap can be seen."
         )
-        self._coming.append(Notice("clock", sentence))
+        self._pending.append(Notice("clock", sentence))
 
-    def clock_agrees(self) -> None:
-        """Take in that two times agree."""
-        self._clock_is_told = False
+    def note_clock_agreement(self) -> None:
+        """Note that two times agree, so that a later jump of the clock is reported again."""
+        self._clock_is_reported = False
 
-    def refuse(self, step: int | None, reason: str) -> None:
-        """Take in that a message was refused, of which the step may be known."""
+    def note_refusal(self, step: int | None, reason: str) -> None:
+        """Note a refused message.
+
+        Parameters
+        ----------
+        step : int or None
+            The step of the message, if it is known.
+        reason : str
+            Why it was refused.
+        """
         self.refused_in_a_row += 1
         self.last_reason = reason
         if len(self._refused_steps) < REFUSALS_IN_A_ROW:
             self._refused_steps.append(step)
 
     @property
-    def refusals_are_untold(self) -> bool:
+    def has_refusals_to_report(self) -> bool:
         """Whether enough messages were refused in a row, and the operator was not told yet."""
-        return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_told
+        return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_reported
 
-    def refusals(self, next_step: int) -> Notice:
-        """Return the notice that no message is taken any more.
+    def report_refusals(self, next_step: int) -> Notice:
+        """Return the notice that all messages are refused, and note that it was given.
 
         Parameters
         ----------
         next_step : int
             The step that is expected next.
         """
-        self._refusals_are_told = True
-        word, count = self._words.step, self.refused_in_a_row
-        since = f"Since {word} {next_step - 1}," if next_step else "From the beginning on,"
+        self._refusals_are_reported = True
+        count = self.refused_in_a_row
+        since = "From the beginning on,"
+        if next_step:
+            since = f"Since {self._words.step} {next_step - 1},"
         sentence = (
-            f"{since} {counted(count, 'message')} came, and all were refused (rejected.jsonl), the last one "
-            f"because {self.last_reason}.{self._likely_cause(next_step)}"
+            f"{since} {counted(count, 'message')} came, and all were refused (rejected.jsonl), the "
+            f"last one because {self.last_reason}.{self._likely_cause(next_step)}"
         )
         return Notice("refused", sentence, value=float(count))
 
     def _likely_cause(self, next_step: int) -> str:
-        """Return what the steps of the refused messages have in common, as a sentence; or nothing."""
+        """Return a sentence with what the steps of the refused messages have in common.
+
+        The sentence begins with a space; it is empty if they have nothing in common.
+        """
         steps = [step for step in self._refused_steps if step is not None]
         if len(steps) < REFUSALS_IN_A_ROW or max(steps) >= next_step:
             return ""
-        word = self._words.step
-        if len({*steps}) == 1:
+        step_name = self._words.step
+        if len(set(steps)) == 1:
             return (
-                f" All belong to {word} {steps[0]}: see whether its counter stands still, and whether "
-                "`watch.seconds_per_step` and `watch.time_unit` are right."
+                f" All belong to {step_name} {steps[0]}: see whether its counter stands still, and "
+                "whether `watch.seconds_per_step` and `watch.time_unit` are right."
             )
-        if steps == sorted({*steps}):
+        if steps == sorted(set(steps)):
             listed = listing(map(str, steps))
             return (
-                f" They belong to the {word}s {listed}, which were watched before: where the counter or the "
-                "clock of the logger has begun again, begin another watch in another folder (--out), or send "
-                "messages without `step`, which go on with this one."
+                f" They belong to the {step_name}s {listed}, which were watched before: where the "
+                "counter or the clock of the logger has begun again, begin another watch in "
+                "another folder (--out), or send messages without `step`, which go on with this "
+                "one."
             )
         return ""
 
-    def take(self, step: int, *, is_blind: bool, passed_over: Mapping[str, str]) -> list[Notice]:
-        """Take in the message of the next step; return the notices that go with it.
+    def accept(self, step: int, *, is_blind: bool, ignored: Mapping[str, str]) -> list[Notice]:
+        """Note that a message is accepted; return the notices that are given with its step.
 
         Parameters
         ----------
         step : int
+            The step of the message.
         is_blind : bool
-            Whether it has no reading of any sensor.
-        passed_over : dict of str to str
-            Names in it that are no sensor, with what each is beside that: "a JSON object", or the known name
-            that it looks like, in words; empty where there is nothing to say.
+            Whether the message has no reading of any sensor.
+        ignored : dict of str to str
+            The names in the message that are no sensor. The value of a name is the known name that
+            it was probably meant to be, in words; it is empty if there is none.
         """
         when = f"{self._words.step.capitalize()} {step}"
-        notices = self.coming()
-        if self._refusals_are_told:
-            sentence = f"{when}: messages are taken again, after {self.refused_in_a_row} were refused."
-            notices.append(Notice("taken", sentence, value=float(self.refused_in_a_row)))
+        notices = self.pop_pending()
+        if self._refusals_are_reported:
+            count = self.refused_in_a_row
+            sentence = f"{when}: messages are taken again, after {count} were refused."
+            notices.append(Notice("taken", sentence, value=float(count)))
         self.refused_in_a_row = 0
         self._refused_steps = []
-        self._refusals_are_told = False
+        self._refusals_are_reported = False
         if is_blind and not self.is_blind:
-            names = listing(f"`{name}`" for name in passed_over)
-            ignored = f"; passed over: {names}" if names else ""
-            sentence = f"{when}: the message has no reading of any {self._words.sensor}{ignored}."
-            notices.append(Notice("blind", sentence))
+            notices.append(self._blind_notice(when, ignored))
         self.is_blind = is_blind
-        notices += self._likely_slips(when, passed_over)
+        notices += self._report_slips(when, ignored)
         return notices
 
-    def _likely_slips(self, when: str, passed_over: Mapping[str, str]) -> list[Notice]:
-        """Return a notice of the names that were passed over and look like known ones, each told once."""
-        slips = [name for name in passed_over if passed_over[name] and name not in self._names_told]
-        slips = slips[: _NAMES_TOLD - len(self._names_told)]
-        if not slips:
-            return []
-        self._names_told += slips
-        described = listing(f"`{name}` ({passed_over[name]})" for name in slips)
-        return [Notice("passed_over", f"{when}: passed over as no {self._words.sensor}: {described}.")]
+    def _blind_notice(self, when: str, ignored: Mapping[str, str]) -> Notice:
+        """Return the notice that a message has no reading of any sensor."""
+        names = listing(f"`{name}`" for name in ignored)
+        passed_over = f"; passed over: {names}" if names else ""
+        sensor = self._words.sensor
+        sentence = f"{when}: the message has no reading of any {sensor}{passed_over}."
+        return Notice("blind", sentence)
 
-    def coming(self) -> list[Notice]:
-        """Return the notices that wait for the next reading, once."""
-        notices = self._coming
-        self._coming = []
+    def _report_slips(self, when: str, ignored: Mapping[str, str]) -> list[Notice]:
+        """Return a notice about ignored names that look like known ones, each reported once."""
+        new_slips = []
+        for name, meaning in ignored.items():
+            if meaning and name not in self._reported_slips:
+                new_slips.append(name)
+        new_slips = new_slips[: _MOST_SLIPS - len(self._reported_slips)]
+        if not new_slips:
+            return []
+        self._reported_slips += new_slips
+        described = listing(f"`{name}` ({ignored[name]})" for name in new_slips)
+        sentence = f"{when}: passed over as no {self._words.sensor}: {described}."
+        return [Notice("passed_over", sentence)]
+
+    def pop_pending(self) -> list[Notice]:
+        """Return the notices that wait for the next reading, and forget them."""
+        notices = self._pending
+        self._pending = []
         return notices

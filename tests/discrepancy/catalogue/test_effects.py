@@ -21,7 +21,7 @@ from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.places import mains_lines
 from discrepancy.errors import CatalogueError
-from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.sources.examples import example_campaign, plan_from_scales
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import ACROSS, Conditions
 from discrepancy.system.sensing import observe
@@ -102,12 +102,12 @@ def test_it_builds_over_its_whole_prior_and_its_shape_is_free_around_the_canonic
     assert effect.patch(setting, {**middle, **effect.canonical_shape()}, place) == named
     assert pickle.loads(pickle.dumps(effect)).patch(setting, middle, place) == named
     for item in effect.shape:
-        assert abs(item.prior.normal(item.canonical)) < 2.0
-        moved = {**middle, item.name: item.prior.value(item.prior.normal(item.canonical) + 1.0)}
+        assert abs(item.prior.standard_normal(item.canonical)) < 2.0
+        moved = {**middle, item.name: item.prior.value(item.prior.standard_normal(item.canonical) + 1.0)}
         assert effect.patch(setting, moved, place) != named
     for item in (*effect.parameters, *effect.shape):
         for u in (-2.0, -0.3, 0.0, 1.5):
-            assert item.prior.normal(item.prior.value(u)) == pytest.approx(u, abs=1e-9)
+            assert item.prior.standard_normal(item.prior.value(u)) == pytest.approx(u, abs=1e-9)
     for u, place in product((-6.0, 0.7, 6.0), effect.places(setting)):
         values = {item.name: item.prior.value(u) for item in (*effect.parameters, *effect.shape)}
         patch = effect.patch(setting, values, place)
@@ -266,9 +266,9 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
     prior = Prior("log_normal", 0.01, 1.0)
     slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6
     target = prior.value(u) + slope * step
-    reached = prior.value(prior.stepped(u, step))
+    reached = prior.value(prior.step_within_prior(u, step))
     assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
-    assert Prior("normal", -1.0, 1.0).stepped(u, step) == u + step
+    assert Prior("normal", -1.0, 1.0).step_within_prior(u, step) == u + step
 
 
 # ---------------------------------------------------------------- on lumped models
@@ -279,7 +279,7 @@ OF_STORES = {"outflow", "overflow"}
 
 def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     model = LumpedModel.load("three_mass_chain")
-    plan = plan_for(model, ("x3", "base_strain"), "end")
+    plan = plan_from_scales(model, ("x3", "base_strain"), "end")
     setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
     reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
     absent = {name for name, reason in reasons.items() if reason is not None}

@@ -13,7 +13,7 @@ from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.library import effect_by_identifier, in_events, library, load_catalogue
+from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue, variants_in_events
 from discrepancy.errors import CatalogueError
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -209,7 +209,7 @@ def test_an_effect_during_an_event_acts_in_all_of_its_intervals(pump, write):
     text = text.replace('events = ["pump_on"]', "").replace('places = "ports"', 'places = "channels"')
     text = re.sub("force = .*\n(begin|end) = .*\n((begin|end) = .*\n)?", 'offset = "slope"\n', text)
     campaign = replace(pump, events=TWICE)
-    (during,) = in_events(effects_of_file(write(text)), setting_of(campaign, MODEL))
+    (during,) = variants_in_events(effects_of_file(write(text)), setting_of(campaign, MODEL))
     patch = during.patch(setting_of(campaign, MODEL), {"slope": 0.75}, "x")
     shown = observe(MODEL, campaign, campaign.trials[1], patch, Conditions(np.zeros(0))).values[:, 0]
     is_on = ((TIME >= 1.0) & (TIME < 3.0)) | ((TIME >= 6.0) & (TIME < 8.0))

@@ -15,14 +15,14 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.fits.candidate import EffectTerm
 from discrepancy.judgement.next_experiment import (
     Proposal,
+    feasible_proposals,
     mutual_information,
     next_experiments,
     oscillates,
-    proposals,
 )
-from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
+from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
 from discrepancy.report.decidability_text import group_lines
-from discrepancy.self_calibration import outcome_of, self_calibrate, wilson, write_self_calibration
+from discrepancy.self_calibration import outcome_of, self_calibrate, wilson_interval, write_self_calibration
 from discrepancy.simulation import Simulator
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -38,7 +38,7 @@ def group_of(found, identifier):
 
 
 def decided(model, given, *effects):
-    return separability(given, model, kit.problem_of(given, model).setting, kit.chosen(*effects))
+    return compute_separability(given, model, kit.problem_of(given, model).setting, kit.chosen(*effects))
 
 
 def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock():
@@ -121,8 +121,8 @@ def test_a_whole_laboratory_test_separates():
     (gain,) = gauge.parameters
     small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
     effects = [*others, replace(gauge, parameters=(replace(gain, prior=small),))]
-    unseen = separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
-    assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSED
+    unseen = compute_separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
+    assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSION_DISTANCE
     assert "gauge_gain" in unseen.identifiers
     assert unseen.groups == ()
 
@@ -131,7 +131,7 @@ def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
     """Detectable sizes are finite, and those of a stated deviation of that size."""
     given, model = kit.BENCH.measured(1), kit.BENCH.model
     blank = kit.with_noise(kit.problem_of(given, model), **dict.fromkeys(given.channels))
-    ideal = as_predicted(blank.campaign, model, blank.setting)
+    ideal = campaign_as_predicted(blank.campaign, model, blank.setting)
     found, again = (
         decided(model, replace(blank.campaign, channels=channels), "gauge_gain", "quadratic_damping")
         for channels in (blank.campaign.channels, ideal.channels)
@@ -188,7 +188,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
     stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
     fits = [kit.fitted(problem, term) for term in (EffectTerm(stiffening, "end"), EffectTerm(drift))]
     information = {
-        item.trial.name: mutual_information(problem, item, fits, HALF) for item in proposals(problem)
+        item.trial.name: mutual_information(problem, item, fits, HALF) for item in feasible_proposals(problem)
     }
     assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
     same = Proposal(problem.campaign.trials[0], "", "", 1.0)
@@ -206,7 +206,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
 def test_proposals_are_trials_of_the_kinds_that_were_done():
     """A longer record is one of what swings."""
     problem = kit.BENCH.problem(1)
-    found = list(proposals(problem))
+    found = list(feasible_proposals(problem))
     assert {item.trial.kind for item in found} == {TrialKind.STATIC, TrialKind.RINGDOWN}
     assert len({item.description for item in found}) == len(found)
     for item in found:
@@ -224,7 +224,7 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
         for data, part in zip(problem.trials, none.trial_derivatives, strict=True)
     )
     assert not oscillates(problem, replace(none, trial_derivatives=decay))
-    names = [item.trial.name for item in proposals(problem, swings=False)]
+    names = [item.trial.name for item in feasible_proposals(problem, is_oscillating=False)]
     assert names
     assert "longer record" not in names
 
@@ -292,9 +292,9 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     assert all(case.distance >= 25.0 for case in found.cases if case.hidden != "nothing")
     assert sum(found.confusion()[2].ravel()) == 6
     assert found.share("right", null=True).total == 2
-    none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
+    none, square = wilson_interval(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
     assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, square / (9.0 + square)))
-    assert wilson(0, 0).total == 0
+    assert wilson_interval(0, 0).total == 0
     again = self_calibrate(campaign, model, FEW, 6, seed=2, workers=2)
     assert again == found
     path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)

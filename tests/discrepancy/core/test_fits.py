@@ -82,7 +82,7 @@ def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
         left_out={0: ((2, 1),), 2: ((0, 0), (30, 2), (59, 1))}, samples=80,
     )  # fmt: skip
     applies = noise.samples is not None
-    assert all(problem.noise_models[name].applies(0.01) is applies for name in problem.channel_names)
+    assert all(problem.noise_models[name].can_whiten(0.01) is applies for name in problem.channel_names)
     check(problem, BOTH)
 
 

@@ -11,8 +11,8 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.judgement.naming import reach_verdict
-from discrepancy.judgement.remarks import look_alike_remark, with_untested
-from discrepancy.judgement.rules import Case
+from discrepancy.judgement.remarks import look_alike_remark, verdict_with_untested_effects
+from discrepancy.judgement.rules import VerdictCase
 from discrepancy.judgement.simulation_comparison import SimulationComparison
 from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
 from discrepancy.search_settings import SEARCH
@@ -198,7 +198,7 @@ def test_without_a_noise_record_the_sentence_says_so():
         problem = kit.closed_problem(seed=3, effect=effect, noise=noise, offset_deviation=0.0)
         verdict, found, fit = reach_verdict(problem, (kit.offset_effect(),))
         assert verdict.kind is kind, verdict.sentence
-        share = SimulationComparison(found).share(fit, held_out=False)
+        share = SimulationComparison(found).gap_share(fit, held_out=False)
         assert share.value == pytest.approx(float(effect > 0.0), abs=0.01)
         assert ("No noise record" in verdict.sentence) is (noise is None)
     assert "record" not in verdict.sentence
@@ -213,14 +213,14 @@ def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_o
     for terms in ((cell,), (friction, gain), (cell, gain)):
         found.record_fit(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
-    outcome = Case(found, {more: 0.7, right: 0.3}).common_effects()
+    outcome = VerdictCase(found, {more: 0.7, right: 0.3}).common_effects_verdict()
     assert outcome[0].kind is VerdictKind.NAMED
     assert [item.identifier for item in outcome[0].effects] == list(right)
     assert outcome[0].probability == pytest.approx(1.0)
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
-        assert Case(found, shares).common_effects() is None
+        assert VerdictCase(found, shares).common_effects_verdict() is None
     # patch and proof are those of a member that fits, the probability is that of those together
-    verdict, _, nearest = Case(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).open()
+    verdict, _, nearest = VerdictCase(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).undecided_verdict()
     assert verdict.kind is VerdictKind.GROUP
     assert verdict.group == nearest.candidate.identifiers == right
     assert "cannot tell which" not in verdict.sentence
@@ -291,14 +291,17 @@ def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_o
     second, freed = held(-1.0, 0.9, cubic), held(-2.0, 0.9, replace(cubic, free_shape=True))
     others = (
         held(-1.0, 0.9, replace(friction, free_shape=True)), held(-1.0, 0.9, replace(drag, free_shape=True)),
-        held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival, 0.9, drag), held(-1.0, 0.5, drag),
+        held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival_range, 0.9, drag), held(-1.0, 0.5, drag),
     )  # fmt: skip
     comparison = object.__new__(SimulationComparison)
-    comparison.score, comparison.decisive_share = (lambda item: item.score), (lambda item: item.told)
-    comparison.contenders = [best, second, freed, *others]
-    assert comparison.competitors(best) == [second]
-    comparison.contenders = [best, held(-1.0, 0.9, drag), second]
-    assert [item.candidate.terms for item in comparison.competitors(best)] == [(drag,), (cubic,)]
+    comparison.score, comparison.held_out_or_fitted_share = (
+        (lambda item: item.score),
+        (lambda item: item.told),
+    )
+    comparison.nameable_hypotheses = [best, second, freed, *others]
+    assert comparison.competing_hypotheses(best) == [second]
+    comparison.nameable_hypotheses = [best, held(-1.0, 0.9, drag), second]
+    assert [item.candidate.terms for item in comparison.competing_hypotheses(best)] == [(drag,), (cubic,)]
 
 
 # ---------------------------------------------------------------- what a name does not exclude
@@ -334,7 +337,7 @@ def test_only_names_are_remarked_on_and_likeness_counts_both_ways():
 def test_a_group_says_last_what_these_trials_cannot_test():
     setting = kit.chain_bench(amplitudes=()).setting
     group = replace(verdict_on("gauge_gain", kind=VerdictKind.GROUP), sentence="Either is missing.")
-    sentence = with_untested(group, setting, kit.CATALOGUE).sentence
+    sentence = verdict_with_untested_effects(group, setting, kit.CATALOGUE).sentence
     assert sentence.startswith("Either is missing. ")
     told = {effect.name for effect in kit.CATALOGUE if effect.name in sentence}
     # what is easily taken for it comes first
@@ -343,4 +346,4 @@ def test_a_group_says_last_what_these_trials_cannot_test():
     assert places == sorted(places)
     assert not {effect.name for effect in kit.CATALOGUE if effect.unavailable(setting) is None} & told
     single = verdict_on("load_cell")
-    assert with_untested(single, setting, kit.CATALOGUE) is single
+    assert verdict_with_untested_effects(single, setting, kit.CATALOGUE) is single

@@ -8,11 +8,17 @@ from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from discrepancy.campaign.noise import MAINS_DEVIATION, NoiseModel, autoregression, noise_model, without_lines
+from discrepancy.campaign.noise import (
+    MAINS_DEVIATION,
+    NoiseModel,
+    fit_autoregression,
+    noise_model,
+    remove_lines,
+)
 from discrepancy.campaign.noise_tests import (
     cumulative_periodogram,
     fisher_g,
-    holm,
+    holm_rejections,
     ljung_box,
     pooled_variance_p_value,
     variance_p_value,
@@ -32,7 +38,7 @@ def channel(samples, interval=INTERVAL):
 def test_autoregression_is_recovered(coefficients):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
     series = coloured(np.random.default_rng(1), coefficients, 8000)
-    found, innovation = autoregression(series)
+    found, innovation = fit_autoregression(series)
     padded = np.zeros(max(len(found), len(coefficients)))
     padded[: len(found)] = found
     padded[: len(coefficients)] -= coefficients
@@ -41,7 +47,7 @@ def test_autoregression_is_recovered(coefficients):
     noise = noise_model(channel(series[:3000]), 1.0)
     assert noise.standard_deviation == pytest.approx(1.0, rel=0.05)  # of the innovation
     assert noise.static_deviation == pytest.approx(series.std(), rel=0.1)
-    assert (noise.applies(INTERVAL), noise.applies(2.0 * INTERVAL)) == (True, False)
+    assert (noise.can_whiten(INTERVAL), noise.can_whiten(2.0 * INTERVAL)) == (True, False)
     np.testing.assert_array_equal(noise.whiten(series, 2.0 * INTERVAL), series)
     left = np.convolve(series, np.r_[1.0, -found])  # of the record in silence
     assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
@@ -52,7 +58,7 @@ def test_lines_are_not_found_in_noise(coefficients, count, records):
     """Level 1e-4 a line, three lines, however few neighbours tell the level of the noise."""
     generator = np.random.default_rng(7)
     drawn = (coloured(generator, coefficients, count, before=200) for _ in range(records))
-    found = sum(len(without_lines(noise, INTERVAL)[1]) for noise in drawn)
+    found = sum(len(remove_lines(noise, INTERVAL)[1]) for noise in drawn)
     assert found <= stats.binom.isf(1e-2, 3 * records, 1e-4)
 
 
@@ -70,7 +76,7 @@ def test_lines_are_not_found_in_noise(coefficients, count, records):
 def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, size, line):
     time = interval * np.arange(count)
     noise = np.random.default_rng(9).standard_normal(count)
-    rest, lines = without_lines(noise + size * np.cos(2.0 * np.pi * shown * time + 0.3), interval)
+    rest, lines = remove_lines(noise + size * np.cos(2.0 * np.pi * shown * time + 0.3), interval)
     assert lines == (line,)
     assert rest.std() == pytest.approx(1.0, rel=0.1 if count == 1000 else 0.03)
     assert ljung_box(rest)[1] > 1e-3
@@ -115,9 +121,9 @@ def test_serial_tests_see_what_they_are_for():
 
 
 def test_holm_by_hand():
-    assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
-    assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
-    assert holm([], 0.01) == ()
+    assert holm_rejections([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
+    assert holm_rejections([0.011, 0.02, 0.03], 0.03) == (False, False, False)
+    assert holm_rejections([], 0.01) == ()
 
 
 def test_ljung_box_allows_for_samples_that_do_not_count():

@@ -137,17 +137,19 @@ class TwoRivals:
 
     def __init__(self, probability, gain, fits):
         self.problem, self.chance, self.fits = None, probability, fits
-        self.contenders = [SimpleNamespace(log_evidence=gain, candidate=Candidate()) for _ in range(2)]
+        self.nameable_hypotheses = [
+            SimpleNamespace(log_evidence=gain, candidate=Candidate()) for _ in range(2)
+        ]
         self.no_effect = SimpleNamespace(log_evidence=0.0)
 
-    def simplest_equivalent(self, best):
+    def simplest_equivalent_hypothesis(self, best):
         return best
 
     def enlarges_error(self, best):
         return False
 
-    def competitors(self, best):
-        return self.contenders[1:]
+    def competing_hypotheses(self, best):
+        return self.nameable_hypotheses[1:]
 
     def probability(self, *items):
         return self.chance
@@ -164,8 +166,8 @@ class TwoRivals:
     ],
 )  # fmt: skip
 def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, probability, gain, fits, kind):
-    monkeypatch.setattr(in_part, "_group", lambda *given: "group")
-    monkeypatch.setattr(in_part, "_unexplained", lambda *given: "unexplained")
+    monkeypatch.setattr(in_part, "_group_outcome", lambda *given: "group")
+    monkeypatch.setattr(in_part, "_unexplained_outcome", lambda *given: "unexplained")
     monkeypatch.setattr(in_part, "named_effects", lambda *given: ())
     assert in_part._verdict_by_comparison(TwoRivals(probability, gain, fits), None) == kind
 
@@ -177,7 +179,7 @@ def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, pr
 def test_what_speaks_against_a_name_is_the_probability_or_the_evidence(
     monkeypatch, probability, gain, reason
 ):
-    monkeypatch.setattr(in_part, "_unexplained", lambda comparison, first, nearest, reason="": reason)
+    monkeypatch.setattr(in_part, "_unexplained_outcome", lambda comparison, first, nearest, reason="": reason)
     assert in_part._verdict_by_comparison(TwoRivals(probability, gain, True), None).endswith(reason)
 
 

@@ -10,10 +10,10 @@ from discrepancy.files.verdict import read_verdict
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
-from discrepancy.judgement.closed_share import errors_text, share_text
+from discrepancy.judgement.closed_share import percent_with_interval, rms_errors_text
 from discrepancy.judgement.conclusion import VerdictOutcome
 from discrepancy.judgement.moved_unknowns import moved_sentence, moved_unknowns
-from discrepancy.judgement.verdict_checks import checked_verdict, far_held_out_records, unfitted_records
+from discrepancy.judgement.verdict_checks import check_against_trials, far_held_out_records, unfitted_records
 from discrepancy.report.figures import ReportInput
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
@@ -215,7 +215,7 @@ def test_the_record_of_proof_is_what_the_residuals_show(case, tmp_path):
     proof, after = stored.proof, stored.residuals.held_out or stored.residuals
     before = found.before.held_out or found.before
     scores = proof.held_out_after or proof.fitted_after
-    for name in after.measured:
+    for name in after.channel_names:
         pairs = [
             (item.residual[:, item.column(name)], item.used[:, item.column(name)])
             for item in after.trials
@@ -234,11 +234,11 @@ def test_the_record_of_proof_is_what_the_residuals_show(case, tmp_path):
         for residuals in (before, after)
     ]
     assert proof.closed.value == pytest.approx(1.0 - total[1] / total[0])
-    assert not proof.grew
+    assert not proof.has_grown
     if stored.verdict.kind in (VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED):
-        assert share_text(proof.closed) in stored.verdict.sentence
+        assert percent_with_interval(proof.closed) in stored.verdict.sentence
         old = proof.held_out_before or proof.fitted_before
-        assert errors_text(after.channels, old.rms, scores.rms) in stored.verdict.sentence
+        assert rms_errors_text(after.channels, old.rms, scores.rms) in stored.verdict.sentence
 
 
 def test_a_hypothesis_with_which_the_error_grows_is_not_named():
@@ -249,7 +249,7 @@ def test_a_hypothesis_with_which_the_error_grows_is_not_named():
     candidate = fit_of_name.candidate
     values = candidate.add_step(fit_of_name.effect, np.full(candidate.parameter_count, 4.0))
     worse = fit(found.problem, candidate, replace(fit_of_name.point, effect=values), iterations=0)
-    outcome = checked_verdict(VerdictOutcome(verdict, found.search, worse))
+    outcome = check_against_trials(VerdictOutcome(verdict, found.search, worse))
     assert outcome.verdict.kind is VerdictKind.UNEXPLAINED
     assert outcome.verdict.effects == outcome.verdict.resembles == ()
     assert outcome.fit is found.search.no_effect

@@ -9,17 +9,17 @@ import pytest
 from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.library import in_events, library
+from discrepancy.catalogue.library import library, variants_in_events
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import fit
-from discrepancy.judgement.separability import as_predicted
-from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.judgement.separability import campaign_as_predicted
+from discrepancy.sources.examples import example_campaign, plan_from_scales
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_remarks import without_port
+from discrepancy.verdict_remarks import missing_port_remark
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
 from tests.discrepancy.rigs import FEW, drag_found, measured, one_mass, setting_of
@@ -122,7 +122,7 @@ def test_verdicts_that_name_nothing():
         judged(misspelt)
 
     # what the model says, to the last bit, and no noise record: nothing to weigh the rest by
-    exact = as_predicted(LABORATORY.campaign, LABORATORY.model, LABORATORY.setting)
+    exact = campaign_as_predicted(LABORATORY.campaign, LABORATORY.model, LABORATORY.setting)
     channels = {name: replace(item, noise=None) for name, item in exact.channels.items()}
     result = judged(replace(exact, trials=exact.fitted, channels=channels), thorough=False)
     assert result.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -144,17 +144,17 @@ def test_a_gain_far_from_its_prior_is_remarked_on():
 
 def test_effects_that_lack_a_port_are_remarked_on_with_the_port_to_declare():
     chain = LumpedModel.load("three_mass_chain")
-    plan = plan_for(chain, ("x3", "x1"), "end")
+    plan = plan_from_scales(chain, ("x3", "x1"), "end")
     campaign = example_campaign(chain, "ringdown", 1, plan)
-    assert without_port(setting_of(campaign, chain), library()) == []
+    assert missing_port_remark(setting_of(campaign, chain), library()) == []
     bare = LumpedModel(chain.description.model_copy(update={"port": ()}))
-    (remark,) = without_port(setting_of(campaign, bare), library())
+    (remark,) = missing_port_remark(setting_of(campaign, bare), library())
     assert remark.startswith("Not tested for lack of a port: Coulomb friction, ")
     assert "joint micro-slip (Iwan) and Bouc-Wen hysteresis; declare a [[port]]" in remark
     assert "vector = [0, 0, 1] between the ground and 'end'" in remark
     assert "drift" not in remark
     static = example_campaign(chain, "static", 1, plan)
-    (remark,) = without_port(setting_of(static, bare), library())
+    (remark,) = missing_port_remark(setting_of(static, bare), library())
     assert "Coulomb" not in remark  # a port would not help: there is no motion
 
 
@@ -168,7 +168,7 @@ def test_trials_that_came_and_went_are_not_mistaken_for_each_other():
     channels = problem.campaign.channels
     outputs = tuple((channels[name].output, channels[name].quantity) for name in template.channels)
     memo = problem.model
-    plain = memo.patched(ModelPatch())
+    plain = memo.with_patch(ModelPatch())
     conditions = Conditions(np.array([1.0, 0.5]), health=np.zeros((9, 2)))
     for number in range(200):
         trial = replace(template, force=float(number) * template.force)
@@ -263,8 +263,10 @@ def test_friction_that_begins_with_an_event_is_named_with_it(campaign):
     assert found.sentence.endswith("acts from 4.137 s on in 'first'; from 2.221 s on in 'second'.")
     setting = kit.problem_of(campaign, MODEL).setting
     for events in ((), campaign.events[1:]):
-        assert in_events(library(), replace(setting, campaign=replace(campaign, events=events))) == ()
-    names = {effect.identifier for effect in in_events(library(), setting)}
+        assert (
+            variants_in_events(library(), replace(setting, campaign=replace(campaign, events=events))) == ()
+        )
+    names = {effect.identifier for effect in variants_in_events(library(), setting)}
     assert {"coulomb_friction_during_bolt_loose", "mains_hum_during_bolt_loose"} <= names
     assert not any(name.startswith(("clock_error", "point_mass", "high_pass")) for name in names)
 

@@ -213,8 +213,8 @@ def test_what_a_campaign_accepts_is_read_and_written(tmp_path):
     campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, *changes))
     again = read_campaign(write_campaign(campaign, tmp_path / "b"))
     for item in (campaign, again):
-        assert item.accepted("tip", "release") == {"sign", "outliers", "held", "too short"}
-        assert item.accepted("g17") == {"sign"}
+        assert item.accepted_faults("tip", "release") == {"sign", "outliers", "held", "too short"}
+        assert item.accepted_faults("g17") == {"sign"}
 
 
 def test_a_word_that_is_no_fault_cannot_be_accepted(tmp_path):

@@ -13,9 +13,9 @@ from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import check_data, clipped_run
-from discrepancy.checks.rest import _freedom
+from discrepancy.checks.rest import _effective_sample_count
 from discrepancy.errors import ModelError
-from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_for, write_example
+from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_from_scales, write_example
 from discrepancy.system.lumped_model import LumpedModel
 from fe.runtime import patch as patches
 from fe.runtime.patch import ModelPatch, SensorGain
@@ -95,8 +95,8 @@ def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed)
     """And say what is held out."""
     chain = LumpedModel.load("three_mass_chain")
     with pytest.raises(ModelError, match="has no output 'x9'"):
-        plan_for(chain, ("x9",), "end")
-    plan = plan_for(chain, ("x3", "x1", "base_strain", "joint_strain"), "end")
+        plan_from_scales(chain, ("x9",), "end")
+    plan = plan_from_scales(chain, ("x3", "x1", "base_strain", "joint_strain"), "end")
     one, two = (write_example(chain, tmp_path / name, "laboratory", seed, plan) for name in "ab")
     assert one.data_hash == two.data_hash
     assert one.data_hash != write_example(chain, tmp_path / "c", "laboratory", 4, plan).data_hash
@@ -397,5 +397,5 @@ def test_outliers_are_found_and_left_out_unless_they_are_too_many(campaign):
 def test_a_series_that_is_correlated_has_bartletts_freedom(kept):
     """n (1 - r^2) / (1 + r^2) of a first-order autoregression."""
     noise = np.random.default_rng(3).standard_normal((20, 4000))
-    found = np.mean([_freedom(series) for series in lfilter([1.0], [1.0, -kept], noise)])
+    found = np.mean([_effective_sample_count(series) for series in lfilter([1.0], [1.0, -kept], noise)])
     assert found == pytest.approx(4000.0 * (1.0 - kept**2) / (1.0 + kept**2), rel=0.06)

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.fault import FaultKind
-from discrepancy.checks.held import held_spans
+from discrepancy.checks.held import stuck_spans
 from discrepancy.checks.quality import check_data, clipped_run
 from tests.discrepancy.data.rings import TIME, campaign_of, only
 
@@ -66,13 +66,13 @@ def test_what_rests_is_not_frozen(digit, pace):
     used = np.ones(len(TIME), dtype=bool)
     other = np.cos(5.0 * TIME)[:, np.newaxis]
     for name, values in _sound(digit, pace, np.random.default_rng(2)).items():
-        assert held_spans(values, used, np.zeros((len(TIME), 0))) == [], name
+        assert stuck_spans(values, used, np.zeros((len(TIME), 0))) == [], name
         if name in ("ring", "warming", "day", "backlash", "dead zone"):
-            assert held_spans(values, used, other) == [], name
+            assert stuck_spans(values, used, other) == [], name
     clock = np.interp(TIME, [0.0, 3.0, 4.0, 8.0], [0.0, 3.0, 3.0, 7.0])
     motion = clock + 0.1 * clock**2
     for beside, spans in ((np.round(motion, 2), []), (np.round(np.sin(3.0 * TIME), 3), [(600, 801)])):
-        assert held_spans(np.round(motion, 3), used, beside[:, np.newaxis]) == spans
+        assert stuck_spans(np.round(motion, 3), used, beside[:, np.newaxis]) == spans
 
 
 STEP = 2.0 * np.pi / 1024.0
@@ -101,7 +101,7 @@ def test_an_encoder_that_sticks_at_the_end_of_a_swing_is_not_held(noise):
     """Printed with six decimals: its steps differ by the last of them."""
     angles = np.round(np.round(_swing_with_friction() / STEP) * STEP, 6)
     other = np.cos(5.0 * np.arange(len(angles)))[:, np.newaxis]
-    assert held_spans(angles, np.ones(len(angles), bool), other, noise) == []
+    assert stuck_spans(angles, np.ones(len(angles), bool), other, noise) == []
 
 
 @pytest.mark.parametrize("noise", [0.0, STEP / 3.0, STEP])
@@ -110,7 +110,7 @@ def test_encoder_steps_that_were_resampled_by_straight_lines_are_not_held(noise)
     steps = np.round(0.5 * np.exp(-0.3 * time) * np.cos(6.0 * time) / STEP) * STEP
     resampled = np.round(np.interp(np.arange(0.0, 3.99, 0.001), time, steps), 6)
     other = np.cos(5.0 * np.arange(len(resampled)))[:, np.newaxis]
-    assert held_spans(resampled, np.ones(len(resampled), bool), other, noise) == []
+    assert stuck_spans(resampled, np.ones(len(resampled), bool), other, noise) == []
 
 
 def _logged_faster_than_updated(updates=400, samples_of_each=10):
@@ -120,14 +120,14 @@ def _logged_faster_than_updated(updates=400, samples_of_each=10):
 
 def test_a_sensor_that_is_slower_than_its_logger_is_neither_held_nor_clipped():
     values = _logged_faster_than_updated()
-    assert held_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == []
+    assert stuck_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == []
     assert clipped_run(values, values.max()) == 0
 
 
 def test_a_sensor_that_is_slower_than_its_logger_can_be_held():
     values = _logged_faster_than_updated()
     values[1000:1100] = values[1000]
-    assert held_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == [(1000, 1100)]
+    assert stuck_spans(values, np.ones(len(values), bool), np.zeros((len(values), 0)), 0.02) == [(1000, 1100)]
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from discrepancy.campaign.records import NoiseRecord, Quantity
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.quality import check_data
-from discrepancy.checks.rest import moves
-from discrepancy.checks.unit_slips import slip_between
+from discrepancy.checks.rest import disturbance_phrase
+from discrepancy.checks.unit_slips import find_slip
 from tests.discrepancy.data.rings import MODEL, TIME, campaign_of, only
 from tests.refusals import Inputs
 
@@ -87,7 +87,7 @@ def test_what_moves_alike_is_no_copy():
     ("scale", "quantity", "stated", "drive", "pair"), INPUTS.table("faults.toml")["slips"]
 )
 def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
-    assert str(slip_between(scale, Quantity(quantity), stated, drive=drive) or "").strip("(?)") == pair
+    assert str(find_slip(scale, Quantity(quantity), stated, is_input=drive) or "").strip("(?)") == pair
 
 
 # ---------------------------------------------------------------- at rest
@@ -109,8 +109,8 @@ def test_noise_of_any_colour_is_at_rest(seed):
         white[500:] + 2.0 * mains,
         np.random.default_rng(seed).standard_t(3, 800),
     ):
-        assert moves(_record(samples)) is None
-        assert moves(_record(samples), 3.2) is None
+        assert disturbance_phrase(_record(samples)) is None
+        assert disturbance_phrase(_record(samples), 3.2) is None
 
 
 @pytest.mark.parametrize(

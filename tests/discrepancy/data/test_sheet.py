@@ -18,7 +18,7 @@ from openpyxl import Workbook
 from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.sheet import read_sheet
-from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
+from discrepancy.campaign.units import UNITS, conversion_factor, factor_to_si, quantities_of
 from discrepancy.errors import CampaignFileError, DiscrepancyError
 from tests.refusals import Inputs, refused
 
@@ -282,12 +282,12 @@ def test_units_mean_what_they_always_did_and_what_laboratories_write():
     powers = [(quantity, unit, float(f"1e{power}")) for quantity, unit, power in rows("powers")]
     for quantity, unit, factor in powers + rows("factors", "others"):
         assert quantity in quantities_of(unit), unit
-        assert conversion_of(quantity, unit) == pytest.approx(factor, rel=1e-15), unit
+        assert factor_to_si(quantity, unit) == pytest.approx(factor, rel=1e-15), unit
     usual = {(quantity, unit) for quantity, row in UNITS.items() for unit in row.usual}
     assert usual == {row[:2] for row in rows("powers", "factors")}
-    assert conversion("ms", "s") == pytest.approx(1e-3, rel=1e-15)
+    assert conversion_factor("ms", "s") == pytest.approx(1e-3, rel=1e-15)
     with pytest.raises(ValueError, match="cannot become s"):
-        conversion("mm", "s")
+        conversion_factor("mm", "s")
 
 
 @pytest.mark.parametrize(
@@ -303,8 +303,8 @@ def test_units_mean_what_they_always_did_and_what_laboratories_write():
 )
 def test_loggers_names_of_units_are_known(unit, quantity, in_si):
     assert quantity in quantities_of(unit)
-    assert conversion_of(quantity, unit) == pytest.approx(in_si, rel=1e-12)
-    assert conversion("Sec", "s") == 1.0
+    assert factor_to_si(quantity, unit) == pytest.approx(in_si, rel=1e-12)
+    assert conversion_factor("Sec", "s") == 1.0
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_loggers_names_of_units_are_known(unit, quantity, in_si):
 def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal(unit):
     assert quantities_of(unit) == (Quantity.SIGNAL,) * ("V/" in unit or "V/v" in unit)
     with pytest.raises(ValueError, match=r"strain must have a unit such as .*, and '.*' came"):
-        conversion_of(Quantity.STRAIN, unit)
+        factor_to_si(Quantity.STRAIN, unit)
 
 
 @pytest.mark.parametrize(

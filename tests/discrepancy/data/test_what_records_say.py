@@ -7,7 +7,11 @@ import pytest
 
 from discrepancy.campaign.records import Channel, Hold, NoiseRecord, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.checks.fault import FaultKind
-from discrepancy.checks.model_check import check_against_model, posterior_over_prior, unobservable
+from discrepancy.checks.model_check import (
+    check_against_model,
+    posterior_to_prior_ratios,
+    unobservable_parameter_faults,
+)
 from tests.discrepancy.rigs import asked, campaign, model_of
 from tests.refusals import Inputs
 
@@ -38,7 +42,7 @@ def fatal(campaign):
 def test_what_is_left_of_each_prior():
     """Beside least squares of x by the two parameters, by hand; a short push of a cart is no short record."""
     campaign = pushed()
-    left = posterior_over_prior(campaign, CART)
+    left = posterior_to_prior_ratios(campaign, CART)
     time = campaign.trials[0].time
 
     def x(mass, damping):
@@ -58,7 +62,7 @@ def test_what_is_left_of_each_prior():
     for scale in (100.0, 9.81):  # no plausible slip
         assert not fatal(pushed(scale))
     slippery = model_of(CART_FILE.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }"))
-    (found,) = unobservable(campaign, slippery)
+    (found,) = unobservable_parameter_faults(campaign, slippery)
     assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
     (fault,) = check_against_model(campaign, slippery)
     assert (fault.kind, fault.fatal) == (FaultKind.UNOBSERVABLE, False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, TrialKind
-from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
+from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_end_readings
 from tests.discrepancy.rigs import asked, campaign
 
 
@@ -56,7 +56,7 @@ def test_outliers_that_a_campaign_accepts_stay():
 def test_a_wrong_end_is_also_beyond_the_stated_noise(noise, found):
     residual = np.random.default_rng(1).standard_normal((200, 1))
     residual[0] += 20.0
-    wrong = wrong_ends(residual, residual < 1e5, np.array([noise]))
+    wrong = wrong_end_readings(residual, residual < 1e5, np.array([noise]))
     assert [tuple(place) for place in np.argwhere(wrong).tolist()] == found
 
 
@@ -117,7 +117,9 @@ def test_rows_of_static_trials():
 
 def ends(*columns):
     residual = np.stack(columns, axis=1)
-    return [(int(row), int(column)) for row, column in np.argwhere(wrong_ends(residual, residual < 1e5))]
+    return [
+        (int(row), int(column)) for row, column in np.argwhere(wrong_end_readings(residual, residual < 1e5))
+    ]
 
 
 @pytest.mark.parametrize("place", [0, 1, 2, 197, 198, 199])

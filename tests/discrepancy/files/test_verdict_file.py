@@ -18,7 +18,7 @@ from discrepancy.errors import VerdictFileError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.files.verdict import StoredPatch, patch_effects, read_patch, write_patch, write_verdict
-from discrepancy.judgement.proof import prove
+from discrepancy.judgement.proof import prove_effects
 from discrepancy.verdict import VerdictKind
 from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
 from reporting.errors import FileNotWrittenError
@@ -50,7 +50,7 @@ def test_a_verdict_comes_back_equal(tmp_path):
     assert np.isnan([FRICTION.shape[0].high, STIFFNESS.deviation, VERDICT.gates[0].statistic]).all()
     again = write_verdict(tmp_path / "again.json", VERDICT, None, ORIGIN)
     assert again.read_bytes() == GOLDEN.read_bytes()
-    proof = prove(FITTED, FITTED)
+    proof = prove_effects(FITTED, FITTED)
     for number, content in enumerate((proof, replace(proof, held_out_before=None))):
         back = files.read_verdict_file(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
         assert same(back.verdict, VERDICT)
@@ -252,7 +252,7 @@ def test_files_of_earlier_numbers_are_read(number, tmp_path):
 
 def test_an_older_proof_is_read_without_its_share_and_says_why(tmp_path):
     """Chi-square after was divided by the posterior's doubt too: its errors are read, its share is not."""
-    path = write_verdict(tmp_path / "verdict.json", VERDICT, prove(FITTED, FITTED), ORIGIN)
+    path = write_verdict(tmp_path / "verdict.json", VERDICT, prove_effects(FITTED, FITTED), ORIGIN)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["schema"] = "uav-twin verdict 4"
     content["verdict"]["explained"] = {"value": 0.998}
@@ -265,6 +265,6 @@ def test_an_older_proof_is_read_without_its_share_and_says_why(tmp_path):
     content["proof"] |= {"gap_closed": 0.998, "gap_reason": ""}
     path.write_text(json.dumps(content), encoding="utf-8")
     proof = files.read_verdict_file(path).proof
-    assert proof.held_out_after.rms == prove(FITTED, FITTED).held_out_after.rms
+    assert proof.held_out_after.rms == prove_effects(FITTED, FITTED).held_out_after.rms
     assert proof.closed is None
     assert "of an earlier version" in proof.closed_reason

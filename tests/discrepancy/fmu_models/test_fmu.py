@@ -173,7 +173,7 @@ def test_an_fmu_that_is_stepped_converges_to_the_lumped_model(stepped, name: str
     short = replace(what, time=what.time[:100], force=what.force[:100])
     given: dict[str, Any] = {"clock": (0.0, -0.03), "outputs": BOTH} if what is RINGDOWN else {}
     coarse, fine = (share(stepped, LUMPED, short, *items, **given, n=n) for n in (1, 4))
-    derived = tuple(("displacement", quantity) for quantity in Quantity.DISPLACEMENT.moving)
+    derived = tuple(("displacement", quantity) for quantity in Quantity.DISPLACEMENT.motion_chain)
     moved = stepped.respond(short, derived, ModelPatch(items), Conditions(**GIVEN))
     np.testing.assert_array_equal(moved.rates[:, 1], moved.values[:, 2])
     assert coarse < 4e-4

@@ -14,9 +14,15 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.errors import FitError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.judgement.closed_share import closed_share
-from discrepancy.judgement.consistency_gate import check_consistency, directions, score_tests
+from discrepancy.judgement.consistency_gate import check_consistency, directions_by_test, score_tests
 from discrepancy.judgement.naming import reach_verdict
-from discrepancy.judgement.proof import check_held_out, correlation_time, log_density, prove, scores
+from discrepancy.judgement.proof import (
+    check_held_out,
+    compute_scores,
+    correlation_time,
+    log_density,
+    prove_effects,
+)
 from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
 from tests.discrepancy.core import kit
@@ -40,7 +46,7 @@ def test_scores_of_a_right_model():
     bench = Bench(count=400, amplitudes=MANY, held_out=HELD, noise_freedom=2000.0)
     fitted = bench.fit(np.random.default_rng(13))
     for part in (fitted.fitted, fitted.held_out):
-        found = scores(part)
+        found = compute_scores(part)
         expected = pytest.approx(found.chi_square_expected, abs=4.0 * found.chi_square_deviation)
         assert found.chi_square_per_sample == expected
         assert found.coverage_50 == pytest.approx(0.5, abs=0.03)
@@ -51,10 +57,10 @@ def test_scores_of_a_right_model():
         assert sum(found.pit) == pytest.approx(1.0)
         assert found.rms["g1"] == pytest.approx(2.0, rel=0.1)
         wide = [replace(item, predictive_deviation=1.5 * item.predictive_deviation) for item in part.trials]
-        assert scores(replace(part, trials=tuple(wide))).pit_p_value < 1e-6
+        assert compute_scores(replace(part, trials=tuple(wide))).pit_p_value < 1e-6
         again = [replace(item, residual=np.repeat(item.residual[::8], 8, axis=0)) for item in part.trials]
         assert (
-            scores(replace(part, trials=tuple(again))).pit_p_value > 0.01
+            compute_scores(replace(part, trials=tuple(again))).pit_p_value > 0.01
         )  # what repeats itself counts once
 
 
@@ -64,7 +70,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other()
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
     after = bench.fit(np.random.default_rng(5))
     assert [check_held_out(item).passed for item in (before, after)] == [False, True]
-    proof = prove(before, after)
+    proof = prove_effects(before, after)
     assert proof.held_out_before.chi_square_per_sample > 3.0
     left = proof.held_out_after.chi_square_per_sample / proof.held_out_before.chi_square_per_sample
     assert proof.closed.value == pytest.approx(1.0 - left)
@@ -72,32 +78,32 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other()
     assert proof.closed_reason == ""
     assert proof.log_score_gain > 5.0 * proof.log_score_gain_error > 0.0
     other = [replace(item, noise_deviation=3.0 * item.noise_deviation) for item in after.trials]  # its own
-    gain = prove(before, replace(after, trials=tuple(other))).log_score_gain
+    gain = prove_effects(before, replace(after, trials=tuple(other))).log_score_gain
     assert gain == pytest.approx(proof.log_score_gain)
     assert proof.remaining.startswith("Nothing that these data can show remains")
-    none = prove(before, before)
+    none = prove_effects(before, before)
     assert none.closed.value == 0.0
     assert none.log_score_gain == none.log_score_gain_error == 0.0
     assert none.remaining.startswith("Still unexplained: χ² per sample")
     exact = Bench(amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
     sets = [exact.fit(np.random.default_rng(6), extra=lacking(exact, size)) for size in (400.0, 200.0)]
-    assert prove(*sets).closed.value == pytest.approx(0.75, abs=0.03)
+    assert prove_effects(*sets).closed.value == pytest.approx(0.75, abs=0.03)
 
 
 def test_no_gap_is_said_and_not_divided_by():
     """Nor is there one without a held-out trial or a noise record."""
     fitted = Bench(amplitudes=(200.0, 150.0), held_out=(False, True)).fit(np.random.default_rng(7))
-    proof = prove(fitted, fitted)
+    proof = prove_effects(fitted, fitted)
     assert proof.closed is None
     assert "show no gap before" in proof.closed_reason
     bare = with_noise(fitted, None)
     assert check_held_out(bare).passed is None
-    proof = prove(bare, bare)
+    proof = prove_effects(bare, bare)
     assert isnan(proof.held_out_after.chi_square_per_sample)
     assert proof.closed.value == 0.0  # of the error itself
     assert "not known" in proof.remaining
     without = Bench().fit(np.random.default_rng(7))
-    proof = prove(without, without)
+    proof = prove_effects(without, without)
     assert proof.closed.trials == "fitted"
     assert isnan(proof.log_score_gain)
     assert proof.closed_reason == "No trial was held out."
@@ -122,10 +128,10 @@ def with_error(residuals, factor):
 def test_an_error_that_grew_is_a_negative_share_however_wide_the_posterior():
     bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
-    proof = prove(before, with_error(before, 1.4))
+    proof = prove_effects(before, with_error(before, 1.4))
     assert proof.closed.value == pytest.approx(1.0 - 1.4**2)
     assert proof.closed.high < 0.0
-    assert proof.grew
+    assert proof.has_grown
     ratio = proof.held_out_after.chi_square_per_sample / proof.held_out_before.chi_square_per_sample
     assert ratio == pytest.approx(1.4**2)
 
@@ -152,13 +158,13 @@ def test_scores_of_one_set():
     expected = stats.norm.logpdf(item.residual, scale=item.predictive_deviation)
     np.testing.assert_allclose(log_density(item), expected + np.log(item.noise_deviation), rtol=1e-12)
     exact, loose = (
-        scores(residuals).chi_square_deviation / scores(residuals).chi_square_expected
+        compute_scores(residuals).chi_square_deviation / compute_scores(residuals).chi_square_expected
         for residuals in (fitted, with_noise(fitted, NoiseRecord(2.0, 10.0)))
     )
     assert loose**2 == pytest.approx(exact**2 + 0.2)
     unused = replace(item, trial=replace(item.trial, used=np.zeros_like(item.used)))
     with pytest.raises(FitError, match="at least one used sample"):
-        scores(replace(fitted, trials=(unused,)))
+        compute_scores(replace(fitted, trials=(unused,)))
 
 
 def test_standard_error_is_that_of_trials_not_of_samples():
@@ -170,7 +176,7 @@ def test_standard_error_is_that_of_trials_not_of_samples():
         held = [n for n, t in enumerate(bench.trials) if t.held_out]
         extra = {n: generator.standard_normal() * 1.5 * np.ones((1, 4)) for n in held}
         seed = generator.integers(1 << 30)
-        proof = prove(*(bench.fit(np.random.default_rng(seed), extra=more) for more in (extra, None)))
+        proof = prove_effects(*(bench.fit(np.random.default_rng(seed), extra=more) for more in (extra, None)))
         found.append((proof.log_score_gain, proof.log_score_gain_error))
     gains, errors = np.array(found).T
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(gains), rel=0.35)
@@ -216,7 +222,7 @@ def changed(problem, *, record=None, size=None, shift=0.0, place="middle", fligh
 def asked(problem, term=kit.OFFSET):
     """Return the fit of a term, the directions beside it and their tests."""
     found = kit.fitted(problem, term)
-    along = directions(problem, found)
+    along = directions_by_test(problem, found)
     return found, along, score_tests(problem, found, along)
 
 

@@ -17,7 +17,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.search.fitted_candidates import FittedCandidates
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import Investigation, investigate, without_wrong_ends
+from discrepancy.workflow import Investigation, investigate, problem_without_wrong_ends
 from tests.discrepancy.rigs import chosen, integrated, model_of
 
 AXIS = """
@@ -103,7 +103,7 @@ def test_the_value_of_the_law_is_that_of_the_simulation(sticking: Investigation)
 
 def test_evidence_under_recorded_noise_has_the_scale_of_that_with_a_missing_force() -> None:
     campaign = pushed_axis(0.0, 300)
-    problem = without_wrong_ends(campaign, model_of(AXIS))
+    problem = problem_without_wrong_ends(campaign, model_of(AXIS))
     no_effect = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
     candidates = FittedCandidates(problem, (), no_effect)
     evidence = candidates.score_under_recorded_noise(no_effect) - candidates.log_prior(no_effect.candidate)

@@ -11,9 +11,9 @@ from discrepancy.errors import FitError
 from discrepancy.location.backbones import backbones
 from discrepancy.location.dependence import modal_motion, predicted_frequencies
 from discrepancy.location.locate import locate, outlier_remarks
-from discrepancy.location.map import features, residual_map
-from discrepancy.location.patterns import kinds_of, singular_patterns
-from discrepancy.location.residuals import ResidualSet, quadratic_moments
+from discrepancy.location.map import dependence_functions, residual_map
+from discrepancy.location.patterns import group_by_kind, singular_patterns
+from discrepancy.location.residuals import ResidualSet, sum_of_squares_moments
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
 
 # ---------------------------------------------------------------- calibration of the whole
@@ -25,9 +25,11 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
     silent, proportion = [], []
     for _ in range(20):
         fitted = bench.fit(generator)
-        silent.append(not any(cell.significant for cell in residual_map(fitted, fitted.white(generator))))
+        silent.append(
+            not any(cell.significant for cell in residual_map(fitted, fitted.whitened_residuals(generator)))
+        )
         fitted = bench.fit(generator, extra={0: np.array([0.0, 0.0, 4.0, 0.0])})
-        cells = residual_map(fitted, fitted.white(generator))
+        cells = residual_map(fitted, fitted.whitened_residuals(generator))
         found = [(cell.channel, cell.trial) for cell in cells if cell.significant]
         assert ("g3", "release 1") in found
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
@@ -42,7 +44,8 @@ def test_a_short_noise_record_makes_no_pattern_over_the_channels():
     for _ in range(40):
         fitted = bench.fit(generator)
         told += sum(
-            bool(singular_patterns(fitted, kind)) for kind in kinds_of(fitted, fitted.white(generator))
+            bool(singular_patterns(fitted, kind))
+            for kind in group_by_kind(fitted, fitted.whitened_residuals(generator))
         )
     assert told <= binom.isf(1e-3, 80, 0.01)
 
@@ -232,7 +235,9 @@ def test_harmonics_of_a_motion_are_those_of_its_phase():
     item = Bench(count=400).fit(np.random.default_rng(2)).trials[0]
     angle = 2.0 * np.pi * 5.0 * item.trial.time
     moved = {"prediction": np.cos(angle), "rates": -np.sin(angle)}
-    found = features(replace(item, **{name: np.tile(row[:, None], 4) for name, row in moved.items()}), 0)
+    found = dependence_functions(
+        replace(item, **{name: np.tile(row[:, None], 4) for name, row in moved.items()}), 0
+    )
     for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
         wave = np.cos(order * angle + 0.3)
         left = wave - found[name] @ np.linalg.lstsq(found[name], wave, rcond=None)[0]
@@ -247,10 +252,10 @@ def test_moments_of_a_sum_of_squares_are_those_of_the_projection():
     S = np.linalg.qr(generator.standard_normal((12, 3)))[0] * np.array([1.0, 0.9, 0.4])
     A = np.eye(12) - S @ S.T
     expected = 1.0 - np.sum(S**2, axis=1)
-    mean, freedom = quadratic_moments([(expected[:5], S[:5]), (expected[5:], S[5:])])
+    mean, freedom = sum_of_squares_moments([(expected[:5], S[:5]), (expected[5:], S[5:])])
     assert mean == pytest.approx(np.trace(A))
     assert freedom == pytest.approx(np.trace(A) ** 2 / np.trace(A @ A))
-    assert quadratic_moments([(expected, None)]) == pytest.approx((np.trace(A), np.trace(A)))
+    assert sum_of_squares_moments([(expected, None)]) == pytest.approx((np.trace(A), np.trace(A)))
 
 
 @pytest.mark.parametrize("held_out", [False, True])
@@ -258,7 +263,8 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(500)
+        np.concatenate([part.ravel() for part in bench.fit(generator).whitened_residuals(generator)])
+        for _ in range(500)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))

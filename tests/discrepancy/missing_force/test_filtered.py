@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.judgement.remarks import begins_inside, when_sentence
+from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.explained import fit_missing_forces
 from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, sum_regressions
@@ -303,7 +303,7 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
         assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=0.01 * case.length)
         assert window.channels == ("block",)
         assert window.size > 3.0
-    assert when_sentence(told) in verdict.sentence
+    assert gap_times_sentence(told) in verdict.sentence
 
 
 def test_a_window_whose_readings_are_all_missing_is_drawn():
@@ -340,8 +340,8 @@ def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     assert window.end.low - 0.01 <= 2.0 <= window.end.high + 0.01
     assert window.size == pytest.approx(8.0, rel=0.1)
     assert windows_of_residuals(fitted) == (window,)
-    assert begins_inside((window,))
-    assert when_sentence((window,)).startswith("The gap is there in 'release 2' since 1.")
+    assert has_gap_beginning_inside((window,))
+    assert gap_times_sentence((window,)).startswith("The gap is there in 'release 2' since 1.")
     (axis, *_) = time_line_figure((window,)).axes
     assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
     assert windows_of_residuals(Bench(count=300).fit(np.random.default_rng(4))) == ()
@@ -356,7 +356,7 @@ def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     (window,) = windows_of_residuals(fitted)
     assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
     assert window.size > 1.0
-    assert when_sentence((window,)) == "The gap is there throughout the records."
+    assert gap_times_sentence((window,)) == "The gap is there throughout the records."
 
 
 def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channels():
@@ -384,11 +384,11 @@ def test_words_of_windows():
     part = GapWindow("b", ("x",), Moment(1.0, 0.98, 1.04), None, 0.0, 9.0, 3.0)
     left = GapWindow("b", ("x",), None, Moment(2.0, 1.5, 2.5), 0.0, 9.0, 2.0, with_effect=True)
     throughout = "in 'a' throughout the record, 4 times the noise."
-    assert not begins_inside((whole,))
+    assert not has_gap_beginning_inside((whole,))
     for windows, sentence in (
         ((whole, part), "The gap is there in 'b' since 1.000 s (0.980 to 1.040), to the end of the record, "
          f"3 times the noise; {throughout}"),
         ((whole, part, part, part), f"The gap comes and goes, 4 times; the largest is {throughout}"),
         ((left,), ""),
     ):  # fmt: skip
-        assert when_sentence(windows) == sentence
+        assert gap_times_sentence(windows) == sentence

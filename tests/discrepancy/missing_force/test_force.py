@@ -32,7 +32,7 @@ from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.verdict import Verdict, VerdictKind
-from discrepancy.workflow import Investigation, checked, investigate
+from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
 from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
@@ -74,7 +74,7 @@ def write_drive(folder):
 def read(folder):
     """Read a folder with a campaign and its model."""
     model = load_model(folder / "model.toml")
-    campaign, faults = checked(read_campaign(folder), model)
+    campaign, faults = check_and_prepare(read_campaign(folder), model)
     assert not faults
     return problem_of(campaign, model)
 
@@ -357,7 +357,7 @@ def test_a_model_with_the_right_law_of_its_own_has_no_gap_at_any_time():
     model = LumpedModel.load("single_mass_rig")
     values = {"friction_ratio": 0.02}
     rubs = hiding(simulated(model, "ringdown", 4), model, "coulomb_friction", values, "slide")
-    found = investigate(simulated(model, "ringdown", 4, rubs), model.patched(rubs), FEW[:1]).verdict
+    found = investigate(simulated(model, "ringdown", 4, rubs), model.with_patch(rubs), FEW[:1]).verdict
     assert (found.kind, found.windows) == (VerdictKind.NOTHING_MISSING, ())
 
 

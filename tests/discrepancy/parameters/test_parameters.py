@@ -195,7 +195,7 @@ def test_one_parameter_is_integrated_as_densely_as_one_likes():
 def test_the_colour_of_the_noise_is_no_gap_where_its_record_has_it(monkeypatch, recorded):
     """A record of 400 samples tells the colour only roughly, and 1500 residuals are not white."""
     monkeypatch.setattr(
-        "discrepancy.parameters.calibration.checked", lambda campaign, *_, **__: (campaign, ())
+        "discrepancy.parameters.calibration.check_and_prepare", lambda campaign, *_, **__: (campaign, ())
     )
     generator = np.random.default_rng(101)
 

@@ -19,18 +19,29 @@ from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
 from discrepancy.judgement.conclusion import probability_text
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
-from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    DETECTION_DISTANCE,
+    Detectability,
+    Separability,
+    compute_separability,
+)
+from discrepancy.report.decidability_text import (
+    campaign_needs,
+    confused_effects,
+    detectability_texts,
+    group_lines,
+)
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import parameter_rows, render_report, what_is_missing
+from discrepancy.report.page import missing_effects_text, parameter_rows, render_report
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.text import (
     WORDS,
     formula,
     headline,
     number,
+    percent_with_interval,
     remainders_sentence,
-    share_text,
     si_sizes,
 )
 from discrepancy.system.structures import WingModel
@@ -56,7 +67,7 @@ def drag():
 
 @pytest.fixture(scope="module")
 def able(drag):
-    return separability(drag.campaign, drag.model, drag.problem.setting, FEW)
+    return compute_separability(drag.campaign, drag.model, drag.problem.setting, FEW)
 
 
 def page_of(investigation, **verdict):
@@ -68,12 +79,12 @@ def page_of(investigation, **verdict):
 
 def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     closed, held = drag.proof.closed, drag.proof.held_out_after
-    said = f"It explains {share_text(closed)} of the mean square error in "
+    said = f"It explains {percent_with_interval(closed)} of the mean square error in "
     text = page_of(drag)  # without intervals, by its parameters
     force = drag.verdict.force
     opening = (
         f">Quadratic aerodynamic damping at {force.port}<", f">{number(force.rms)} N<",
-        f">{share_text(closed)}<", f">{probability_text(drag.verdict.probability)}<",
+        f">{percent_with_interval(closed)}<", f">{probability_text(drag.verdict.probability)}<",
         f">{headline(drag.verdict)}<", "Its size: ", said,
     )  # fmt: skip
     places = [text.index(words) for words in opening]
@@ -148,12 +159,14 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
-        Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5)
         for n, effect in enumerate(FEW[:count])
     )
     (told,) = (
         line
-        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind)
+        for line in campaign_needs(
+            Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
+        )
         if "would not be seen" in line
     )
     first = FEW[0].identifier.replace("_", " ")
@@ -162,34 +175,38 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
 
 
 def test_what_can_be_decided(drag, able):
-    words = {"neighbours": neighbours, "seen_of": seen_of, "able": able}
+    words = {"confused_effects": confused_effects, "detectability_texts": detectability_texts, "able": able}
     _, cells = WORDS.table("decide", [item for item in able.detectability if not item.reason], **words)
     rows = {row[0].replace(" ", "_"): row for row in cells}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
     told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
     said = list(
-        WORDS.rendered_blocks(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told)
+        WORDS.rendered_blocks(
+            WORDS.content["printed"]["check"], group_lines=group_lines, campaign_needs=campaign_needs, **told
+        )
     )
     assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
     confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
-    assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    assert len(confused) == sum(bool(confused_effects(able, name)) for name in able.identifiers)
     for line in confused:
-        assert all(other in line for other in neighbours(able, line.split()[1]))
+        assert all(other in line for other in confused_effects(able, line.split()[1]))
     for row, name in enumerate(able.identifiers):
-        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
+        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSION_DISTANCE
         near[row] = False
-        assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
+        assert confused_effects(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
     assert group_lines(able)
-    text = " ".join(needs(able, drag.campaign, FEW, TrialKind))
+    text = " ".join(campaign_needs(able, drag.campaign, FEW, TrialKind))
     for group in able.groups:
         assert group[0].replace("_", " ") in text
-    assert " add " not in " ".join(needs(able, drag.campaign, FEW, ()))  # trials that its model cannot follow
-    unproved = needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
+    assert " add " not in " ".join(
+        campaign_needs(able, drag.campaign, FEW, ())
+    )  # trials that its model cannot follow
+    unproved = campaign_needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
     assert [line for line in unproved if "nothing can be proved" in line] == unproved[-1:]
     assert "nothing can be proved" not in text
     quiet = {name: replace(item, noise=None) for name, item in drag.campaign.channels.items()}
-    *_, asked = needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
+    *_, asked = campaign_needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
     assert asked.startswith(f"Give a noise record for {', '.join(quiet)} (")
 
 
@@ -243,7 +260,7 @@ def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
     for length, (first, second) in names.items():
         effects = (replace(effect, identifier="a", name=first), replace(effect, identifier="b", name=second))
         verdict = Verdict(VerdictKind.GROUP, "", 0.97, 12.0, effects=effects, group=("a", "b"))
-        cards[length] = what_is_missing(verdict)
+        cards[length] = missing_effects_text(verdict)
     assert cards["short"] == f"play at {effect.place} or drag at {effect.place}"
     assert cards["long"] == "one of 2 hypotheses"
 

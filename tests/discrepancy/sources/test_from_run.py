@@ -107,7 +107,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
     np.testing.assert_allclose(shown, truth, atol=2e-4 * np.abs(truth).max())
     # those of a question come after them: a gauge that was turned back reads as the others do
     back = ModelPatch((SensorRotation("g9", -0.4),))
-    again = observe(model.remembering(), campaign, campaign.trials[0], back, conditions).values
+    again = observe(model.with_response_cache(), campaign, campaign.trials[0], back, conditions).values
     plain = model.respond(campaign.trials[0], outputs, ModelPatch(), conditions).values
     np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)
     np.testing.assert_array_equal(np.delete(again, 8, axis=1), np.delete(shown, 8, axis=1))

@@ -87,7 +87,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
     stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
     if isinstance(model, SystemModel):
         state = SystemState(tuple(model.prior_mean()), (0.0,) * len(model.regions))
-        stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
+        stiffness, mass = (getattr(model.system_in_state(state), name) for name in ("stiffness", "mass"))
         row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
     loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))
     found = model.scales(campaign(loads, replace(kind.trial(TrialKind.RINGDOWN), start=100.0)))
@@ -155,7 +155,7 @@ def test_rates_are_derivatives(kind: Kind, change: str) -> None:
     """In a motion that is held for 150 ms / pace before its release, at even stamps and with a gap."""
     time = np.delete(0.003 / kind.pace * np.arange(1501), 999 if change == "drift" else -1)
     what = replace(kind.trial(TrialKind.RINGDOWN), time=time)
-    outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.moving]
+    outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.motion_chain]
     outputs += [(name, Quantity(quantity)) for name, quantity in kind.quantities.items() if quantity]
     items = patch.ModelPatch(
         tuple(

@@ -18,7 +18,7 @@ from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.system.lumped_model import LumpedModel
-from discrepancy.system.motion import Motion, motion_of
+from discrepancy.system.motion import Motion, simulate_motion
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.system_state import SystemState
 from fe.runtime import patch as patches
@@ -37,7 +37,7 @@ SQUARE, SHAPES = eigh(STIFFNESS, MASS)
 VISCOUS = MASS @ SHAPES @ np.diag(np.array([0.016, 0.012, 0.012]) * np.sqrt(SQUARE)) @ (MASS @ SHAPES).T
 MOTION = second_order(*(np.linalg.solve(MASS, part) for part in (STIFFNESS, VISCOUS)))
 DISPLACEMENTS = {f"x{k}": Quantity.DISPLACEMENT for k in (1, 2, 3)}
-X3, VELOCITY, ACCELERATION = (("x3", quantity) for quantity in Quantity.DISPLACEMENT.moving)
+X3, VELOCITY, ACCELERATION = (("x3", quantity) for quantity in Quantity.DISPLACEMENT.motion_chain)
 
 
 CHAIN = LumpedModel.load("three_mass_chain")
@@ -132,7 +132,7 @@ def test_a_point_mass_sits_between_places() -> None:
     row = np.array([0.0, 0.25, 0.75])
     wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
     state = SystemState((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
-    np.testing.assert_allclose(CHAIN.system(state).angular_frequency, wanted, rtol=1e-10)
+    np.testing.assert_allclose(CHAIN.system_in_state(state).angular_frequency, wanted, rtol=1e-10)
 
 
 @given(ratios=st.tuples(*[st.floats(0.0, 3.0)] * 3), clock=st.floats(0.0, 0.01))
@@ -193,11 +193,11 @@ def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **h
     system = on_joint(how.pop("modes", 3), beta)
     acts = port_laws(ModelPatch(items), list(system.ports))
     excitation = Excitation(time, time, initial=np.zeros((0, 2)), release=ReleasePoint(row, RELEASE))
-    return motion_of(system, excitation, acts, **how)
+    return simulate_motion(system, excitation, acts, **how)
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
-    return motion.response([OutputEquation.of_row(row) for row in rows]).values
+    return motion.response([OutputEquation.from_row(row) for row in rows]).values
 
 
 LAWS = laws("joint", HOLD, A, 15.0 * A)

@@ -101,7 +101,7 @@ def test_an_unknown_begin_takes_any_state() -> None:
     for quantity, height in ((Quantity.DISPLACEMENT, 3.0), (Quantity.VELOCITY, 3.0 * time[-1])):
         given = campaign(what, h=Channel("h", quantity, "height", None))
         largest = np.sqrt(2.0) * np.array([height, max(height / time[-1], 9.81 * time[-1])])
-        assert model.initial_sizes(given, what) == pytest.approx(largest, rel=1e-9)
+        assert model.initial_state_magnitudes(given, what) == pytest.approx(largest, rel=1e-9)
     found = seen(model, what, HEIGHT, initial=np.sqrt(2.0) * np.array([[3.0, -2.0]]))  # mass-normalised
     np.testing.assert_allclose(found[:, 0], 3.0 - 2.0 * time - 0.5 * 9.81 * time**2, atol=1e-12)
 

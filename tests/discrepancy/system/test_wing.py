@@ -49,7 +49,7 @@ def wing(coarse_patch_arrays: PatchArrays) -> WingModel:
 
 def modes(wing: WingModel, count: int) -> tuple[Any, Any, Any]:
     """Squares, shapes and modal coordinates of the release of `RING`, of the wing as it is believed."""
-    system = wing.system(SystemState(tuple(wing.prior_mean().tolist()), (0.0, 0.0)))
+    system = wing.system_in_state(SystemState(tuple(wing.prior_mean().tolist()), (0.0, 0.0)))
     tip = wing.wing.force_row("tip_load")
     square, shapes = eigh(system.stiffness, system.mass, subset_by_index=[0, count - 1])
     held = np.linalg.solve(system.stiffness, tip)

@@ -373,11 +373,11 @@ def test_a_watch_takes_features_with_their_covariance(file):
     reader, count = MessageReader(scenario), scenario.observation.count
     covariance = np.diag([1e-2, 1e-8, 1e-6, 1.0, 1e-6, 1e-6])
     told = {"frequency_1_Hz": 461.7, "mid_1": None, "modes_4": 4590.0, "covariance": covariance.tolist()}
-    message = reader.message(told)
+    message = reader.read(told)
     np.testing.assert_array_equal(message.observed[:count], [461.7, np.nan, np.nan, 4590.0, np.nan, np.nan])
     np.testing.assert_array_equal(message.observed, packed_row(message.observed[:count], covariance))
     for wrong, sentence in (([1.0], "6 rows of 6"), ((-covariance).tolist(), "eigenvalues of zero or more")):
-        assert sentence in str(reader.message({"covariance": wrong}))
+        assert sentence in str(reader.read({"covariance": wrong}))
 
 
 # ------------------------------------------------------------------ gauges beside those of a structure file

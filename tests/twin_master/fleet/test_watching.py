@@ -204,7 +204,7 @@ def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
                     step, control, *cells = row.split(",")
                     publish(publisher, f"wing-{number}", int(step), control, map(float, cells))
         topics = fleet._sources[0]._topics  # type: ignore[union-attr]
-        if [len(topic.came) for _, topic in sorted(topics.items())] == [STEPS - 3, STEPS]:
+        if [len(topic.payloads) for _, topic in sorted(topics.items())] == [STEPS - 3, STEPS]:
             (north / "wing-2").unlink(missing_ok=True)
             (north / "wing-0" / "published").write_text("")
             for lost in fleet._lost.values():
@@ -236,7 +236,7 @@ def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
-    monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
     heard, notes, told = list[dict[str, Any]](), list[str](), list[tuple[str, int, bool]]()
@@ -245,7 +245,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
         """Return seconds that pass with the decisions, and not with the clock of a machine that is busy."""
         return 1.0 if watch.folder.name == "two" and len(told) > 5 else 0.0
 
-    monkeypatch.setattr(Watch, "silence", property(silence))
+    monkeypatch.setattr(Watch, "seconds_since_step", property(silence))
     client, steps, further = broker.client("client", heard), iter(range(1000)), list[int]()
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
 
@@ -279,7 +279,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
     again = FleetWatch(planned, tmp_path / "out", lambda *_: None, notes.append, steps=1)
     again.run(end)
     topics = again._sources[0]._topics  # type: ignore[union-attr]
-    assert [len(topic.came) for topic in topics.values()] == [0, 0]
+    assert [len(topic.payloads) for topic in topics.values()] == [0, 0]
     wait_until(lambda: states()[-1] == "ended")
     client.disconnect()
     silent = [said for said in told if said[0] == "north/two"]

@@ -10,8 +10,10 @@ from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t,
 
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import estimates_of
+from twin_master.learning.draw_posterior import posterior_of_draws
 from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter, posterior_of_draws, quantiles_of
+from twin_master.learning.learning_filter import LearningFilter
+from twin_master.learning.mixture_quantiles import mixture_quantiles
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
@@ -257,7 +259,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
 def test_quantiles_are_those_of_the_mixture():
     weight, mean, deviation = np.array([0.5, 0.3, 0.2]), np.array([0.0, 4.0, 5.0]), np.array([1.0, 0.5, 0.0])
     levels = np.array([0.025, 0.5, 0.9])
-    result = quantiles_of(weight, mean[:, None], deviation[:, None], levels)
+    result = mixture_quantiles(weight, mean[:, None], deviation[:, None], levels)
     reached = norm.cdf((result[:2] - mean[:2]) / deviation[:2]) @ weight[:2]
     np.testing.assert_allclose(reached, levels[:2], atol=1e-4)
     assert result[2, 0] == pytest.approx(5.0, abs=1e-3)
@@ -271,7 +273,7 @@ def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     joint[0, 1, 1] = 1.0
     told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
     expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
-    found = expectation.of_marginals(told, joint, slice(None), None)
+    found = expectation.from_marginals(told, joint, slice(None), None)
     value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
     np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
     spread = np.sqrt(weight @ (value - weight @ value) ** 2)

@@ -147,16 +147,19 @@ def test_the_view_shows_what_was_learnt(folder):
     flight, run = Flight(folder), open_run(folder)
     filtered = run["filtered"].to_dataset()
     flight.update()
-    shown = flight.believed(flight.seen(0, STEPS)).expected
+    shown = flight.beliefs_in(flight.records_of_steps(0, STEPS)).expected
     noise = filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = flight.predicted(flight.seen(STEPS - 1, STEPS)[0]).expected.mean
+    ahead = flight.prediction_after(flight.records_of_steps(STEPS - 1, STEPS)[0]).expected.mean
     assert np.abs((ahead - run["predicted"]["quantity_mean"].values[-1]) / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = flight.believed(flight.seen(0, STEPS)).expected.mean - filtered["quantity_mean"].values
+        error = (
+            flight.beliefs_in(flight.records_of_steps(0, STEPS)).expected.mean
+            - filtered["quantity_mean"].values
+        )
         return float(np.abs(error / noise).max())
 
     residual = (run["observed"]["strain"].values - filtered["quantity_mean"].values) / noise

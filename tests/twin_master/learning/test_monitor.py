@@ -13,13 +13,13 @@ from scipy.stats import t as student
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import changed_scenario, estimates_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.learning import rivals
+from twin_master.learning import hypothesis_weights
+from twin_master.learning.hypothesis_weights import HypothesisWeights
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.rivals import Shares
 from twin_master.mission.journal import encode_line, step_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import MissionStep, Reading
-from twin_master.network.estimator import Words
+from twin_master.network.estimator import NoticeWording
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.twin import TwinStep
 from twin_master.scenario.tables import Learning, Noticing
@@ -60,7 +60,9 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     inner = ExactFilter(model, sensors)
     seen = drawn(np.random.default_rng(3), 12)
     seen[6:, 1] *= 1.4
-    words = Words(names=("root", "spar", "tip"), command="")  # of an asset where none looks for causes
+    words = NoticeWording(
+        names=("root", "spar", "tip"), command=""
+    )  # of an asset where none looks for causes
     watched = estimates_of(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
     for step, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
         # The filter goes on as if it were alone, and the evidence is the model's.
@@ -101,64 +103,64 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
 
 def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
-    shares = Shares.at_first(0.01, begins, 0, 1)
-    np.testing.assert_allclose(np.exp(shares.current), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
-    hazard, ends, chain = 0.03, rivals.ENDS, np.zeros((7, 7))
+    weights = HypothesisWeights.initial(0.01, begins, 0, 1)
+    np.testing.assert_allclose(np.exp(weights.current), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
+    hazard, ends, chain = 0.03, hypothesis_weights.END_PROBABILITY, np.zeros((7, 7))
     chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
     chain[0, 0] = 1.0 - hazard
     chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
     chain[2:, 1], chain[range(2, 7), range(2, 7)] = ends, 1.0 - ends
-    expected = np.exp(shares.current)
+    expected = np.exp(weights.current)
     for _ in range(40):
         went = ends * expected[2:]
         expected = expected @ chain
-        ended = shares.advance(np.log(hazard), begins)
-        np.testing.assert_allclose(np.exp(shares.current), expected, rtol=1e-3)
+        ended = weights.advance(np.log(hazard), begins)
+        np.testing.assert_allclose(np.exp(weights.current), expected, rtol=1e-3)
         np.testing.assert_allclose(ended / ended.sum(), went / went.sum(), rtol=1e-3)
-    assert np.exp(shares.current).sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.exp(weights.current).sum() == pytest.approx(1.0, abs=1e-12)
 
 
-def two_controls() -> tuple[Shares, Float]:
-    """Return shares under the second of two controls with a fault that is nearly sure, and its priors."""
+def two_controls() -> tuple[HypothesisWeights, Float]:
+    """Return weights under the second of two controls with a fault that is nearly sure, and its priors."""
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
-    shares = Shares.at_first(0.5, begins, 1, 2)
-    shares.weigh(np.array([0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
-    return shares, begins
+    weights = HypothesisWeights.initial(0.5, begins, 1, 2)
+    weights.update(np.array([0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
+    return weights, begins
 
 
 def test_a_change_of_control_neither_makes_nor_mends_a_fault():
-    shares, _ = two_controls()
-    before = shares.none_of_these
-    shares.change_control(1, 0)
-    assert shares.none_of_these == pytest.approx(before, abs=1e-12)
-    assert np.exp(shares.hidden[0]) == pytest.approx(rivals.SHOWS_ELSEWHERE * before, abs=1e-12)
+    weights, _ = two_controls()
+    before = weights.free_gains_probability
+    weights.change_control(1, 0)
+    assert weights.free_gains_probability == pytest.approx(before, abs=1e-12)
+    assert np.exp(weights.hidden[0]) == pytest.approx(hypothesis_weights.SHOWS_ELSEWHERE * before, abs=1e-12)
 
 
 def test_a_fault_does_not_fade_under_a_control_that_cannot_show_it():
-    shares, begins = two_controls()
-    shares.change_control(1, 0)
+    weights, begins = two_controls()
+    weights.change_control(1, 0)
     right_now = np.array([0.0, 0.0, -3.0, -3.0, -3.0, -3.0, -3.0])  # what shows predicts worse
     for _ in range(200):
-        shares.advance(np.log(1e-4), begins)
-        shares.weigh(right_now)
-    assert shares.none_of_these > 0.9
-    shares.change_control(0, 1)
-    assert np.exp(shares.current[rivals.NONE]) > 0.9
+        weights.advance(np.log(1e-4), begins)
+        weights.update(right_now)
+    assert weights.free_gains_probability > 0.9
+    weights.change_control(0, 1)
+    assert np.exp(weights.current[hypothesis_weights.FREE_GAINS]) > 0.9
 
 
 def test_a_fault_that_showed_under_a_control_is_mended_by_that_control():
-    shares, begins = two_controls()
-    shares.change_control(1, 0)
+    weights, begins = two_controls()
+    weights.change_control(1, 0)
     for log_ratio in (5.0, -5.0):  # it shows there for a while, then no more
         for _ in range(20):
-            shares.advance(np.log(1e-4), begins)
-            shares.weigh(np.array([0.0, 0.0, log_ratio, 0.0, 0.0, 0.0, 0.0]))
-    assert shares.none_of_these < 0.01
+            weights.advance(np.log(1e-4), begins)
+            weights.update(np.array([0.0, 0.0, log_ratio, 0.0, 0.0, 0.0, 0.0]))
+    assert weights.free_gains_probability < 0.01
 
 
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_steps(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
-    monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
+    monkeypatch.setattr("twin_master.learning.fault_filter._GAIN_DEVIATIONS", (0.0,) * 4)
     steps, seen = 4, drawn(np.random.default_rng(8), 4)
     seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole step
     known = Noticing(noise_degrees=1e9, onset_steps=3.0)
@@ -212,7 +214,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
     model, sensors = small(1)
     kept = today.carried.arrays
     belief = kept["notice/model"] @ model.transition.matrix[0]
-    places, value = estimator._value[0][:, :, 0], sensors.value_per_draw[:, :, 0, 0]
+    places, value = estimator._faults._value[0][:, :, 0], sensors.value_per_draw[:, :, 0, 0]
     np.testing.assert_array_equal(places, value)
     degrees = SETTINGS.noise_degrees + float(kept["notice/count"][0])
     scale = np.sqrt((SETTINGS.noise_degrees + kept["notice/model_squares"][0]) / degrees)
@@ -281,7 +283,7 @@ def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
 
 
 def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
-    monkeypatch.setattr("twin_master.learning.monitor._LARGEST", 71)
+    monkeypatch.setattr("twin_master.learning.fault_filter._MOST_BELIEF_NUMBERS", 71)
     with pytest.raises(InvalidModelError, match=r"3 states and 2 draws for each of 12 faults .* leave out"):
         watchful()
 
@@ -361,10 +363,10 @@ def test_belief_and_decision_follow_what_holds_now(between):
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
     wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
-    assert wing.scenario.control_names[wing.safest_control] == "2g"
+    assert wing.scenario.control_names[wing.safest] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
-    assert named.scenario.control_names[named.safest_control] == "3g"
+    assert named.scenario.control_names[named.safest] == "3g"
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
     steps = [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]

@@ -39,7 +39,7 @@ from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.mission.sensor_design import DrawnReadings, choose_sensors, draw_readings, level_separations
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
-from twin_master.network.planner import BeliefPolicy, rationed
+from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.transition import TransitionModel
 from twin_master.plan_command import _without_information
 from twin_master.run_folder import read_scenario
@@ -104,7 +104,7 @@ def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_step():
     levels = known.model.states.coordinates[:, 0]
     assert seen == pytest.approx(norm.logpdf(0.37, levels, 0.1))
     assert not known.sensor_model.log_likelihood(row[:24], INSPECT).any()
-    drawn = known.sensor_model.sampled(np.zeros(9, dtype=int), 0, np.random.default_rng(0))  # type: ignore[attr-defined]
+    drawn = known.sensor_model.draw_observations(np.zeros(9, dtype=int), 0, np.random.default_rng(0))  # type: ignore[attr-defined]
     assert np.isnan(drawn[:, 24:]).all()
 
 
@@ -119,7 +119,9 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
     rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
     controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]
-    rows = [sensors.sampled(states[[step]], control, rng)[0] for step, control in enumerate(controls)]
+    rows = [
+        sensors.draw_observations(states[[step]], control, rng)[0] for step, control in enumerate(controls)
+    ]
     seen = np.where(gauges | (np.arange(26) >= 24), rows, np.nan)
     expected = estimates_of(exact, seen, controls)
     for estimator in others:
@@ -244,7 +246,7 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most():
     model = replace(known.model, transition=TransitionModel((np.tile(np.eye(4), (5, 1, 1)),)))
     chosen = plan.policy.decide(ahead)
     wanting = np.flatnonzero(chosen == INSPECT)
-    few = rationed(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
+    few = ration_controls(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
     value = plan.policy.action_value(ahead, 5)
     other = np.delete(value, INSPECT, axis=1).max(axis=1)
     gain = value[:, INSPECT] - other

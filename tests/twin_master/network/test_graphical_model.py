@@ -57,7 +57,7 @@ def test_what_a_table_changes_by_within_an_interval_is_that_of_a_quadrature(step
     states = StateSpace((Factor("a", tuple(levels)), Factor("b", (1.0, 2.0))))
     along = np.array(values[: len(levels)])
     table = along[:, None, None] * [[1.0, 0.0], [1.0, 3.0]]  # (a, b, sensor)
-    found = states.within_interval(table.reshape(-1, 2)).reshape(len(levels), 2, 2, 2)
+    found = states.change_within_interval(table.reshape(-1, 2)).reshape(len(levels), 2, 2, 2)
     half = np.concatenate([levels[:1], 0.5 * (levels[1:] + levels[:-1]), levels[-1:]])
     for k, level in enumerate(levels):
         at = half[k] + (half[k + 1] - half[k]) * (np.arange(20000) + 0.5) / 20000
@@ -213,7 +213,7 @@ def test_filter_and_smoother_equal_arbitrary_precision(seed, scale, steps, shift
     model = random_model(rng, shape=(2, 3), zeros=0.0 if ruled_out else 0.6, product=product)
     assert model.transition.is_product is product
     value, matrix = rng.normal(size=6), model.transition.matrix[1]
-    np.testing.assert_allclose(model.transition.expected(1, value), matrix @ value, atol=1e-14)
+    np.testing.assert_allclose(model.transition.expected_value(1, value), matrix @ value, atol=1e-14)
     control = rng.integers(0, 2, steps)
     log_likelihood = rng.normal(size=(steps, 6)) * scale + shift
     log_likelihood[rng.random(steps) < 0.3] = 0.0

@@ -11,18 +11,15 @@ from scipy.stats import multivariate_normal, norm
 
 from benchmarks.studies.planning import PROBLEMS, tiger
 from twin_master.errors import InvalidModelError, InvalidObservationError, PlanningError
-from twin_master.network import belief_planning
-from twin_master.network.belief_planning import (
-    DecisionProblem,
-    leaving_probability,
-    plan_on_belief,
-    simulated_returns,
-)
+from twin_master.network import simulated_missions
+from twin_master.network.belief_planning import plan_on_belief
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.identified import IdentifiedSensorModel
 from twin_master.network.inference import known_control
-from twin_master.network.planner import BeliefPolicy, given_policy, value_iteration
+from twin_master.network.planner import BeliefPolicy, evaluate_policy, value_iteration
 from twin_master.network.quantity import QuantityModel, RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.simulated_missions import leaving_probability, simulated_returns
 from twin_master.network.transition import TransitionModel
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -108,7 +105,7 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
     apart = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
     np.testing.assert_allclose(printed.log_likelihood(observation, 1), apart, **close)
 
-    near = model.nearest(observation, 1, values[:, :, 1])
+    near = model.fit_within_interval(observation, 1, values[:, :, 1])
     rest = norm.logpdf(observation, near.value, deviation)[..., seen].sum(axis=-1)
     np.testing.assert_allclose((rest + near.log_density).T, each, **close)
     sensor = int(np.flatnonzero(seen)[0])
@@ -117,8 +114,10 @@ def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
         gain = np.linalg.solve(covariance[s, 1][np.ix_(others, others)], covariance[s, 1][others, sensor])
         mean = values[:, s, 1, sensor] + (observation[others] - values[:, s, 1, others]) @ gain
         variance = covariance[s, 1, sensor, sensor] - gain @ covariance[s, 1][others, sensor]
-        np.testing.assert_allclose(near.alone[:, s, sensor], mean, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(deviation[sensor] ** 2 / near.left[s, sensor], variance, rtol=1e-5)
+        np.testing.assert_allclose(near.value_by_others[:, s, sensor], mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            deviation[sensor] ** 2 / near.one_minus_leverage[s, sensor], variance, rtol=1e-5
+        )
 
 
 def random_values(seed, ties=False):
@@ -212,7 +211,7 @@ def test_the_value_is_optimal_and_that_of_its_policy(seed, discount, of_blocks):
     for policy in (np.random.default_rng(seed).dirichlet(np.ones(3), 6), plan.policy):
         closed_loop = discount * np.einsum("su,ust->st", policy, transition)
         exact = np.linalg.solve(np.eye(6) - closed_loop, (policy * reward).sum(axis=1))
-        found = given_policy(model, reward, discount, policy)
+        found = evaluate_policy(model, reward, discount, policy)
         np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11 * scale)
     action_value = reward + discount * np.einsum("ust,t->su", transition, plan.value)
@@ -419,7 +418,7 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first, worth):
 
 
 def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
-    monkeypatch.setattr(belief_planning, "LIVES", 4000)
+    monkeypatch.setattr(simulated_missions, "LIVES", 4000)
     problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
     vectors = 0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]])
     policy = BeliefPolicy(vectors, np.array([1, 0, 2]))
@@ -427,7 +426,7 @@ def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypat
     def leaves(belief: np.ndarray, steps: int) -> float:
         if policy.decide(belief) != 1:
             return 1.0
-        after = problem.following(belief, 1) if steps > 1 else np.zeros((0, 4))
+        after = problem.next_beliefs(belief, 1) if steps > 1 else np.zeros((0, 4))
         return float(sum(row.sum() * leaves(row / row.sum(), steps - 1) for row in after))
 
     beliefs = rng.dirichlet(np.ones(4), 5)

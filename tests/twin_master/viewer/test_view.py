@@ -27,7 +27,8 @@ from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, encode_line
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
+from twin_master.viewer.flight import Flight, StepBeliefs
+from twin_master.viewer.flight_page import LATEST, FlightPage, Request
 from uav_twin import fly, load_scenario, open_run
 
 STEPS = 50
@@ -61,9 +62,9 @@ def add(folder: Path, *content: bytes) -> None:
         file.writelines(content)
 
 
-def of_steps(flight: Flight, first: int, end: int) -> Belief:
+def of_steps(flight: Flight, first: int, end: int) -> StepBeliefs:
     """Return what the twin believed of steps when they were flown."""
-    return flight.believed(flight.seen(first, end))
+    return flight.beliefs_in(flight.records_of_steps(first, end))
 
 
 def asked(first: int = 0, end: int = 0, step: int = LATEST, **changed: int) -> Request:
@@ -74,7 +75,10 @@ def asked(first: int = 0, end: int = 0, step: int = LATEST, **changed: int) -> R
 def test_every_number_is_that_of_the_run(run):
     flight, stored = viewed(run), open_run(run)
     assert flight.steps == STEPS
-    believed, expected = of_steps(flight, 0, STEPS), flight.predicted(flight.seen(28, 29)[0])
+    believed, expected = (
+        of_steps(flight, 0, STEPS),
+        flight.prediction_after(flight.records_of_steps(28, 29)[0]),
+    )
     for belief, group, part, control in (
         (believed, "filtered", slice(None), "decision_probability"),
         (expected, "predicted", 28, "control_probability"),
@@ -89,7 +93,9 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_allclose(believed.expected.standard_deviation, deviation, rtol=1e-9)
     noise = stored["filtered"]["noise_standard_deviation"].values
     np.testing.assert_allclose(believed.expected.noise, noise, rtol=1e-9)
-    np.testing.assert_array_equal(flight.truth(flight.seen(0, STEPS)), stored["truth"]["state"].values)
+    np.testing.assert_array_equal(
+        flight.true_states_in(flight.records_of_steps(0, STEPS)), stored["truth"]["state"].values
+    )
 
 
 def test_steps_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
@@ -106,7 +112,7 @@ def test_steps_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_the
     flight.update()
     assert (flight.steps, flight.number) == (10, number + 1)
     # A viewer that holds the twenty steps is told all ten again.
-    answer = told(Teller(flight), 0, 20, flight=number, shown=19, count=20)
+    answer = told(FlightPage(flight), 0, 20, flight=number, shown=19, count=20)
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
     add(begun, lines[11].replace(b'"step": 10', b'"step": 11'), *lines[12:])
     with pytest.raises(RunFolderError, match=r"line 12 of the journal .* was changed or is damaged"):
@@ -124,8 +130,10 @@ def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
     assert flight.update()
     assert (flight.steps, flight.number) == (10, number + 1)
     expected = [step["observed"] for step in steps[:10]]
-    np.testing.assert_array_equal(flight.observed(flight.seen(0, 10)), np.array(expected, dtype=float))
-    last = [step["filtered"] for step in flight.seen(8, 10)]
+    np.testing.assert_array_equal(
+        flight.observations_in(flight.records_of_steps(0, 10)), np.array(expected, dtype=float)
+    )
+    last = [step["filtered"] for step in flight.records_of_steps(8, 10)]
     assert last == [steps[8]["filtered"], steps[20]["filtered"]]
     add(begun, *map(encode_line, [{"model": {}}, *steps[10:20]]))
     assert viewed(begun).steps == 20
@@ -136,7 +144,7 @@ def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
     journal = begun / JOURNAL_NAME
     journal.rename(begun / "before")
     journal.write_bytes(b"".join(lines[:4]))  # another flight
-    assert Teller(flight).answer(asked()) is None  # until it is seen
+    assert FlightPage(flight).answer(asked()) is None  # until it is seen
     assert flight.update()
     assert flight.steps == 3
 
@@ -150,14 +158,14 @@ def test_without_what_the_twin_knew_nothing_is_shown(begun, content):
         Flight(begun)
 
 
-def told(teller: Teller, *words: int, **changed: int) -> dict[str, Any]:
+def told(teller: FlightPage, *words: int, **changed: int) -> dict[str, Any]:
     answer: dict[str, Any] = json.loads(str(teller.answer(asked(*words, **changed))))
     return answer
 
 
 def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     flight = viewed(run)
-    teller = Teller(flight)
+    teller = FlightPage(flight)
     everything = told(teller)
     assert (everything["step"], everything["first"], everything["count"]) == (STEPS - 1, 0, STEPS)
     number = everything["flight"]
@@ -174,7 +182,7 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     mean = flight.knowledge.model.states.mean(believed.probability)
     wide = np.hypot(believed.expected.standard_deviation, believed.expected.noise)
     np.testing.assert_allclose(past["state"], 100.0 * mean)
-    np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(flight.seen(0, 29)))
+    np.testing.assert_allclose(past["observed"], 1e6 * flight.observations_in(flight.records_of_steps(0, 29)))
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
     np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * wide)
     assert np.min(past["state_lower"]) >= 0.0

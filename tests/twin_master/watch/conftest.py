@@ -28,10 +28,13 @@ from twin_master.mission.steps import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
-from twin_master.watch.feeds import PASSWORD_VARIABLE, CsvFeed
+from twin_master.watch.broker_address import PASSWORD_VARIABLE
+from twin_master.watch.csv_feed import CsvFeed
+from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Counts, Feed
-from twin_master.watch.opening import begun_watch
+from twin_master.watch.intake import Counts
+from twin_master.watch.opening import begin_watch
+from twin_master.watch.result import store_watch
 
 
 def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
@@ -49,7 +52,7 @@ def begun(base: Watch, folder: Path) -> Watch:
     """Return a watch of the same configuration in a folder of its own, without calibrating again."""
     shutil.copytree(base.folder, folder)
     watch = copy.copy(base)
-    watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
+    watch.folder, watch.journal_path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
     return watch
 
 
@@ -57,14 +60,14 @@ def watchful(base: Watch, folder: Path) -> Watch:
     watch = begun(base, folder)
     watch.scenario = watch.scenario.model_copy(update={"notice": Noticing()})
     watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=watch.scenario))]
-    watch._take_up()
+    watch.update_from_journal()
     return watch
 
 
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
     """Run a watch up to each number of steps (None: to the end); return the last counts."""
     for steps in stops or (None,):
-        counts = watch.run(feed, lambda _decision: time.sleep(pause), steps=steps)
+        counts = watch.run(feed, lambda _decision: time.sleep(pause), step_limit=steps)
     return counts
 
 
@@ -199,7 +202,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
 def mission(base: Watch) -> History:
     """The paper's mission, flown by the model that the watch believes."""
     knowledge = replace(base.models[0].knowledge, scenario=load_scenario("paper_level_turns").scenario)
-    return flight_of(knowledge, base._source, seed=knowledge.scenario.mission.seed)
+    return flight_of(knowledge, base.source, seed=knowledge.scenario.mission.seed)
 
 
 @pytest.fixture(scope="session")
@@ -220,7 +223,7 @@ def plain(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
     """A watch that has seen nothing."""
     folder = tmp_path_factory.mktemp("base") / "watch"
-    with begun_watch(scenario.scenario, scenario.file, folder, SilentProgress()) as watch:
+    with begin_watch(scenario.scenario, scenario.file, folder, SilentProgress()) as watch:
         return watch
 
 
@@ -241,7 +244,7 @@ def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory)
     """Folder of the watch of the whole mission."""
     folder = tmp_path_factory.mktemp("whole") / "watch"
     watch = begun(base, folder)
-    watch.store(ran(watch, CsvFeed(recorded, watch.scenario)))
+    store_watch(watch, ran(watch, CsvFeed(recorded, watch.scenario)))
     return folder
 
 

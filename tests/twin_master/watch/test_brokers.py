@@ -17,7 +17,8 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, mosquitto, ran, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
-from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, CsvFeed, broker_of
+from twin_master.watch.broker_address import PASSWORD_VARIABLE, Broker, parse_broker
+from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed, Topic
@@ -38,7 +39,7 @@ def address(broker: Mosquitto) -> str:
 
 
 def where_of(broker: Mosquitto) -> Broker:
-    return broker_of(address(broker))
+    return parse_broker(address(broker))
 
 
 def message(step: int, **others: object) -> str:
@@ -55,7 +56,7 @@ def watching(where: Broker, watch: Watch, steps: int) -> Iterator[list[str]]:
     """Watch so many steps in a thread, from when the twin is connected on; yields what it notes."""
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
-    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"steps": steps})
+    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"step_limit": steps})
     thread.start()
     wait_until(lambda: notes)
     yield notes
@@ -77,7 +78,7 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
 @pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
 def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
     secure, steps = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
-    where = broker_of(secure, broker.authority) if broker.tls else where_of(broker)
+    where = parse_broker(secure, broker.authority) if broker.tls else where_of(broker)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
@@ -124,7 +125,7 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
 
     def run(steps: int, note: Any = str) -> None:
         feed = MqttFeed(where, watch, note)
-        watch.run(feed, str, steps=steps)
+        watch.run(feed, str, step_limit=steps)
         feed.close()
 
     run(1, lambda _note: publish(listener, *range(steps)))  # all but the first wait at the broker
@@ -161,13 +162,13 @@ def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watc
         sent.append(decision)
         return len(sent)
 
-    topic = Topic(SimpleNamespace(behind={}, room=True, send=send), TOPIC, watch.scenario, str)
-    topic.begun(watch)
+    topic = Topic(SimpleNamespace(publishers={}, can_send=True, send=send), TOPIC, watch.scenario, str)
+    topic.attach(watch)
     topic.publish()
-    topic.answered(1, None)
+    topic.note_answer(1, None)
     first, *_ = records(watch.folder / JOURNAL_NAME)
     assert int(published.read_text()) == first[2]
-    topic.go_back()  # as where the broker is lost
+    topic.resend_unacknowledged()  # as where the broker is lost
     topic.publish()
     assert [decision["step"] for decision in sent] == [0, 1, 2, 1, 2]
 
@@ -183,7 +184,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
             publish(publisher, *sent)
 
         feed = MqttFeed(where_of(broker), watch, note)
-        counts = watch.run(feed, str, steps=steps)
+        counts = watch.run(feed, str, step_limit=steps)
         feed.close()
         return counts
 
@@ -275,15 +276,15 @@ def test_a_subscription_that_is_refused(watch, broker, tmp_path):
     broker.further += ["allow_anonymous true", f"plugin {RIGHTS_PLUGIN}"]
     broker.further += [f"plugin_opt_config_file {tmp_path / 'rights.json'}"]
     broker.again()
-    feed = MqttFeed(broker_of(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}"), watch, str)
+    feed = MqttFeed(parse_broker(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}"), watch, str)
     with pytest.raises(MissionInputError, match=r"does not let the twin read wing/7: Not authorized"):
         watch.run(feed, str)
 
 
 @pytest.mark.parametrize(("wrong", "sentence"), Inputs(__file__).refused("addresses"))
 def test_addresses_of_brokers(tmp_path, wrong, sentence):
-    assert broker_of("mqtt://host/a/b").port == 1883
-    assert broker_of("mqtts://me%40work@host:1/a").user == "me@work"
+    assert parse_broker("mqtt://host/a/b").port == 1883
+    assert parse_broker("mqtts://me%40work@host:1/a").user == "me@work"
     (tmp_path / "authority.pem").write_text("no certificate")
     with refused(MissionInputError, sentence):
-        broker_of(wrong, tmp_path / "authority.pem" if sentence.startswith("authority") else None)
+        parse_broker(wrong, tmp_path / "authority.pem" if sentence.startswith("authority") else None)

@@ -13,8 +13,9 @@ from tests.twin_master.runs import journal, with_former_names
 from tests.twin_master.watch.conftest import begun, ran, viewed, watchful, write_csv
 from tests.twin_master.watch.test_teaching import tutor
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.feeds import CsvFeed, FolderFeed
+from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.message import Message, MessageReader, Refused
+from twin_master.watch.recorded_feeds import FolderFeed
 
 SENTENCE = "`turn` is now called `step`"
 
@@ -38,12 +39,12 @@ def test_a_journal_of_an_earlier_version_is_read_and_gone_on_with(base, loose, t
     """Also in the middle of a search, of the trial of a patch, and behind its adoption."""
     (tmp_path / "whole").mkdir()
     whole = watchful(base, tmp_path / "whole" / "watch")
-    whole.run(CsvFeed(loose, whole.scenario), str, tutor(whole, tmp_path, "named", -0.3).act)
+    whole.run(CsvFeed(loose, whole.scenario), str, tutor(whole, tmp_path, "named", -0.3).teach)
     (asked,) = [line["verdict"]["to_step"] for line in journal(whole.folder) if "verdict" in line]
     stopped = watchful(base, tmp_path / "stopped")
     for number, end in enumerate((asked, asked + 5, asked + 15, None)):
-        teach = tutor(stopped, tmp_path, "named", -0.3).act
-        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, steps=end)
+        teach = tutor(stopped, tmp_path, "named", -0.3).teach
+        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
         with_former_names(stopped.folder)
         with pytest.warns(FormerNameWarning, match=SENTENCE) as told:
             stopped = watchful(stopped, tmp_path / str(number))
@@ -55,8 +56,8 @@ def test_a_journal_of_an_earlier_version_is_read_and_gone_on_with(base, loose, t
     former_names._sources_told.clear()
     with pytest.warns(FormerNameWarning, match=SENTENCE):
         flight = viewed(stopped.folder)
-    shown = [step["filtered"] for step in flight.seen(0, flight.steps)]
-    assert shown == [step["filtered"] for step in viewed(whole.folder).seen(0, flight.steps)]
+    shown = [step["filtered"] for step in flight.records_of_steps(0, flight.steps)]
+    assert shown == [step["filtered"] for step in viewed(whole.folder).records_of_steps(0, flight.steps)]
     messages = [message for message, _ in FolderFeed(stopped.folder, stopped.scenario).messages(None)]
     assert [message.step for message in messages if isinstance(message, Message)] == [*range(flight.steps)]
 
@@ -79,9 +80,9 @@ def test_a_message_that_says_turn_is_read(base):
     reader = MessageReader(base.scenario)
     content = [json.dumps({"turn": turn, "strain_1": 1e-3}).encode() for turn in (4, 5)]
     with pytest.warns(FormerNameWarning, match=f"^A message: {SENTENCE}. The former name is still") as told:
-        messages = [reader.message(text) for text in content]
+        messages = [reader.read(text) for text in content]
     assert len(told) == 1
     assert [message.step for message in messages if isinstance(message, Message)] == [4, 5]
-    refusal = reader.message({"turn": 4, "step": 4, "strain_1": 1e-3})
+    refusal = reader.read({"turn": 4, "step": 4, "strain_1": 1e-3})
     assert isinstance(refusal, Refused)
     assert str(refusal) == f"A message: {SENTENCE}, and both are given."

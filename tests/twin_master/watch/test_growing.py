@@ -17,7 +17,7 @@ import pytest
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import ran
 from twin_master.errors import MissionInputError
-from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.message import Message, Refused
 

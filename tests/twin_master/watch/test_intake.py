@@ -19,7 +19,9 @@ from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
 from twin_master.scenario.tables import WatchSection
 from twin_master.watch import feeds
-from twin_master.watch.intake import Feed, Intake
+from twin_master.watch.csv_feed import CsvFeed
+from twin_master.watch.feed import Feed
+from twin_master.watch.intake import Intake
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 from uav_twin import Twin, load_scenario
 
@@ -59,7 +61,7 @@ def message(row: np.ndarray, **others: object) -> bytes:
 def intake_of(
     knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None, feed: Feed | None = None
 ) -> Intake:
-    feed = feed or feeds.json_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
+    feed = feed or feeds.feed_of_json_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
     return Intake(knowledge.scenario, feed, rejected)
 
 
@@ -110,7 +112,7 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
 def test_what_was_refused_behind_the_last_step_is_refused_once_when_it_is_read_again(knowledge, tmp_path):
     path, rejected = tmp_path / "m.csv", tmp_path / "rejected.jsonl"
     path.write_text("step,strain_1\nno,1\n0,1e-4\nno,2\n1,1e-4\nno,3\n")
-    intake = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
+    intake = intake_of(knowledge, [], rejected, CsvFeed(path, knowledge.scenario))
     states = [json.dumps(intake.state()) for _ in operate(knowledge.twin(lag=20), intake)]
     whole = rejected.read_text()
     for cut in ("", '{"message": 7, "rea'):  # a kill may leave half a line
@@ -120,7 +122,7 @@ def test_what_was_refused_behind_the_last_step_is_refused_once_when_it_is_read_a
         assert rejected.read_text() == whole
         assert (live.counts.rejected, live.counts.received) == (3, 4)
         rejected.write_text(whole + cut)
-        again = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
+        again = intake_of(knowledge, [], rejected, CsvFeed(path, knowledge.scenario))
         again.restore(json.loads(states[0]))
         assert [*operate(knowledge.twin(lag=20), again)]
         assert rejected.read_text() == whole
@@ -151,7 +153,7 @@ ANYTHING = st.recursive(
 @given(st.binary(max_size=60) | ANYTHING.map(lambda value: json.dumps(value).encode()))
 def test_anything_is_an_observation_or_refused(content):
     reader = MessageReader(load_scenario("level_turns").scenario)
-    found = reader.message(content)
+    found = reader.read(content)
     assert isinstance(found, Refused) or found.observed.shape == (24,)
     assert isinstance(found, Refused) or not np.isinf(found.observed).any()
 
@@ -159,7 +161,7 @@ def test_anything_is_an_observation_or_refused(content):
 def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
     knowledge, clean, expected, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
+    monkeypatch.setattr("twin_master.watch.rejected.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
     flood = [big, deep, b"\xff\xfe{\n", b"NaN\n", b'{"step": NaN}\n', b'{"step": 1e999}\n'] * 3
@@ -214,9 +216,9 @@ def test_times_stand_for_steps_and_a_clock_that_is_set_after_the_first_spoils_no
 def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     path = tmp_path / "gauges.csv"
 
-    def feed(text: str, scenario: Any = knowledge.scenario) -> feeds.CsvFeed:
+    def feed(text: str, scenario: Any = knowledge.scenario) -> CsvFeed:
         path.write_text(text, encoding="utf-8")
-        return feeds.CsvFeed(path, scenario)
+        return CsvFeed(path, scenario)
 
     def messages(text: str) -> list[Any]:
         return [fed[0] for fed in feed(text).messages(None)]
@@ -241,7 +243,7 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
             np.testing.assert_allclose(fed.observed[~lost], strains[step][~lost], rtol=1e-15)
     read = feed(text)
     assert len(list(islice(read.messages(None), 50))) == 50
-    assert len([*feed(text).messages(read.place)]) == STEPS - 50
+    assert len([*feed(text).messages(read.position)]) == STEPS - 50
     text = "time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n"
     units, infinite, fine = cast(list[Message], messages(text))
     assert units.unreadable == {1: "0.6; give its unit, such as `strain_2_microstrain`"}
@@ -251,7 +253,7 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     assert (whole.step, whole.observed[0]) == (12, 1e-4)
     assert "no number" in str(half)
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
-    refused = feeds.CsvFeed(path, knowledge.scenario).messages(None)
+    refused = CsvFeed(path, knowledge.scenario).messages(None)
     assert all(isinstance(fed[0], Refused) for fed in refused)
     for header, sentence in INPUTS.refused("headers"):
         with pytest.raises(Exception, match=sentence):
@@ -260,12 +262,12 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     ((passed, _),) = feed("step,strian_1,strain_2\n1,2,1e-4\n", allowing).messages(None)
     assert isinstance(passed, Message)
     assert (passed.observed[1], np.isnan(passed.observed).sum(), passed.unreadable) == (1e-4, 23, {})
-    assert MessageReader(allowing).message(b'{"strian_1": 2, "strain_2": 1e-4}').observed[1] == 1e-4
-    together = MessageReader(allowing).message({"strain": [812.0] * 24, "unit": "microstrain"})
+    assert MessageReader(allowing).read(b'{"strian_1": 2, "strain_2": 1e-4}').observed[1] == 1e-4
+    together = MessageReader(allowing).read({"strain": [812.0] * 24, "unit": "microstrain"})
     np.testing.assert_allclose(together.observed, 8.12e-4, rtol=1e-15)
     scenario = load_scenario("pump_wear").scenario
     pump, unit = MessageReader(scenario), scenario.observation.sensor_units[0]
-    assert pump.message({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0
+    assert pump.read({f"{next(iter(pump._sensor_of_name))} [k{unit}]": 2.0}).observed[0] == 2000.0
     for own, unit, size in (
         ("m2", "mm2", 1e-6),
         ("m\N{SUPERSCRIPT THREE}/s", "mm\N{SUPERSCRIPT THREE}/s", 1e-9),
@@ -273,8 +275,8 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     ):
         leak = scenario.observation.model_copy(update={"unit": own})
         reader = MessageReader(scenario.model_copy(update={"observation": leak}))
-        np.testing.assert_allclose(reader.message({f"operation_2 [{unit}]": 3.0}).observed[1], 3.0 * size)
-    refused = MessageReader(allowing).message(b'{"strain_2_bar": 1e-4}')  # a gauge that is there
+        np.testing.assert_allclose(reader.read({f"operation_2 [{unit}]": 3.0}).observed[1], 3.0 * size)
+    refused = MessageReader(allowing).read(b'{"strain_2_bar": 1e-4}')  # a gauge that is there
     assert "`bar` is no unit of sensor 2" in str(refused)
 
 
@@ -299,7 +301,7 @@ def test_an_unreadable_gauge_is_lost_alone_and_named_once(knowledge, strains, tm
     for name in ("list", "names", "csv"):
         twin, state, notices = knowledge.twin(lag=20), None, []
         for part in (slice(0, 5), slice(5, 9)):
-            csv = feeds.CsvFeed(path, knowledge.scenario) if name == "csv" else None
+            csv = CsvFeed(path, knowledge.scenario) if name == "csv" else None
             intake = intake_of(knowledge, lines.get(name, [])[part], feed=csv)
             intake.restore(state)
             for _ in operate(twin, intake):

@@ -15,7 +15,8 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import begun
 from twin_master.errors import ImpossibleObservation
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.watch.feeds import CsvFeed, json_lines
+from twin_master.watch.csv_feed import CsvFeed
+from twin_master.watch.feeds import feed_of_json_lines
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Intake
 
@@ -40,7 +41,7 @@ def decisions_of(watch: Watch, messages: list[Mapping[str, Any]], steps: int | N
     """Return what the operator is told of messages."""
     stream = io.BytesIO("".join(json.dumps(message) + "\n" for message in messages).encode())
     decisions = list[Any]()
-    watch.run(json_lines(watch.scenario, stream), decisions.append, steps=steps)
+    watch.run(feed_of_json_lines(watch.scenario, stream), decisions.append, step_limit=steps)
     return decisions
 
 
@@ -132,14 +133,14 @@ def test_a_counter_that_begins_again_is_told_as_that(watch, mission):
 def test_observations_that_no_state_shows_are_refusals(base, mission):
     """They are refused once their step is assimilated, so that steps go on."""
     text = "".join(json.dumps(line(mission, step, step=step)) + "\n" for step in range(3))
-    intake = Intake(base.scenario, json_lines(base.scenario, io.BytesIO(text.encode())))
+    intake = Intake(base.scenario, feed_of_json_lines(base.scenario, io.BytesIO(text.encode())))
     twin = base.models[0].knowledge.twin(lag=12)
     for step in range(3):
         reading = intake.read(twin)
         assert reading is not None
         predicted = intake.replace_impossible(reading, ImpossibleObservation("wing", step))
         twin.step(predicted.observed, predicted.control)
-    assert "probability zero" in intake.stream.refusals(twin.steps).sentence
+    assert "probability zero" in intake.stream.report_refusals(twin.steps).sentence
     assert intake.complaint().startswith("The watch ended while messages were refused: the last 3 of 3")
 
 
@@ -198,7 +199,7 @@ def test_a_watch_that_was_stopped_anywhere_tells_the_same(base, mission, tmp_pat
     for name, stops in (("whole", (None,)), ("stopped", (1, 3, 4, 6, 8, 10, 12, None))):
         watch = begun(base, tmp_path / name)
         for steps in stops:
-            watch.run(CsvFeed(path, watch.scenario), str, steps=steps)
+            watch.run(CsvFeed(path, watch.scenario), str, step_limit=steps)
         lines = journal(watch.folder)
         told.append([(one["step"], notice) for one in lines for notice in one.get("notices", ())])
     assert told[0] == told[1]

@@ -22,11 +22,20 @@ from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run
-from twin_master.viewer.flight import Request, Teller
-from twin_master.watch.feeds import CsvFeed
-from twin_master.watch.folder import Watch
-from twin_master.watch.teaching import Outcome, Teaching, both_patches, patched_model, policy_change
-from twin_master.watch.tutor import TRIED, Tutor, trial_sentence, verdict_of
+from twin_master.viewer.flight_page import FlightPage, Request
+from twin_master.watch.csv_feed import CsvFeed
+from twin_master.watch.folder import GivenPatch, Watch
+from twin_master.watch.patch_trial import (
+    PatchOutcome,
+    describe_policy_change,
+    merge_patches,
+    patched_model,
+)
+from twin_master.watch.result import notices_since, store_watch
+from twin_master.watch.teaching import Teaching
+from twin_master.watch.tutor import Tutor
+from twin_master.watch.verdicts import TRIED, read_verdict, trial_sentence
+from uav_twin.cause_search import DiscrepancySearch
 
 pytestmark = pytest.mark.xdist_group("teaching")  # one worker makes the wing and its watches
 
@@ -61,14 +70,15 @@ def tutor(
     answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
     answer.write_text(json.dumps([kind, patch_record(SensorGain("g5", gain))]))
     script.write_text(ANSWER)
-    return Tutor(watch, wait=wait, command=(sys.executable, str(script), str(answer), gate))
+    search = DiscrepancySearch(command=(sys.executable, str(script), str(answer), gate))
+    return Tutor(watch, search, wait=wait)
 
 
 def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
     decisions = list[dict[str, Any]]()
-    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).act)
+    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).teach)
     records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
@@ -89,18 +99,22 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     asked = decisions[verdict["to_step"]]  # before anything is taught the gauge is known to be off
     assert asked["decided_by"] == "gauge 5 off"
     assert asked["hypotheses"]["gauge 5 off"] > 0.9
-    assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
-    assert watch.told(asked["step"])[0] == watch.told(0)[0]  # the first alarm also in that of the last steps
+    assert [
+        notice.sentence for _, notice in notices_since(watch, 0)
+    ] == said  # in the report too, though filtered anew
+    assert (
+        notices_since(watch, asked["step"])[0] == notices_since(watch, 0)[0]
+    )  # the first alarm also in that of the last steps
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert viewed(watch.folder).pictures == []  # steps show no motion, and no force in it
+    assert viewed(watch.folder).drawings == []  # steps show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_step"]
     for end in (asked + 5, asked + 15, None):
-        teach = tutor(stopped, tmp_path, "named", -0.3).act
-        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, steps=end)
+        teach = tutor(stopped, tmp_path, "named", -0.3).teach
+        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
         again = watchful(stopped, tmp_path / f"{end}")
         check_same(again.folder, stopped.folder, JOURNAL_NAME)
         stopped = again
@@ -115,19 +129,19 @@ def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(n
     of_gauge(folder, "patch.json", -0.3)
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
     flight = viewed(noticing.folder)
-    before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
-    assert flight.pictures == []  # steps are no motion
+    before, number = flight.beliefs_in(flight.records_of_steps(0, 5)).expected.mean, flight.number
+    assert flight.drawings == []  # steps are no motion
     with pytest.raises(MissionInputError, match="--from-step names one of the 20 steps"):
-        noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
-    given = (folder / "patch.json", 15)
-    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, steps=25, patched=given)
-    noticing.store(counts, report=False)
+        noticing.run(CsvFeed(recorded, noticing.scenario), str, patch=GivenPatch(folder / "patch.json", 21))
+    given = GivenPatch(folder / "patch.json", 15)
+    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, step_limit=25, patch=given)
+    store_watch(noticing, counts, report=False)
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
     figures, residual = figures_of(noticing.folder), run["filtered"]["residual"].values
     assert figures["gap_after_patch_15"] == pytest.approx(np.sqrt(np.nanmean(residual[15:20] ** 2)))
     assert "gap_before_patch_15" in figures
-    before_both = noticing.trial(folder / "patch.json", 10)().record["before"]["rms_residual"]
+    before_both = noticing.trial_of(folder / "patch.json", 10)().record["before"]["rms_residual"]
     assert before_both == pytest.approx(np.sqrt(np.nanmean(residual[10:] ** 2)))
     believed, controls = run["filtered"]["probability"].values, run["observed"]["control_index"].values
     for part, model in zip((slice(15), slice(15, None)), noticing.models, strict=True):
@@ -137,24 +151,24 @@ def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(n
     while flight.update():
         pass
     assert flight.number > number  # what a view has told is void
-    seen = flight.seen(0, 25)
-    shown = flight.believed(seen)
+    seen = flight.records_of_steps(0, 25)
+    shown = flight.beliefs_in(seen)
     np.testing.assert_array_equal(shown.expected.mean[:5], before)  # as it was told
     controls = [step["control_index"] for step in seen]
     for part, model in zip((slice(20), slice(20, None)), noticing.models, strict=True):
         joint = known_control(shown.probability[part], controls[part], 2)
         expected, _ = model.knowledge.sensor_model.moments(joint)
         np.testing.assert_allclose(shown.expected.mean[part], expected, rtol=1e-12)
-    np.testing.assert_array_equal(viewed(noticing.folder).believed(seen).expected.mean, shown.expected.mean)
-    (picture,) = flight.pictures
-    teller = Teller(flight)
-    assert b"<svg" in picture.drawing.read_bytes()
+    np.testing.assert_array_equal(viewed(noticing.folder).beliefs_in(seen).expected.mean, shown.expected.mean)
+    (picture,) = flight.drawings
+    teller = FlightPage(flight)
+    assert b"<svg" in picture.path.read_bytes()
     asked = Request(number=1, flight=-1, first=0, end=0, step=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
     shown = json.loads(str(teller.answer(asked.model_copy(update={"step": 19}))))["picture"]
     assert shown["said"] == "It is so."
-    (picture.drawing.parent.parent / "verdict.json").write_text("{}")
-    assert viewed(noticing.folder).pictures == []
+    (picture.path.parent.parent / "verdict.json").write_text("{}")
+    assert viewed(noticing.folder).drawings == []
 
 
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
@@ -165,7 +179,9 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, steps=40)
+        watch.run(
+            CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).teach, step_limit=40
+        )
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
@@ -193,7 +209,7 @@ def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
 )
 def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp_path, name, passed, caveat):
     gates = [{"name": name, "passed": passed, "reason": "It leaves three noises."}]
-    verdict = verdict_of(verdict_folder(tmp_path / "verdict", gates), tmp_path / "log", 3, 13, "step")
+    verdict = read_verdict(verdict_folder(tmp_path / "verdict", gates), tmp_path / "log", 3, 13, "step")
     assert not verdict["tried"]
     sentence = verdict["notice"]["sentence"]
     assert f"named. A mass is missing. {caveat}" in sentence
@@ -215,7 +231,7 @@ def test_a_group_that_differs_at_other_loads_is_not_tried(tmp_path, members, tri
     effects = [{"patch": ModelPatch((member,)).to_list()} for member in members]
     verdict = {"kind": "group", "sentence": "Either is missing.", "gates": gates, "effects": effects}
     (folder / "verdict.json").write_text(json.dumps({"verdict": verdict}))
-    found = verdict_of(folder, tmp_path / "log", 3, 13, "step")
+    found = read_verdict(folder, tmp_path / "log", 3, 13, "step")
     assert found["tried"] is tried
     assert ("more steps at more than one load may" in found["notice"]["sentence"]) is not tried
 
@@ -233,8 +249,9 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
     script.write_text(ANSWER)
     answer.write_text(json.dumps(["named", patch_record(SensorGain("*", -0.1, "strain"))]))
     watch = watchful(base, tmp_path / "watch")
-    teach = Tutor(watch, wait=True, command=(sys.executable, str(script), str(answer), "-"))
-    watch.run(CsvFeed(saturated, watch.scenario), str, teach.act, steps=30)
+    search = DiscrepancySearch(command=(sys.executable, str(script), str(answer), "-"))
+    teach = Tutor(watch, search, wait=True)
+    watch.run(CsvFeed(saturated, watch.scenario), str, teach.teach, step_limit=30)
     records = journal(watch.folder)
     trial = next(n["sentence"] for r in records for n in r.get("notices", []) if n["kind"] == "trial")
     assert not any("model" in record for record in records)
@@ -247,8 +264,8 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
 def unbelieved(base, saturated, tmp_path_factory) -> tuple[Watch, list[dict[str, Any]]]:
     """A watch that ends while no state explains the gauges, with its decisions."""
     watch, decisions = watchful(base, tmp_path_factory.mktemp("unbelieved") / "watch"), []
-    counts = watch.run(CsvFeed(saturated, watch.scenario), decisions.append, steps=12)
-    watch.store(counts)
+    counts = watch.run(CsvFeed(saturated, watch.scenario), decisions.append, step_limit=12)
+    store_watch(watch, counts)
     assert decisions[-1]["none_of_these"] > 0.5 > decisions[0]["none_of_these"]
     return watch, decisions
 
@@ -274,18 +291,18 @@ def test_report_and_summary_tell_no_state_that_is_not_believed(unbelieved):
 def test_the_page_that_follows_a_flight_shows_no_state_that_is_not_believed(unbelieved):
     watch, _ = unbelieved
     asked = Request(number=1, flight=-1, first=0, end=0, step=-1, shown=-1, count=-1)
-    answer = json.loads(str(Teller(viewed(watch.folder)).answer(asked)))
+    answer = json.loads(str(FlightPage(viewed(watch.folder)).answer(asked)))
     assert answer["past"]["state"][-1] == answer["ahead"]["state"][0] == [None, None]
     assert None not in answer["past"]["state"][0]
 
 
 def test_a_verdict_is_told_also_with_the_step_that_ends_a_silence_and_is_no_decision(noticing, recorded):
     notice = {"kind": "verdict", "sentence": "It is so.", "sensors": []}
-    with noticing.begun(CsvFeed(recorded, noticing.scenario)):
-        noticing.write(verdict={"tried": False, "to_step": 0, "notice": notice})
+    with noticing.begin(CsvFeed(recorded, noticing.scenario)):
+        noticing.write_event(verdict={"tried": False, "to_step": 0, "notice": notice})
         noticing.is_quiet = True
         kinds = [[told["kind"] for told in next(noticing.decisions())["notices"]] for _ in range(2)]
-        noticing.write(verdict={"tried": False, "to_step": 1, "notice": notice})
+        noticing.write_event(verdict={"tried": False, "to_step": 1, "notice": notice})
         assert noticing.last_decision()["step"] == 1
     assert kinds == [["verdict", "heard"], []]
 
@@ -294,7 +311,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
     noticing, mission, loose, tmp_path, monkeypatch
 ):
     """It is built beside them, and believed behind the step that the journal says, to the bit."""
-    monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
+    monkeypatch.setattr("uav_twin.cause_search.NICENESS", 0)
     gate = tmp_path / "gate"
     live = tutor(noticing, tmp_path, "group", -0.3, str(gate), wait=False)
 
@@ -305,7 +322,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
         if decision["step"] == 45:  # and those behind the trial while the model was built
             wait_until(lambda: live.outcome is not None and live.outcome.done())
 
-    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.act)
+    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.teach)
     model = next(record for record in journal(noticing.folder) if "model" in record)
     verdict = next(record["verdict"] for record in journal(noticing.folder) if "verdict" in record)
     assert (verdict["step"], model["step"]) == (32, 45)
@@ -322,7 +339,9 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
         believed = twin.step(row, control).filtered.tolist()
     assert journal(noticing.folder)[-1]["filtered"] == believed
     again = watchful(noticing, tmp_path / "again")
-    twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
+    twins = [
+        replay(one.journal_path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)
+    ]
     assert twins[0].save_state() == twins[1].save_state()
 
 
@@ -330,13 +349,13 @@ def test_a_policy_that_changes_is_told(base):
     known = base.models[0].knowledge
     states, sharp = known.model.states, known.scenario.control_names.index("3g")
     z1, z2 = states.coordinates.T
-    assert policy_change(known, known) == ""
+    assert describe_policy_change(known, known) == ""
     policy = np.eye(2)[np.where((z1 > 0.5) & (z2 > 0.1), 1 - sharp, sharp)]
-    sentence = policy_change(known, replace(known, policy=policy))
+    sentence = describe_policy_change(known, replace(known, policy=policy))
     assert sentence == (
         "With it another control is chosen in 2 of 25 states, first 3g in the place of 2g at z1 60 %, z2 0 %."
     )
-    outcome = Outcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
+    outcome = PatchOutcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_step": 3}, outcome, "step").endswith(f". {sentence}")
 
@@ -376,31 +395,31 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_steps():
     teaching = Teaching(100.0)
     alarm = {"kind": "alarm", "sentence": "a", "since": 3}
     for number in range(12):
-        teaching.take(step(number, 10.0, *([alarm] if number == 5 else [])))
+        teaching.take_line(step(number, 10.0, *([alarm] if number == 5 else [])))
     for number in (12, 13, 14, 15):
-        teaching.take(step(number, math.log(100.0) - 0.1))
-    assert teaching.question is None  # it did not hold ten steps after the alarm
-    teaching.take(step(16, math.log(100.0)))
-    assert teaching.question == (3, 16)
+        teaching.take_line(step(number, math.log(100.0) - 0.1))
+    assert teaching.steps_to_search is None  # it did not hold ten steps after the alarm
+    teaching.take_line(step(16, math.log(100.0)))
+    assert teaching.steps_to_search == (3, 16)
     told = {"kind": "verdict", "sentence": "v"}
-    teaching.take({"step": 16, "verdict": {"to_step": 16, "step": 16, "tried": False, "notice": told}})
-    assert teaching.question is None
-    assert teaching.untold == [told]
+    teaching.take_line({"step": 16, "verdict": {"to_step": 16, "step": 16, "tried": False, "notice": told}})
+    assert teaching.steps_to_search is None
+    assert teaching.pending_notices == [told]
     for number in range(17, 40):
-        teaching.take(step(number, 10.0))
-        assert (teaching.question is not None) == (number >= 27)
-    assert teaching.question == (3, 27)
-    assert teaching.untold == []
-    teaching.take({"step": 40, "model": {"from_step": 8, "notice": told, "alarms": [alarm]}})
-    assert (teaching.question, teaching.untold) == (None, [told, alarm])
+        teaching.take_line(step(number, 10.0))
+        assert (teaching.steps_to_search is not None) == (number >= 27)
+    assert teaching.steps_to_search == (3, 27)
+    assert teaching.pending_notices == []
+    teaching.take_line({"step": 40, "model": {"from_step": 8, "notice": told, "alarms": [alarm]}})
+    assert (teaching.steps_to_search, teaching.pending_notices) == (None, [told, alarm])
     for number in range(41, 60):
-        teaching.take(step(number, 10.0))
-    assert teaching.question == (8, 49)  # the alarm of the new model, and not before it was believed
+        teaching.take_line(step(number, 10.0))
+    assert teaching.steps_to_search == (8, 49)  # the alarm of the new model, and not before it was believed
 
 
 def test_a_second_patch_stands_beside_the_first(tmp_path):
     first, second = (of_gauge(tmp_path, channel, -0.1, channel) for channel in ("g5", "g7"))
-    both = json.loads(both_patches(first, second))
+    both = json.loads(merge_patches(first, second))
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
     assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
-    assert both_patches(None, second) == second.read_bytes()
+    assert merge_patches(None, second) == second.read_bytes()

@@ -28,10 +28,13 @@ from twin_master.mission.journal import JOURNAL_NAME, record_of_line
 from twin_master.mission.replay import BelievedModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed, json_lines
+from twin_master.watch.csv_feed import CsvFeed
+from twin_master.watch.feed import Feed
+from twin_master.watch.feeds import feed_of_json_lines, file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Feed
-from twin_master.watch.opening import flown, resumed_watch
+from twin_master.watch.opening import copy_of_run_until, resume_watch
+from twin_master.watch.recorded_feeds import FolderFeed
+from twin_master.watch.result import notices_since, store_watch
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
@@ -75,13 +78,13 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp
     with pytest.raises(MissionInputError, match="holds no journal"):
         file_feed(tmp_path, base.scenario)
     before = (whole / JOURNAL_NAME).read_bytes()
-    with flown(whole, 3, 20, SilentProgress()) as copy:  # up to a step
+    with copy_of_run_until(whole, 3, 20, SilentProgress()) as copy:  # up to a step
         assert (copy / "run.nc").is_file()
         assert [record["step"] for record in journal(copy)] == list(range(21))
     assert not copy.exists()
     assert (whole / JOURNAL_NAME).read_bytes() == before
     nowhere = r"has the steps 0 to 20 up to step 20, and none from 21 on"
-    with pytest.raises(MissionInputError, match=nowhere), flown(whole, 21, 20, SilentProgress()):
+    with pytest.raises(MissionInputError, match=nowhere), copy_of_run_until(whole, 21, 20, SilentProgress()):
         raise AssertionError
 
 
@@ -134,7 +137,7 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
     check_same(*folders, *(["rejected.jsonl"] if case == "gap" else [JOURNAL_NAME]))
     assert last_line(folders[0]) == last_line(folders[1])
     if case == "gap":
-        watch.store(counts, last=35, report=False)
+        store_watch(watch, counts, last=35, report=False)
         assert figures_of(watch.folder)["blind_steps"] == "15, 16, 17, 18, 19"
         summary = json.loads((watch.folder / "summary.json").read_text())
         assert summary["control"] == "left 3g for 2g at step 31"
@@ -151,7 +154,7 @@ def test_what_came_behind_the_last_step_of_a_live_watch_stays_counted(watch, mis
     told = {"step": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
     line = json.dumps(told | {"strain": mission.observed[0].tolist()}).encode() + b"\n"
     for lines, received in ((3 * line, 3), (b"", 3), (line, 4)):
-        counts = ran(watch, json_lines(watch.scenario, io.BytesIO(lines)))
+        counts = ran(watch, feed_of_json_lines(watch.scenario, io.BytesIO(lines)))
         assert (counts.received, counts.duplicates) == (received, received - 1)
     assert [decision["step"] for decision in journalled(watch) if decision] == [0]
 
@@ -202,7 +205,7 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_STEPS", 8)
-    monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
+    monkeypatch.setattr("twin_master.watch.teaching.CHECKED_BYTES", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), watch.scenario)
     file, counts = watch.folder / JOURNAL_NAME, []
@@ -219,7 +222,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     with pytest.raises(
         NotResumableError, match=r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
     ):
-        watch.told(0)
+        notices_since(watch, 0)
     # Another watch takes in all but what the line said, and refuses that by name; the refusal says so.
     fed = [*FolderFeed(watch.folder, watch.scenario).messages(None)]
     assert "line 4 of journal.jsonl was changed or is damaged" in str(fed.pop(2)[0])
@@ -237,7 +240,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
         assert file.read_bytes() == b"".join(wrong)
     monkeypatch.undo()
     with pytest.raises(NotResumableError, match=sentence) as caught:
-        resumed_watch(watch.folder, None, SilentProgress()).__enter__()
+        resume_watch(watch.folder, None, SilentProgress()).__enter__()
     assert f"--observations {watch.folder}" in caught.value.__notes__[-1]
 
 
@@ -249,7 +252,7 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
     if source == "standard input":
         read, write = os.pipe()
         stream = os.fdopen(read, "rb")
-        feed: Feed = json_lines(watch.scenario, stream)
+        feed: Feed = feed_of_json_lines(watch.scenario, stream)
         texts = [json.dumps({"step": step, "strain_1": 1e-3}) + "\n" for step in range(3)]
     else:
         header, *texts = plain.read_text().splitlines(keepends=True)[:4]
@@ -257,7 +260,7 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
         path.write_text(header)
         stream, write = path.open("rb"), os.open(path, os.O_WRONLY | os.O_APPEND)
         feed = CsvFeed(path, watch.scenario, follow=True)
-    watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"steps": 3})
+    watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"step_limit": 3})
     watching.start()
 
     def kinds(count: int) -> list[tuple[int, list[str]]]:
@@ -289,14 +292,14 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
     assert kinds(6)[5:] == [(2, ["heard"])]
     assert journalled(watch)[-len(told) :] == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
-    shown = viewed(watch.folder).seen(0, 4)  # as the page shows it
+    shown = viewed(watch.folder).records_of_steps(0, 4)  # as the page shows it
     seen = [[notice["kind"] for notice in step.get("notices", ())] for step in shown]
     expected = [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     if source == "standard input":  # the recording contradicts the first three steps
         expected = [["taken", "heard", "refused", "quiet", "quiet"], ["heard", "quiet"]]
         expected += [["heard", "refused"], ["taken"]]
     assert seen == expected
-    assert [step for step, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
+    assert [step for step, notice in notices_since(watch, 0) if notice.kind == "quiet"] == [0, 0, 1]
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
@@ -325,7 +328,7 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
 
 def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     """The gauge that comes loose at step 10, and the skin that softens from step 25 on."""
-    monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
+    monkeypatch.setattr("twin_master.watch.opening.store_watch", lambda *_arguments, **_options: None)
     folder = tmp_path / "a b"
     done = command("watch", "watched_wing", "--out", folder, "--pace", "0.001")
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,39 @@
+"""Quantiles of mixtures of normal distributions, by bisection."""
+
+import numpy as np
+from scipy.special import ndtr
+
+from reporting.arrays import Float
+
+HALVINGS = 18
+SEARCH_DEVIATIONS = 6.5
+"""Standard deviations of the mean within which 2.5 and 97.5 % quantiles lie (Cantelli)."""
+
+
+def mixture_quantiles(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:
+    """Return quantiles (P, G) of G mixtures of N normal distributions.
+
+    Parameters
+    ----------
+    weight : (N,) array
+        The weights of the components, which sum to one; the same for all mixtures.
+    mean, deviation : (N, G) array
+        Mean and standard deviation of the components; a deviation of zero is a point.
+    levels : (P,) array
+        Levels of the quantiles, between 2.5 and 97.5 %.
+    """
+    center = weight @ mean
+    total_deviation = np.sqrt(weight @ (deviation**2 + (mean - center) ** 2))
+    low = np.tile(center - SEARCH_DEVIATIONS * total_deviation, (len(levels), 1))
+    high = np.tile(center + SEARCH_DEVIATIONS * total_deviation, (len(levels), 1))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        distance = middle[:, None] - mean  # (P, N, G)
+        # A component without deviation lies wholly on one side.
+        standardized = np.copysign(np.inf, distance)
+        np.divide(distance, deviation, out=standardized, where=deviation > 0.0)
+        probability_below = np.einsum("n,png->pg", weight, ndtr(standardized))
+        is_above_quantile = probability_below >= levels[:, None]
+        low = np.where(is_above_quantile, low, middle)
+        high = np.where(is_above_quantile, middle, high)
+    return high

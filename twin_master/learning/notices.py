@@ -1,0 +1,230 @@
+"""The sentences by which the watch over the gauges tells an operator what it notices."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.arrays import Float
+from twin_master.learning.watch_state import WatchState
+from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
+
+CLEARLY_BETTER = float(np.log(10.0))
+"""Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
+_OR_THE_ASSET = "or the asset near it is not as the model says, as where it has softened"
+"""Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
+_LEAST_NAMED_PROBABILITY = 0.1
+"""A gauge whose probability to be the one that is off is smaller is not named in an alarm."""
+_LEAST_NAMED_DEVIATIONS = 2.0
+"""A gain that is fewer prior standard deviations from zero is not named in an alarm."""
+_MOST_NAMED = 6
+"""Gauges that an alarm names at most."""
+_LARGEST_LOG = 700.0
+"""Logarithms up to this have an exponential that is a finite number."""
+
+
+@dataclass(frozen=True)
+class NoticeWriter:
+    """Writes the notices of a step.
+
+    Attributes
+    ----------
+    wording : NoticeWording
+        How sentences speak of steps and sensors.
+    threshold : float
+        The evidence from which an alarm is raised.
+    gains : (K,) array
+        The gain errors of single gauges that are compared.
+    log_gauge_prior : (G,) array
+        The log prior probability of each gauge to be the one that is off.
+    lowest_plausible, highest_plausible : (U, G) array
+        Readings beyond these are absurd under a control, SI.
+    hypothesis_names : tuple of str
+        The name of the hypothesis that a gauge is off, for each gauge.
+    """
+
+    wording: NoticeWording
+    threshold: float
+    gains: Float
+    log_gauge_prior: Float
+    lowest_plausible: Float
+    highest_plausible: Float
+    hypothesis_names: tuple[str, ...]
+
+    def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
+        """Return which readings (G,) no state can plausibly cause under a control; NaN is not."""
+        is_too_low = readings < self.lowest_plausible[control_index]
+        is_too_high = readings > self.highest_plausible[control_index]
+        return np.asarray(is_too_low | is_too_high)
+
+    def report_absurd_readings(
+        self,
+        was_left_out: NDArray[np.bool_],
+        is_absurd: NDArray[np.bool_],
+        readings: Float,
+        control_index: int,
+        step: int,
+    ) -> list[Notice]:
+        """Return a notice for each gauge (G,) whose readings begin or cease to be absurd."""
+        notices = []
+        for g in np.flatnonzero(is_absurd & ~was_left_out).tolist():
+            reading, low, high = self.wording.format_values(
+                g,
+                readings[g],
+                self.lowest_plausible[control_index, g],
+                self.highest_plausible[control_index, g],
+            )
+            sentence = (
+                f"{self._step_text(step)}: {self.wording.name_sensors([g])} shows {reading}, and "
+                f"no state can show less than {low} or more than {high}; its readings are left out "
+                "until they come back."
+            )
+            notices.append(Notice("gauge_left_out", sentence, (g + 1,), float(readings[g])))
+        for g in np.flatnonzero(was_left_out & ~is_absurd & ~np.isnan(readings)).tolist():
+            sentence = (
+                f"{self._step_text(step)}: the readings of {self.wording.name_sensors([g])} are "
+                "back, and used again."
+            )
+            notices.append(Notice("gauge_back", sentence, (g + 1,), float(readings[g])))
+        return notices
+
+    def report_followed_hypothesis(
+        self, state: WatchState, hypotheses: Sequence[Hypothesis], step: int
+    ) -> list[Notice]:
+        """Return a notice if belief and decision follow another hypothesis than before.
+
+        The state of the watch remembers which one is followed.
+        """
+        best = max(hypotheses, key=lambda hypothesis: hypothesis.probability)
+        if best is hypotheses[0]:
+            followed = 0
+        elif best.belief is None:
+            followed = -1
+        else:
+            followed = self.hypothesis_names.index(best.name) + 1
+        if best.probability <= 0.5 or followed == state.followed_hypothesis:
+            return []
+        state.followed_hypothesis = followed
+
+        sensors = f"{self.wording.sensor}s"
+        probability = f"(probability {best.probability:.3g})"
+        if followed == 0:
+            sentence = f"the model explains the {sensors} again {probability}."
+        elif followed < 0:
+            sentence = (
+                f"no state explains the {sensors}, none is believed, and the control is the safest "
+                f"{probability}."
+            )
+        else:
+            or_the_asset = f"{_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}"
+            sentence = (
+                f"{best.name}: belief and decision follow the other {sensors} {probability}. "
+                f"{or_the_asset}: these data cannot tell."
+            )
+        numbers = (followed,) if followed > 0 else ()
+        sentence = f"{self._step_text(step)}: {sentence}"
+        return [Notice("hypothesis", sentence, numbers, best.probability)]
+
+    def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
+        """Return the alarms that are raised in this step; the state remembers them.
+
+        A gauge that is off also raises the evidence of free gains, and a region that softens raises
+        that of its gauges. So the kind of fault that explains less waits. This makes false alarms
+        rarer still.
+        """
+        log_gauge = suspicion.log_evidence_any_gauge
+        log_free_gains = suspicion.log_evidence_none
+        log_threshold = np.log(self.threshold)
+        notices = []
+        is_gauge = log_gauge >= max(log_threshold, log_free_gains - CLEARLY_BETTER)
+        if is_gauge and not state.gauge_alarm_raised:
+            state.gauge_alarm_raised = True
+            notices.append(self._gauge_alarm(state, log_gauge, step))
+        is_free_gains = log_free_gains >= max(log_threshold, log_gauge + CLEARLY_BETTER)
+        if is_free_gains and not state.free_gains_alarm_raised:
+            state.free_gains_alarm_raised = True
+            notices.append(self._free_gains_alarm(state, log_free_gains, step))
+        return notices
+
+    def _gauge_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
+        """Return the alarm that a single gauge is off, naming those that it may be."""
+        log_weight = state.log_gauge_evidence + self.log_gauge_prior[:, None]
+        weight = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))  # (G, K)
+        probability = weight.sum(axis=1)
+        named = _largest(probability, _LEAST_NAMED_PROBABILITY)
+        onset = float(np.sum(weight * state.gauge_onset))
+        if len(named) > 1:
+            sensors = self.wording.name_sensors(named)
+            finding = f"one of {sensors} does not show what the model says"
+        else:
+            expected_sign = weight @ np.sign(self.gains)
+            amount = "much" if expected_sign[named[0]] > 0.0 else "little"
+            finding = f"{self.wording.name_sensors(named)} shows too {amount}"
+        finding = f"{finding}, {_OR_THE_ASSET}"
+        return self._alarm(state, step, finding, named, log_evidence, onset)
+
+    def _free_gains_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
+        """Return the alarm that no state explains all gauges, naming those explained least."""
+        statistics = state.free_gain_statistics
+        gain_deviations = np.abs(statistics.sum_cx) / np.sqrt(1.0 + statistics.sum_cc)
+        named = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
+        finding = (
+            "no state of the model explains all gauges together, least "
+            f"{self.wording.name_sensors(named)}"
+        )
+        onset = float(state.free_gains_onset[0])
+        return self._alarm(state, step, finding, named, log_evidence, onset)
+
+    def _alarm(
+        self,
+        state: WatchState,
+        step: int,
+        finding: str,
+        gauges: list[int],
+        log_evidence: float,
+        onset: float,
+    ) -> Notice:
+        """Return an alarm.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch.
+        step : int
+            The number of this step.
+        finding : str
+            What is wrong, as a clause.
+        gauges : list of int
+            The gauges that the alarm names, from 0.
+        log_evidence : float
+            The log evidence against the model.
+        onset : float
+            The expected first step of the fault. It counts from the first step of this model, which
+            may have taken the place of another.
+        """
+        evidence = float(np.exp(min(log_evidence, _LARGEST_LOG)))
+        first_step = round(step + 1.0 - state.step_count + onset)
+        since = f"since about {self.wording.step} {first_step}" if first_step else "from the start"
+        evidence_text = f"{evidence:,.0f}" if 1e3 <= evidence < 1e6 else f"{evidence:.3g}"
+        search = ""
+        if self.wording.command:
+            search = f"; to find the cause: {self.wording.command}"
+            if first_step:
+                search += f" --from-step {first_step}"
+        sentence = (
+            f"{self._step_text(step)}: {finding}, {since} (evidence {evidence_text} against the "
+            f"model, alarm from {self.threshold:g}){search}"
+        )
+        return Notice("alarm", sentence, tuple(g + 1 for g in gauges), evidence, first_step)
+
+    def _step_text(self, step: int) -> str:
+        """Return the beginning of a sentence, such as "Step 12"."""
+        return f"{self.wording.step.capitalize()} {step}"
+
+
+def _largest(values: Float, least: float) -> list[int]:
+    """Return the indices of the largest of values (G,): those of `least` or more, one at least."""
+    order = np.argsort(-values, kind="stable").tolist()
+    large = [g for g in order if values[g] >= least]
+    return large[:_MOST_NAMED] or order[:1]

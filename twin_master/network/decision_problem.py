@@ -1,0 +1,86 @@
+"""The partially observed decision problem that is planned on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reporting.arrays import Float, Index
+from twin_master.network.transition import TransitionModel
+
+
+@dataclass(frozen=True)
+class DecisionProblem:
+    """A partially observed Markov decision problem of finite size.
+
+    In a step the state is observed under the control and then moves; or, if `moves_first`, it moves
+    and is observed then.
+
+    Attributes
+    ----------
+    transition : TransitionModel
+        The transitions between S states under U controls.
+    reward : (S, U) array
+        The reward of one step.
+    discount : (U,) array
+        The discount factor of the return after a step, in [0, 1); zero if nothing follows.
+    likelihood : tuple of (K, S) array
+        For each control p(observation | state), for K observations: columns sum to one. K may
+        differ from control to control.
+    prior : (S,) array
+        The belief before the first step.
+    moves_first : bool
+        Whether the observation in a step is that of the state to which the step leads.
+    """
+
+    transition: TransitionModel
+    reward: Float
+    discount: Float
+    likelihood: tuple[Float, ...]
+    prior: Float
+    moves_first: bool = False
+
+    def next_beliefs(self, belief: Float, control: int, observation: Index | None = None) -> Float:
+        """Return next beliefs, each times the probability of its observation.
+
+        Parameters
+        ----------
+        belief : (S,) or (B, S) array
+            One belief; or B beliefs with an observation for each.
+        control : int
+            The control of the step.
+        observation : (B,) array, optional
+            The observation that follows each belief; if left out, all K observations of one belief.
+
+        Returns
+        -------
+        (K, S) or (B, S) array
+            The next belief after each observation. A row sums to the observation's probability.
+        """
+        likelihood = self.likelihood[control]
+        if observation is not None:
+            likelihood = likelihood[observation]
+        if self.moves_first:
+            return np.asarray(likelihood * self.transition.forward(control, belief))
+        return self.transition.forward(control, likelihood * belief)
+
+    def expected_vector(self, control: int, chosen: Index, vectors: Float) -> Float:
+        """Return the expected return after a step from each state: (S,).
+
+        Parameters
+        ----------
+        control : int
+            The control of the step.
+        chosen : (K,) array
+            The vector that is followed after each observation.
+        vectors : (N, S) array
+            Returns from each state.
+        """
+        likelihood = self.likelihood[control]
+        if self.moves_first:
+            after_observation = np.einsum("ks,ks->s", likelihood, vectors[chosen])
+            return self.transition.expected_value(control, after_observation)
+        result: Float = np.zeros(len(self.prior))
+        for number in np.unique(chosen).tolist():
+            probability = likelihood[chosen == number].sum(axis=0)
+            result += probability * self.transition.expected_value(control, vectors[number])
+        return result

@@ -1,0 +1,190 @@
+"""Compiled loops for Gaussian sensors: log densities of many observations by many draws.
+
+Observations are taken by blocks. The innermost loop of each sum runs over the observations of the
+block, so that they are computed side by side, each as it would be alone.
+"""
+
+import numpy as np
+
+from fe.compilation import callable_when_compiled, compiled
+from reporting.arrays import Float, Index
+
+LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
+BLOCK_SIZE = 32
+"""Observations whose densities of all draws stay in the fast memory of a processor."""
+INVERSE_LOG_TWO = 1.0 / float(np.log(2.0))
+LOG_TWO_HIGH = 6.93147180369123816490e-01
+"""The leading digits of log 2: its product with a whole number below 2^11 is exact."""
+LOG_TWO_LOW = 1.90821492927058770002e-10
+"""The remaining digits of log 2."""
+EVEN = (3.00198505138664455042e-6, 2.52448340349684104192e-3, 2.27265548208155028766e-1, 2.0)
+"""Even part of a rational approximation of exp within log(2) / 2 of zero (Moshier 1989)."""
+ODD = (1.26177193074810590878e-4, 3.02994407707441961300e-2, 1.0)
+"""Its odd part; together they are good to 2e-16."""
+EXPONENT_BIAS = 1023
+"""A double with the exponent bits n + 1023 and the fraction zero is 2^n."""
+FRACTION_BITS = 52
+"""Number of bits of the fraction of a double."""
+LEAST_EXPONENT = -708.0
+"""The exponential function of a smaller number is negligible beside one, and has fewer digits."""
+ROUNDING = 1e-13
+"""Entries that remain of a separated matrix, relative to the largest value, are rounding errors."""
+
+
+def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
+    """Return matrices (N, R) and (R, E) whose product is a matrix (N, E), to rounding.
+
+    This is a cross approximation with full pivoting: the column and the row of the largest
+    remaining entry are taken out, until nothing remains. The caller forms sums of products, so that
+    the result does not depend on a library or its threads.
+
+    Parameters
+    ----------
+    values : (N, E) array
+        The matrix.
+    largest : float
+        The size of the numbers to whose rounding errors the product is exact.
+    """
+    remaining = values.copy()
+    columns: list[Float] = []
+    rows: list[Float] = []
+    while remaining.size and len(rows) < min(remaining.shape):
+        row, column = np.unravel_index(np.argmax(np.abs(remaining)), remaining.shape)
+        pivot = remaining[row, column]
+        if abs(pivot) <= ROUNDING * largest:
+            break
+        columns.append(remaining[:, column].copy())
+        rows.append(remaining[row] / pivot)
+        remaining -= columns[-1][:, None] * rows[-1]
+    # Reshaped, because without any column an array has only one axis.
+    row_count, column_count = values.shape
+    return (
+        np.array(columns).reshape(-1, row_count).T,
+        np.array(rows).reshape(-1, column_count),
+    )
+
+
+@callable_when_compiled
+def _log_sum_exp(
+    exponent: Float, largest: Float, total: Float, mantissa: Float, power_bits: Index
+) -> None:
+    """Fill `total` (B,) with log sum exp over the rows of `exponent` (E, B).
+
+    The other arrays (B,) are for work. The exponential function is written out, as a number times a
+    power of two, because calls of a library function are not computed side by side.
+    """
+    largest[:] = -np.inf
+    total[:] = 0.0
+    for e in range(len(exponent)):
+        for b in range(len(total)):
+            largest[b] = max(largest[b], exponent[e, b])
+    power = power_bits.view(np.float64)
+    for e in range(len(exponent)):
+        for b in range(len(total)):
+            value = max(exponent[e, b] - largest[b], LEAST_EXPONENT)
+            # value = whole * log 2 + fraction, the product in two parts to be exact.
+            whole = np.floor(value * INVERSE_LOG_TWO + 0.5)
+            fraction = (value - whole * LOG_TWO_HIGH) - whole * LOG_TWO_LOW
+            # exp(fraction) by a rational approximation, times 2^whole by its bits.
+            square = fraction * fraction
+            even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
+            odd = fraction * ((ODD[0] * square + ODD[1]) * square + ODD[2])
+            mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
+            power_bits[b] = (np.int64(whole) + EXPONENT_BIAS) << FRACTION_BITS
+        for b in range(len(total)):
+            total[b] += mantissa[b] * power[b]
+    for b in range(len(total)):
+        total[b] = largest[b] + np.log(total[b]) if largest[b] > -np.inf else -np.inf
+
+
+@compiled
+def log_densities(
+    observation: Float,
+    mean: Float,
+    inverse_deviation: Float,
+    interval_directions: Float,
+    draw_directions: Float,
+    draw_coefficients: Float,
+    draw_offset: Float,
+    log_scale: Float,
+    result: Float,
+) -> None:
+    """Fill `result` with the log density of observations in each state, for each draw or their sum.
+
+    With d = (observation - mean) / deviation it is for a draw e
+
+        (|I d|² - |d|²) / 2 + (d A) b_e - offset_e + log scale,
+
+    where I are the directions in which the interval of a state moves the sensors, and A b_e is the
+    difference of the draw from the mean.
+
+    Parameters
+    ----------
+    observation : (G, T) array
+        The sensor values, any number if a sensor is lost.
+    mean, inverse_deviation : (S, G) array
+        The mean over the draws, and one over the standard deviation; the latter is zero if a sensor
+        is lost.
+    interval_directions : (S, F, G) array
+        The matrix I of each state.
+    draw_directions : (S, G, R) array
+        The matrix A of each state.
+    draw_coefficients : (R, E) array
+        The vectors b_e.
+    draw_offset : (S, E) array
+        What the density of a draw has less, whatever is observed.
+    log_scale : (S,) array
+        The log of the density's factor.
+    result : (T, S, E) or (T, S, 1) array
+        To be filled: the log density of each draw, or the log of the sum over the draws.
+    """
+    sensors, observation_count = observation.shape
+    directions, draws = draw_coefficients.shape
+    factors = interval_directions.shape[1]
+    for first in range(0, observation_count, BLOCK_SIZE):
+        size = min(BLOCK_SIZE, observation_count - first)
+        distance = np.empty((sensors, size))
+        slope = np.empty((directions, size))
+        exponent = np.empty((draws, size))
+        power_bits = np.empty(size, np.int64)
+        square = np.empty(size)
+        along_direction = np.empty(size)
+        mantissa = np.empty(size)
+        for s in range(len(mean)):
+            # Squared distance |d|², and d A.
+            square[:] = 0.0
+            slope[:] = 0.0
+            for g in range(sensors):
+                for b in range(size):
+                    difference = observation[g, first + b] - mean[s, g]
+                    distance[g, b] = difference * inverse_deviation[s, g]
+                    square[b] += distance[g, b] * distance[g, b]
+                for r in range(directions):
+                    for b in range(size):
+                        slope[r, b] += distance[g, b] * draw_directions[s, g, r]
+            # Minus the part that the interval of the state explains.
+            for f in range(factors):
+                along_direction[:] = 0.0
+                for g in range(sensors):
+                    for b in range(size):
+                        along_direction[b] += interval_directions[s, f, g] * distance[g, b]
+                for b in range(size):
+                    square[b] -= along_direction[b] * along_direction[b]
+            for b in range(size):
+                if not square[b] < np.inf:  # an absurd observation
+                    square[b] = np.inf
+                    slope[:, b] = 0.0
+            # The exponent of each draw.
+            for e in range(draws):
+                for b in range(size):
+                    exponent[e, b] = -0.5 * square[b] - draw_offset[s, e]
+                for r in range(directions):
+                    for b in range(size):
+                        exponent[e, b] += slope[r, b] * draw_coefficients[r, e]
+            # The sum over draws, if it is wanted.
+            if result.shape[2] == 1:
+                _log_sum_exp(exponent, along_direction, square, mantissa, power_bits)
+                exponent[0] = square
+            for b in range(size):
+                for e in range(result.shape[2]):
+                    result[first + b, s, e] = exponent[e, b] + log_scale[s]

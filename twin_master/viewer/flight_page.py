@@ -1,0 +1,320 @@
+"""The page of a flight: its HTML, and the answers to the requests of its viewers.
+
+A viewer says in a request which steps it has and which step it shows. The answer follows from the
+request alone. So a viewer that was away, or is slow, gets all that it lacks at once, and nothing is
+kept for it.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from importlib import resources
+
+import numpy as np
+from jinja2 import Template
+from markupsafe import Markup
+from pydantic import BaseModel
+
+from reporting.arrays import Float
+from reporting.errors import ReportingError
+from reporting.json_file import plain
+from twin_master.errors import TwinMasterError
+from twin_master.report.reading import (
+    NORMAL_95,
+    PrintedSensors,
+    printed_factors,
+    printed_sensors,
+)
+from twin_master.report.structure import design_of, planform_of
+from twin_master.scenario.schema import REWARD_NAMES
+from twin_master.viewer.flight import Flight, StepBeliefs, StepRecord
+
+WINDOW_STEPS = 240
+"""Number of steps that a page shows at once."""
+LATEST = -1
+"""The number that a request has in the place of a step if it asks for the last one."""
+TALLEST_BAR = 0.82
+"""Height of the bar of a probability of 1, if the row of a control has the height 1."""
+
+
+class Request(BaseModel, frozen=True, extra="forbid", strict=True):
+    """The request of a viewer.
+
+    Attributes
+    ----------
+    number : int
+        The number of the request, which the answer repeats.
+    flight : int
+        The number of the flight whose steps the viewer has, see `Flight.number`.
+    first, end : int
+        The viewer has the steps first..end - 1.
+    step : int
+        The step to be shown; `LATEST` for the last one.
+    shown : int
+        The step that the viewer shows; -1 before the first answer.
+    count : int
+        The number of steps that the viewer knows of; -1 before the first answer.
+    """
+
+    number: int
+    flight: int
+    first: int
+    end: int
+    step: int
+    shown: int
+    count: int
+
+
+SendText = Callable[[str], None]
+"""Sends an answer to one viewer, and stands for this viewer."""
+
+
+class FlightPage:
+    """The page of one flight, for any number of viewers.
+
+    If the sensors have several units, each is shown as its deviation from the expected reading, in
+    standard deviations of that reading.
+
+    Parameters
+    ----------
+    flight : Flight
+        The flight that is shown.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        self._flight = flight
+        self._factors = printed_factors(flight.scenario)
+        self._factor_scales = np.array([factor.scale for factor in self._factors])
+        sensors = printed_sensors(flight.scenario)
+        self._shows_deviations = not sensors.unit
+        self._sensors = _as_deviations(sensors) if self._shows_deviations else sensors
+        self._open_requests: dict[SendText, Request] = {}
+        self._error = ""
+
+    def render_html(self) -> str:
+        """Return the page, whose script draws the figures from the answers."""
+        flight = self._flight
+        mission = flight.scenario.mission
+        wing = planform_of(design_of(flight.folder), flight.scenario)
+        lowest, highest = self._sensor_range()
+        sensors = asdict(self._sensors)
+        sensors |= {"unit": self._sensors.unit, "lowest": lowest, "highest": highest}
+        scene = plain(
+            {
+                "title": mission.title or mission.name,
+                "step_name": mission.step_name,
+                "horizon": mission.prediction_steps,
+                "factors": self._factors,
+                "controls": flight.scenario.control_names,
+                "rewards": REWARD_NAMES,
+                "sensors": sensors,
+                "planform": None if wing is None else wing._asdict(),
+                "window": WINDOW_STEPS,
+                "latest": LATEST,
+                "tallest_bar": TALLEST_BAR,
+            }
+        )
+        # Inside a script element only the beginning of a tag could end it
+        content = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
+        template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
+        html: str = Template(template, autoescape=True).render(scene=scene, content=Markup(content))
+        return html
+
+    def _sensor_range(self) -> tuple[float, float]:
+        """Return the lowest and the highest reading on the axis of the sensors."""
+        if self._shows_deviations:
+            return -NORMAL_95, NORMAL_95
+        readings = self._sensors.scale * self._flight.knowledge.sensor_model.mean
+        return readings.min(), readings.max()
+
+    def ask(self, send: SendText, request: Request) -> None:
+        """Answer a viewer now, or as soon as there is something new.
+
+        A newer request of the viewer replaces an older one.
+        """
+        self._open_requests[send] = request
+        self._answer_viewer(send)
+
+    def forget(self, send: SendText) -> None:
+        """Forget a viewer."""
+        self._open_requests.pop(send, None)
+
+    def update(self) -> None:
+        """Read what is new in the flight, and answer the viewers that wait for it."""
+        try:
+            if self._error or not self._flight.update():
+                return
+        except (TwinMasterError, ReportingError) as error:
+            self._error = str(error)
+        for send in list(self._open_requests):
+            self._answer_viewer(send)
+
+    def _answer_viewer(self, send: SendText) -> None:
+        """Answer the open request of a viewer, if there is something new for it."""
+        if self._error:
+            send(json.dumps({"error": self._error}))
+        # A viewer that could not be reached is forgotten meanwhile
+        request = self._open_requests.get(send)
+        if request is None:
+            return
+        answer = self.answer(request)
+        if answer is not None:
+            del self._open_requests[send]
+            send(answer)
+
+    def answer(self, request: Request) -> str | None:
+        """Return the answer to a request as JSON; None if there is nothing new to say.
+
+        Parameters
+        ----------
+        request : Request
+            The request of a viewer.
+        """
+        flight = self._flight
+        count = flight.steps
+        if not count:
+            return None
+        last_step = count - 1
+        step = last_step
+        if request.step != LATEST:
+            step = min(max(request.step, 0), last_step)
+        has_same_flight = request.flight == flight.number
+        shows_step = has_same_flight and request.shown == step
+        if shows_step and request.count == count:
+            return None
+        first = _first_missing_step(request, step, has_same_flight=has_same_flight)
+        end = step + 1
+        try:
+            records = flight.records_of_steps(min(first, step), end)
+        except FileNotFoundError:  # another flight has taken its place
+            return None
+        answer = {
+            "number": request.number,
+            "flight": flight.number,
+            "count": count,
+            "step": step,
+            "first": first,
+            "picture": self._drawing_at(step),
+            "past": self._past_values(records) if first < end else None,
+            "ahead": None,
+        }
+        if not shows_step:
+            answer["ahead"] = self._plotted_values(flight.prediction_after(records[-1]), None)
+        return json.dumps(plain(answer), allow_nan=False)  # NaN becomes null
+
+    def _drawing_at(self, step: int) -> dict[str, str] | None:
+        """Return the last drawing of a missing force at a step: its address, and the verdict."""
+        numbers = []
+        for number, drawing in enumerate(self._flight.drawings):
+            if drawing.step <= step:
+                numbers.append(number)
+        if not numbers:
+            return None
+        last_number = numbers[-1]
+        return {
+            "address": f"missing_force_{last_number}.svg?flight={self._flight.number}",
+            "said": self._flight.drawings[last_number].sentence,
+        }
+
+    def _past_values(self, records: Sequence[StepRecord]) -> dict[str, object]:
+        """Return what the page shows of steps that were flown, a row for each step."""
+        flight = self._flight
+        beliefs = flight.beliefs_in(records)
+        values = self._plotted_values(beliefs, flight.observations_in(records))
+        values["control"] = [record["control_index"] for record in records]
+        values["notices"] = [self._sentences_in(record) for record in records]
+        values["learnt"] = [record.get("learnt", {}) for record in records]
+        values["truth"] = self._factor_scales * flight.true_states_in(records)
+        return values
+
+    def _sentences_in(self, record: StepRecord) -> list[str]:
+        """Return the sentences of the notices of a step, with the folder of the flight."""
+        folder = f" {self._flight.folder}"
+        return [notice["sentence"].replace(" DIR", folder) for notice in record["notices"]]
+
+    def _plotted_values(
+        self, beliefs: StepBeliefs, observations: Float | None
+    ) -> dict[str, object]:
+        """Return the values of figures in printed units, a row for each step.
+
+        Parameters
+        ----------
+        beliefs : StepBeliefs
+            The beliefs of n steps.
+        observations : (n, G) array or None
+            The readings of the sensors, SI; None for steps to come.
+
+        Returns
+        -------
+        dict
+            Arrays by name; NaN if there is no value, or if no state is believed.
+        """
+        expected = beliefs.expected
+        reward_margin = NORMAL_95 * expected.reward_standard_deviation
+        sensor_mean = expected.mean
+        deviation = np.hypot(expected.standard_deviation, expected.noise)
+        if self._shows_deviations:
+            if observations is not None:
+                observations = (observations - sensor_mean) / deviation
+            sensor_mean = np.zeros_like(sensor_mean)
+            deviation = np.ones_like(deviation)
+        scale = self._sensors.scale
+        sensor_margin = NORMAL_95 * deviation
+        values: dict[str, object] = {
+            **self._state_values(beliefs),
+            "reward": expected.reward_mean,
+            "reward_lower": expected.reward_mean - reward_margin,
+            "reward_upper": expected.reward_mean + reward_margin,
+            "sensor": scale * sensor_mean,
+            "sensor_lower": scale * (sensor_mean - sensor_margin),
+            "sensor_upper": scale * (sensor_mean + sensor_margin),
+            "probability": beliefs.control_probability,
+        }
+        if observations is not None:
+            values["observed"] = scale * observations
+        return values
+
+    def _state_values(self, beliefs: StepBeliefs) -> dict[str, Float]:
+        """Return mean, interval and standard deviation of each factor of the state (n, K).
+
+        The interval is two standard deviations to either side, within the levels of the factor.
+        """
+        scales = self._factor_scales
+        lowest = np.array([factor.levels[0] for factor in self._factors])
+        highest = np.array([factor.levels[-1] for factor in self._factors])
+        states = self._flight.knowledge.model.states
+        is_believed = beliefs.is_believed[:, None]
+        mean = np.where(is_believed, scales * states.mean(beliefs.probability), np.nan)
+        margin = 2.0 * scales * states.standard_deviation(beliefs.probability)
+        return {
+            "state": mean,
+            "state_lower": np.clip(mean - margin, lowest, highest),
+            "state_upper": np.clip(mean + margin, lowest, highest),
+            "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * margin),
+        }
+
+
+def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
+    """Return sensors whose readings are shown in standard deviations of the expected reading."""
+    units = ("standard deviations",) * len(sensors.titles)
+    return replace(sensors, quantity="deviation", units=units, scale=1.0)
+
+
+def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:
+    """Return the first step to be sent, so that the viewer has all that the page shows at once.
+
+    Parameters
+    ----------
+    request : Request
+        The request, with the steps that the viewer has.
+    step : int
+        The step that will be shown, the last one of the window.
+    has_same_flight : bool
+        Whether the steps of the viewer are of this flight; if not, they are void.
+    """
+    end = step + 1
+    first_of_window = max(0, end - WINDOW_STEPS)
+    is_continued = request.first <= first_of_window <= request.end
+    if has_same_flight and is_continued:
+        return min(request.end, end)
+    return first_of_window

@@ -1,0 +1,123 @@
+"""The address of an MQTT broker from which observations come."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from ssl import create_default_context
+from urllib.parse import unquote, urlsplit
+
+from twin_master.errors import MissionInputError
+
+PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
+"""The environment variable with the password of the twin."""
+_PORT = 1883
+_PORT_WITH_TLS = 8883
+
+
+@dataclass(frozen=True)
+class Broker:
+    """A broker and the topic of the observations.
+
+    Decisions are published on `TOPIC/decision`, and the state of the twin on `TOPIC/heartbeat`.
+
+    Attributes
+    ----------
+    host : str
+        The host of the broker.
+    port : int
+        Its port.
+    topic : str
+        The topic of the observations.
+    user : str or None
+        The user name of the twin. Its password is in the environment, `UAV_TWIN_MQTT_PASSWORD`.
+    tls : bool
+        Whether the connection is encrypted (`mqtts://`), with the certificate of the broker.
+    authority : Path or None
+        The certificate of the authority, if the operating system does not have it.
+    """
+
+    host: str
+    port: int
+    topic: str
+    user: str | None = None
+    tls: bool = False
+    authority: Path | None = None
+
+
+def is_broker(observations: str) -> bool:
+    """Return whether observations come from a broker, and not from a file."""
+    return observations.startswith(("mqtt://", "mqtts://"))
+
+
+def parse_broker(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
+    """Return the broker of an address.
+
+    Parameters
+    ----------
+    address : str
+        `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
+    authority : Path, optional
+        The file with the certificate of the authority.
+    many : bool
+        Whether the topic is that of many assets. It then ends with `/+`, which stands for the name
+        of each asset.
+
+    Raises
+    ------
+    MissionInputError
+        If paho-mqtt is not installed; if the address is no such address, has a password in it, or
+        has a topic of many assets for one or of one for many; if the file holds no certificate.
+    """
+    if find_spec("paho") is None:
+        raise MissionInputError(
+            "observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'."
+        )
+    try:
+        parts = urlsplit(address)
+        port = parts.port
+    except ValueError:
+        raise _address_error(address) from None
+    topic = unquote(parts.path.lstrip("/"))
+    if not parts.hostname or not topic:
+        raise _address_error(address)
+    if parts.password is not None:
+        raise MissionInputError(
+            "every user of this machine sees a password in an address: put it into "
+            f"{PASSWORD_VARIABLE}."
+        )
+    has_wildcard = "#" in address or "+" in topic
+    ends_with_wildcard = topic.endswith("/+") and "+" not in topic[:-1] and "#" not in address
+    if many and not ends_with_wildcard:
+        raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
+    if has_wildcard and not many:
+        raise MissionInputError(
+            f"{address}: a topic of one asset is expected, without `#` and `+`."
+        )
+    tls = parts.scheme == "mqtts"
+    if authority is not None:
+        _check_certificate(authority, tls=tls)
+    return Broker(
+        host=parts.hostname,
+        port=port or (_PORT_WITH_TLS if tls else _PORT),
+        topic=topic,
+        user=None if parts.username is None else unquote(parts.username),
+        tls=tls,
+        authority=authority,
+    )
+
+
+def _address_error(address: str) -> MissionInputError:
+    """Return the error for an address that is not that of a broker."""
+    return MissionInputError(
+        f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`."
+    )
+
+
+def _check_certificate(authority: Path, *, tls: bool) -> None:
+    """Refuse a certificate that is no file, belongs to no `mqtts://`, or cannot be read."""
+    if not tls or not authority.is_file():
+        raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+    with MissionInputError.instead_of(
+        OSError, before=f"{authority} holds no certificate: ", after="."
+    ):
+        create_default_context(cafile=authority)

@@ -1,0 +1,60 @@
+"""The interface of a search for the cause of an alarm, which a package above implements.
+
+The watch knows when to search, and in which steps. How to search is known by the workflow on
+discrepancies, which this package does not import: `uav_twin` hands in a `CauseSearch`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+
+@dataclass(frozen=True)
+class SearchRequest:
+    """A request to look for what the model of a watch lacks in some of its steps.
+
+    Attributes
+    ----------
+    run_folder : Path
+        The folder of the watch, which is only read.
+    first_step, last_step : int
+        The first and the last step that the search uses.
+    verdict_folder : Path
+        The folder that the search makes, with `verdict.json` and, if the verdict gives one,
+        `patch.json`. It must appear complete or not at all.
+    log : Path
+        The file that takes the messages of the search.
+    seed : int
+        The seed of all random numbers of the search.
+    low_priority : bool
+        Whether the search gives way to other processes, because a live watch goes on beside it.
+    """
+
+    run_folder: Path
+    first_step: int
+    last_step: int
+    verdict_folder: Path
+    log: Path
+    seed: int
+    low_priority: bool
+
+
+class RunningSearch(Protocol):
+    """A search that was started."""
+
+    def has_ended(self) -> bool:
+        """Return whether the search has ended, with a verdict or without one."""
+
+    def stop(self) -> None:
+        """End the search at once, if it still runs, and wait until it has ended."""
+
+
+class CauseSearch(Protocol):
+    """Starts searches for the cause of an alarm.
+
+    A search must not disturb the watch: it runs in a process of its own, from which no error, no
+    key of the terminal and no change of the state of the process reaches the watch.
+    """
+
+    def start(self, request: SearchRequest) -> RunningSearch:
+        """Start a search and return without waiting for its end."""

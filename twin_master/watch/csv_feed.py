@@ -1,0 +1,215 @@
+"""A CSV file as a feed: its header, its rows, and what happens to both when it is rotated."""
+
+import csv
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from reporting.former_names import warn_of_former_names
+from twin_master.errors import MissionInputError
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.lines import Position, first_line, rotated_files
+from twin_master.watch.message import PRESENT_NAMES, MessageContent, Refused
+from twin_master.watch.recorded_feeds import RecordedFeed
+
+
+def _parse_whole_number(cell: str) -> int:
+    """Return a whole number, also one that a table of floating-point numbers has as `12.0`."""
+    digits, point, decimals = cell.partition(".")
+    is_whole = point and not decimals.strip("0")
+    return int(digits if is_whole else cell)
+
+
+_CONVERSIONS: dict[str, Callable[[str], object]] = {
+    "step": _parse_whole_number,
+    "time": float,
+    "control": str,
+}
+"""The columns that are no sensor, with the conversion of their cells."""
+_MISSING_VALUES = ("nan", "null", "none")
+"""Cells of these columns that mean that there is no value."""
+
+
+class CsvFeed(RecordedFeed):
+    """A CSV file with a header: `step` or `time`, `control`, and sensors by their names.
+
+    A file that takes the place of one that is followed has a header of its own, or the same
+    columns.
+
+    Parameters
+    ----------
+    path, scenario, follow
+        As of `RecordedFeed`.
+
+    Raises
+    ------
+    MissionInputError
+        If the file cannot be read, or if a column is neither of these.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
+        super().__init__(path, scenario, follow=follow)
+        self._set_columns(self._read_header())
+
+    def _read_header(self) -> list[str]:
+        """Return the names of the columns.
+
+        A file that was begun a moment ago has no header yet, and one that was copied and cut has
+        lost it. If the file is followed, it then has the header of the newest rotated file that
+        has one.
+        """
+        files = [self.path]
+        if self.follow:
+            files += reversed(rotated_files(self.path))
+        try:
+            lines = [first_line(file) for file in files]
+            whole_lines = [line for line in lines if line.endswith(b"\n")]
+            rows = [_split_cells(line) for line in whole_lines or lines[:1]]
+        except (OSError, ValueError) as error:
+            reason = str(error).rstrip(".")
+            raise MissionInputError(f"{self.path} cannot be read as CSV: {reason}.") from None
+        for cells in rows:
+            if not self._has_readings(cells):
+                return cells
+        hint = "which a rotated file beside it may have: that one is found with --follow"
+        if self.follow:
+            hint = "and no rotated file beside it has that line"
+        raise MissionInputError(
+            f"{self.path} begins with `{','.join(rows[0])[:60]}`, which is a row of readings: a "
+            f"CSV file begins with a line of its columns, {hint}."
+        )
+
+    def _has_readings(self, cells: Sequence[str]) -> bool:
+        """Return whether the cells of a row are readings, and not the names of columns."""
+        if not any(map(_is_number, cells)):
+            return False
+        # Sensors may have numbers as names
+        try:
+            return not all(self._is_column(PRESENT_NAMES.get(cell, cell)) for cell in cells)
+        except Refused:  # a known name with a wrong unit
+            return False
+
+    def _is_column(self, name: str) -> bool:
+        """Return whether a name is that of a sensor, or of another column."""
+        return name in _CONVERSIONS or self.reader.find_column(name) is not None
+
+    def _set_columns(self, names: Sequence[str]) -> None:
+        """Check the names of columns, and use them for the rows that follow.
+
+        Raises
+        ------
+        MissionInputError
+            If there are no names, if one is no column, or if two mean the same column.
+        """
+        if not any(names):
+            raise MissionInputError(
+                f"{self.path} is empty: a CSV file begins with a line of its columns."
+            )
+        if names[0].startswith("{"):
+            raise MissionInputError(
+                f"{self.path} holds JSON lines, and a file of observations is CSV or NetCDF: hand "
+                f"them over by standard input, `--observations - < {self.path}`."
+            )
+        former_names = {name: PRESENT_NAMES[name] for name in names if name in PRESENT_NAMES}
+        if former_names:
+            warn_of_former_names(str(self.path), former_names)
+        columns = [PRESENT_NAMES.get(name, name) for name in names]
+        try:
+            sensors = self._sensors_of(columns)
+        except Refused as refusal:
+            raise MissionInputError(
+                f"{self.path}: the columns cannot be read, {refusal}; others are `step`, `time` "
+                "and `control`."
+            ) from None
+        occurrences = Counter(columns)
+        has_double_column = any(occurrences[name] > 1 for name in _CONVERSIONS)
+        if len(set(sensors)) < len(sensors) or has_double_column:
+            raise MissionInputError(
+                f"{self.path}: two columns say the same; {', '.join(names)[:300]} came."
+            )
+        self._columns = columns
+
+    def _sensors_of(self, columns: Sequence[str]) -> list[int]:
+        """Return the indices of the sensors among columns.
+
+        Raises
+        ------
+        Refused
+            If a column is no sensor, and such columns are not ignored.
+        """
+        sensors = []
+        unknown_names = []
+        for name in columns:
+            if name in _CONVERSIONS or name.startswith("_"):
+                continue
+            column = self.reader.find_column(name)
+            if column is None:
+                unknown_names.append(name)
+            else:
+                sensors.append(column.sensor)
+        has_known_column = len(unknown_names) < len(columns)
+        is_allowed = self.reader.allows_unknown and has_known_column
+        if unknown_names and not is_allowed:
+            raise Refused(self.reader.describe_unknown(unknown_names, has_sensors=bool(sensors)))
+        return sensors
+
+    def open_file(self, position: Position | None) -> BinaryIO:
+        """Return the file that contains a position, open; take over the columns of its header."""
+        file = super().open_file(position)
+        self.content_of(first_line(Path(file.name)), 0)
+        return file
+
+    def content_of(self, line: bytes, begin: int) -> MessageContent | None:
+        """Return the message in a row; None for a header, whose columns are taken over."""
+        try:
+            cells = _split_cells(line)
+        except ValueError as error:
+            return Refused(f"it is no line of CSV: {str(error)[:80]}")
+        is_first_line = begin == 0
+        if is_first_line and not self._has_readings(cells):
+            with suppress(MissionInputError):
+                self._set_columns(cells)
+                return None
+        if len(cells) != len(self._columns):
+            return Refused(f"{len(self._columns)} cells are expected, and {len(cells)} came")
+        try:
+            return self._record_of(cells)
+        except (ValueError, OverflowError) as error:
+            return Refused(f"a cell is no number: {str(error)[:80]}")
+
+    def _record_of(self, cells: Sequence[str]) -> dict[str, object]:
+        """Return the value of each column in a row; columns without a value are left out."""
+        record: dict[str, object] = {}
+        for name, cell in zip(self._columns, cells, strict=True):
+            is_missing = name in _CONVERSIONS and cell.lower() in _MISSING_VALUES
+            if cell and not is_missing:
+                convert = _CONVERSIONS.get(name, str)
+                record[name] = convert(cell)
+        return record
+
+
+def _is_number(cell: str) -> bool:
+    """Return whether a cell is a number."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _split_cells(line: bytes) -> list[str]:
+    """Return the cells of a row without blanks around them.
+
+    Raises
+    ------
+    ValueError
+        If the line is no row of CSV, or no UTF-8.
+    """
+    text = line.decode("utf-8-sig").rstrip("\r\n")
+    try:
+        cells = next(csv.reader([text]), [])
+    except csv.Error as error:
+        raise ValueError(str(error)) from None
+    return [cell.strip() for cell in cells]

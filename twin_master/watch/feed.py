@@ -1,0 +1,41 @@
+"""The interface of a feed, which gives messages to a watch and takes its decisions."""
+
+from collections.abc import Iterable, Iterator
+
+from twin_master.watch.lines import Position
+from twin_master.watch.message import FeedItem
+from twin_master.watch.records import Decision
+
+
+class Feed:
+    """A source of messages.
+
+    This class is a feed whose messages cannot be read twice: a resumed watch takes what comes next.
+
+    Parameters
+    ----------
+    items : iterable of FeedItem
+        The messages.
+    """
+
+    replayable = False
+    """Whether the feed begins again in each process, with the messages that were read before."""
+    position: Position | None = None
+    """The position after the message that was given last, if the feed is a file."""
+
+    def __init__(self, items: Iterable[FeedItem] = ()) -> None:
+        self._items = items
+
+    def contains_position(self, position: Position) -> bool:
+        """Return whether a position is one in this feed, and not in another source."""
+        return False
+
+    def messages(self, position: Position | None) -> Iterator[FeedItem]:
+        """Yield the messages after a position; all of them if it is None."""
+        return iter(self._items)
+
+    def send_decision(self, decision: Decision) -> None:
+        """Send a decision to the publisher of the messages, if it listens."""
+
+    def close(self) -> None:
+        """Release the connection to the publisher of the messages."""

@@ -1,0 +1,430 @@
+"""The session of the twin at an MQTT broker (extra `uav-twin[mqtt]`, paho-mqtt).
+
+The twin is a client; it opens no port. The broker is asked to send no larger message than is read,
+and no more messages than can wait here. Further ones wait at the broker, or are dropped there.
+"""
+
+import json
+import os
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from secrets import token_hex
+from typing import TYPE_CHECKING, Protocol
+
+from reporting.files import atomic_write_text
+from twin_master.errors import MissionInputError
+from twin_master.watch.broker_address import PASSWORD_VARIABLE, Broker
+from twin_master.watch.message import LARGEST_MESSAGE
+from twin_master.watch.records import Decision, JsonObject
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
+    from paho.mqtt.properties import Properties
+    from paho.mqtt.reasoncodes import ReasonCode
+
+CLIENT_SUFFIX = ".mqtt"
+"""The suffix of the file with the client name."""
+DISCARD_SESSION = "begin anew"
+"""The second line of this file while the former session at the broker is still to be discarded."""
+FIRST_RETRY_SECONDS = 1.0
+LONGEST_RETRY_SECONDS = 30.0
+"""The pause between two attempts is doubled from the first to the longest one [s]."""
+HEARTBEAT_SECONDS = 10.0
+_UNREAD_MESSAGES = 200
+"""Largest number of messages that the broker sends before they are acknowledged."""
+_UNACKNOWLEDGED_DECISIONS = 1000
+"""Largest number of decisions sent and not acknowledged; further ones wait in the journal."""
+_SESSION_SECONDS = 7 * 86_400
+"""How long the broker keeps messages while the watch is away [s]."""
+_KEEPALIVE_SECONDS = 30
+_GOODBYE_SECONDS = 5.0
+"""How long the end waits for the broker to take the last decisions [s]."""
+_PROPERTIES_BYTES = 10_000
+"""Room for the topic and the properties of a message in its packet [bytes]."""
+
+
+class DecisionPublisher(Protocol):
+    """What publishes the decisions of an asset over a session."""
+
+    def publish(self) -> None:
+        """Send decisions, as many as the session can take."""
+
+    def note_answer(self, message_id: int, refusal: str | None) -> None:
+        """Note the answer of the broker to a decision.
+
+        Parameters
+        ----------
+        message_id : int
+            The number that `Session.send` has returned.
+        refusal : str or None
+            Why the broker refuses the decision; None if it has taken it.
+        """
+
+    def resend_unacknowledged(self) -> None:
+        """Note that decisions without an answer must be sent again."""
+
+    def end_pause(self) -> None:
+        """Send decisions again at once, even if the broker has refused one a moment ago."""
+
+
+class Session:
+    """A session at a broker, which keeps messages while the watch is away.
+
+    Parameters
+    ----------
+    broker : Broker
+        The broker, and the topic of the observations.
+    name : str
+        The name of the mission or of the group of assets.
+    folder : Path
+        The folder with the file of the client name, which nobody else can guess.
+    note : callable
+        Called with a sentence when the connection is lost or found, and when the broker refuses
+        something.
+    heartbeat : callable
+        Returns the state of the twin, which is published at regular intervals.
+
+    Attributes
+    ----------
+    unread : deque of MQTTMessage
+        Messages that have come and were not given by `receive` yet.
+    publishers : dict of DecisionPublisher to None
+        Those that have decisions to publish, in their order.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        name: str,
+        folder: Path,
+        note: Callable[[str], None],
+        heartbeat: Callable[[], JsonObject],
+    ) -> None:
+        self._broker = broker
+        self.note = note
+        self._heartbeat = heartbeat
+        self._heartbeat_topic = broker.topic.replace("+", "fleet") + "/heartbeat"
+        self._where = f"broker at {broker.host}:{broker.port}"
+
+        # The client name, by which the broker knows the session
+        self._path = folder / f"{name}{CLIENT_SUFFIX}"
+        lines = []
+        if self._path.is_file():
+            lines = self._path.read_text(encoding="utf-8").splitlines()
+        self._client_name = lines[0] if lines else ""
+        if not self._client_name:
+            self._client_name = f"uav-twin-{name}-{token_hex(8)}"
+        self._discards_session = lines[1:] == [DISCARD_SESSION]
+        self._has_session_at_broker = len(lines) == 1
+
+        # The connection
+        self._client: Client | None = None
+        self._was_subscribed = False
+        self._failure = ""  # why the connection is about to be dropped
+        self._reported_failure = ""
+        self._next_attempt = 0.0
+        self._retry_seconds = FIRST_RETRY_SECONDS
+        self._next_heartbeat = 0.0
+
+        # Messages and decisions
+        self.unread: deque[MQTTMessage] = deque()
+        self._last_message: MQTTMessage | None = None
+        self._publisher_of_message: dict[
+            int, DecisionPublisher
+        ] = {}  # those sent and not acknowledged
+        self.publishers: dict[DecisionPublisher, None] = {}
+
+    @property
+    def can_send(self) -> bool:
+        """Whether a decision can be sent at once."""
+        is_full = len(self._publisher_of_message) >= _UNACKNOWLEDGED_DECISIONS
+        return self._is_connected and not is_full
+
+    @property
+    def _is_connected(self) -> bool:
+        """Whether the broker has let the twin in, and the connection is not lost."""
+        return self._client is not None and self._client.is_connected()
+
+    def _connect(self) -> None:
+        """Connect with a new client.
+
+        Nothing of a former client is needed: what was not acknowledged is known to the publishers
+        and to the broker.
+        """
+        from paho.mqtt import client as paho
+        from paho.mqtt.enums import CallbackAPIVersion
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2,
+            client_id=self._client_name,
+            protocol=paho.MQTTv5,
+            manual_ack=True,
+        )
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.SessionExpiryInterval = _SESSION_SECONDS
+        properties.ReceiveMaximum = _UNREAD_MESSAGES
+        properties.MaximumPacketSize = LARGEST_MESSAGE + _PROPERTIES_BYTES
+        broker = self._broker
+        if broker.user is not None:
+            client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
+        if broker.tls:
+            client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+        last_will = json.dumps({"state": "lost"})
+        client.will_set(self._heartbeat_topic, last_will, qos=1, retain=True)
+        client.on_message = lambda _client, _data, message: self.unread.append(message)
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_publish = self._on_publish
+        client.connect(
+            broker.host,
+            broker.port,
+            _KEEPALIVE_SECONDS,
+            clean_start=self._discards_session,
+            properties=properties,
+        )
+        self._client = client
+
+    def _on_connect(
+        self,
+        client: "Client",
+        _data: object,
+        flags: "ConnectFlags",
+        reason: "ReasonCode",
+        _properties: "Properties | None",
+    ) -> None:
+        """Subscribe to the observations once the broker has let the twin in."""
+        from paho.mqtt.subscribeoptions import SubscribeOptions
+
+        if reason.is_failure:
+            self._failure = (
+                f"the {self._where} refuses the twin: {reason}; give a user in the address and the "
+                f"password in {PASSWORD_VARIABLE}"
+            )
+            return
+        if self._discards_session:
+            return
+        if self._has_session_at_broker and not flags.session_present:
+            self.note(f"The {self._where} has forgotten this watch: what came meanwhile is lost.")
+        # A retained message was published before the watch, at a time that nobody knows
+        options = SubscribeOptions(qos=1, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
+        client.subscribe(self._broker.topic, options=options)
+
+    def _on_subscribe(
+        self,
+        _client: "Client",
+        _data: object,
+        _message_id: int,
+        reasons: "list[ReasonCode]",
+        _properties: "Properties | None",
+    ) -> None:
+        """Note that observations come now, and let all publishers begin."""
+        reason = reasons[0]
+        if reason.is_failure:
+            self._failure = (
+                f"the {self._where} does not let the twin read {self._broker.topic}: {reason}; "
+                "grant its user that right"
+            )
+            return
+        # Without the second line, because the former session is discarded already
+        atomic_write_text(self._path, self._client_name + "\n")
+        self._was_subscribed = True
+        self._has_session_at_broker = True
+        self._reported_failure = ""
+        self._retry_seconds = FIRST_RETRY_SECONDS
+        self._next_heartbeat = 0.0
+        for publisher in self.publishers:
+            publisher.end_pause()
+        self.note(f"Connected to {self._broker.host}:{self._broker.port}.")
+
+    def _on_disconnect(
+        self,
+        _client: "Client",
+        _data: object,
+        _flags: "DisconnectFlags",
+        reason: "ReasonCode",
+        _properties: "Properties | None",
+    ) -> None:
+        """Note why the connection was lost, unless the cause is known already."""
+        self._failure = self._failure or f"the {self._where} is away ({reason})"
+
+    def _on_publish(
+        self,
+        _client: "Client",
+        _data: object,
+        message_id: int,
+        reason: "ReasonCode",
+        _properties: "Properties",
+    ) -> None:
+        """Hand the answer of the broker to the publisher of the message."""
+        publisher = self._publisher_of_message.pop(message_id, None)
+        if publisher is not None:
+            publisher.note_answer(message_id, str(reason) if reason.is_failure else None)
+
+    def _drop_connection(self, failure: str) -> None:
+        """Drop the connection, to try again later; the first time a failure ends the watch.
+
+        Parameters
+        ----------
+        failure : str
+            The cause, if no callback of the client has noted one.
+        """
+        failure = self._failure or failure
+        self._failure = ""
+        self._client = None
+        if not self._was_subscribed:
+            raise MissionInputError(f"{failure}.")
+        if failure != self._reported_failure:
+            self.note(f"Waiting: {failure}.")
+        self._reported_failure = failure
+        self._next_attempt = time.monotonic() + self._retry_seconds
+        self._retry_seconds = min(2.0 * self._retry_seconds, LONGEST_RETRY_SECONDS)
+        self.unread.clear()  # they were not acknowledged, so that the broker sends them again
+        self._last_message = None
+        for publisher in set(self._publisher_of_message.values()):
+            publisher.resend_unacknowledged()
+        self._publisher_of_message.clear()
+
+    def _exchange(self, wait: float) -> None:
+        """Exchange packets with the broker, or try to connect again.
+
+        Parameters
+        ----------
+        wait : float
+            How long to wait at most if nothing comes [s].
+        """
+        client = self._client
+        if client is None:
+            client = self._try_to_connect(wait)
+        if client is None:
+            return
+        count = len(self.unread)
+        error = client.loop(wait)
+        # All that has arrived already
+        while not error and len(self.unread) > count:
+            count = len(self.unread)
+            error = client.loop(0.0)
+        if error or self._failure or client.socket() is None:
+            self._drop_connection(f"the {self._where} is away ({error.name})")
+            return
+        if self._discards_session and self._is_connected:
+            # The former session has ended. The new one is begun by a further connection, because
+            # brokers that restart forget a session that was begun by discarding another one.
+            client.disconnect()
+            self._client = None
+            self._discards_session = False
+            self._failure = ""
+            return
+        for publisher in list(self.publishers):
+            publisher.publish()
+        if self._is_connected and time.monotonic() >= self._next_heartbeat:
+            self._next_heartbeat = time.monotonic() + HEARTBEAT_SECONDS
+            client.publish(self._heartbeat_topic, json.dumps(self._heartbeat()), retain=True)
+
+    def _try_to_connect(self, wait: float) -> "Client | None":
+        """Return a new client; None if it is too early for an attempt, or if it fails."""
+        pause = self._next_attempt - time.monotonic()
+        if pause > 0.0:
+            time.sleep(min(pause, wait))
+            return None
+        try:
+            self._connect()
+        except OSError as error:
+            address = f"{self._broker.host}:{self._broker.port}"
+            self._drop_connection(f"no broker answers at {address} ({error})")
+        return self._client
+
+    def receive(self, wait: float) -> "Iterator[MQTTMessage | None]":
+        """Yield the messages as they come, without end.
+
+        A message is acknowledged when the next one is asked for, or earlier by `acknowledge`.
+
+        Parameters
+        ----------
+        wait : float
+            The time [s] without a message after which None is given.
+        """
+        while True:
+            while self.unread:
+                self._last_message = self.unread.popleft()
+                yield self._last_message
+                self.acknowledge()
+            end = time.monotonic() + wait
+            self._exchange(wait)
+            while not self.unread and time.monotonic() < end:
+                self._exchange(wait)
+            if not self.unread:
+                yield None
+
+    def acknowledge(self) -> None:
+        """Acknowledge the last message, whose content is in the journal."""
+        message = self._last_message
+        if message is not None and self._client is not None:
+            self._client.ack(message.mid, message.qos)
+        self._last_message = None
+
+    def send(self, topic: str, decision: Decision, publisher: DecisionPublisher) -> int:
+        """Send a decision without waiting for the answer of the broker.
+
+        Parameters
+        ----------
+        topic : str
+            The topic of the observations of the asset.
+        decision : dict
+            The decision.
+        publisher : DecisionPublisher
+            Gets the answer of the broker.
+
+        Returns
+        -------
+        int
+            The number of the message, which comes with the answer.
+        """
+        assert self._client is not None, "`can_send` says whether there is a connection"
+        message = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1)
+        self._publisher_of_message[message.mid] = publisher
+        return message.mid
+
+    def close(self) -> None:
+        """Disconnect once the broker has the last decisions; the broker keeps the session."""
+        has_crashed = sys.exc_info()[0] is not None
+        end = time.monotonic() + _GOODBYE_SECONDS
+        while self._has_decisions_to_send and time.monotonic() < end:
+            if self._client is None and (self._was_subscribed or has_crashed):
+                break
+            self._exchange(0.1)
+        if self._has_decisions_to_send:
+            self.note(
+                "The broker has not taken all decisions: the rest is published when the watch goes "
+                "on."
+            )
+        if self._client is not None:
+            self._say_goodbye(self._client, "lost" if has_crashed else "ended")
+
+    @property
+    def _has_decisions_to_send(self) -> bool:
+        """Whether a decision is not sent yet, or sent and not acknowledged."""
+        return bool(self.publishers) or bool(self._publisher_of_message)
+
+    def _say_goodbye(self, client: "Client", state: str) -> None:
+        """Publish the last heartbeat, and disconnect in order."""
+        connection = client.socket()
+        if connection is None:
+            return
+        last_heartbeat = json.dumps(self._heartbeat() | {"state": state})
+        client.publish(self._heartbeat_topic, last_heartbeat, retain=True)
+        # The client closes its socket at once. If something has come that nobody has read, the
+        # system then resets the connection, and the broker may see that before the goodbye. So a
+        # copy of the socket is read until the broker closes the connection.
+        with suppress(OSError), socket.socket(fileno=os.dup(connection.fileno())) as copy:
+            copy.settimeout(_GOODBYE_SECONDS)
+            client.disconnect()
+            while copy.recv(65536):
+                pass

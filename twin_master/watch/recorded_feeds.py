@@ -1,0 +1,240 @@
+"""Feeds that can be read again: files of lines, the store of a run, the journal of a folder."""
+
+import io
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import xarray as xr
+
+from reporting.arrays import Float
+from reporting.errors import DamagedFileError
+from reporting.netcdf import read_groups
+from twin_master.errors import MissionInputError
+from twin_master.mission.journal import JOURNAL_NAME, array_from_json, record_of_line
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.feed import Feed
+from twin_master.watch.lines import GrowingFile, Position, contains, find_file
+from twin_master.watch.message import (
+    LARGEST_MESSAGE,
+    FeedItem,
+    Message,
+    MessageContent,
+    MessageReader,
+    Refused,
+)
+from twin_master.watch.records import JournalLine, JsonObject
+from twin_master.watch.step_status import StepStatus
+
+_TEXT_CHARACTERS = 300
+
+
+def beginning_of(content: bytes | Refused) -> str:
+    """Return the beginning of the text of a message, for the list of refused messages."""
+    if isinstance(content, Refused):
+        return ""
+    return content[:_TEXT_CHARACTERS].decode("utf-8", "replace").rstrip("\n")
+
+
+class RecordedFeed(Feed):
+    """A file of lines, which can be read again.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    scenario : Scenario
+        The scenario of the asset.
+    follow : bool
+        Whether to wait at the end of the file for more, also in a file that takes its place.
+
+    Attributes
+    ----------
+    longest_line : float
+        The greatest length of a line [bytes].
+    """
+
+    replayable = True
+    longest_line: float = LARGEST_MESSAGE
+
+    def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
+        super().__init__()
+        self.path = path
+        self.follow = follow
+        self.scenario = scenario
+        self.reader = MessageReader(scenario)
+
+    def contains_position(self, position: Position) -> bool:
+        """Return whether a position is in the file, or in a rotated one if it is followed."""
+        with self.open_file(position) as file:
+            return contains(file, position)
+
+    def open_file(self, position: Position | None) -> BinaryIO:
+        """Return the file that contains a position, open; if none does, that at the path."""
+        file = find_file(self.path, position, follow=self.follow) or self.path
+        return file.open("rb", buffering=0)
+
+    def messages(self, position: Position | None) -> Iterator[FeedItem]:
+        """Yield the messages after a position; None if no further one has come yet."""
+        followed_path = self.path if self.follow else None
+        lines = GrowingFile(self.open_file(position), position, followed_path)
+        lines.longest = self.longest_line
+        for line in lines:
+            content: MessageContent | None = line
+            if isinstance(line, bytes):
+                content = self.content_of(line, lines.begin)
+            self.position = lines.position
+            if line is None:
+                yield None, ""
+            elif content is not None:
+                yield self.reader.read(content), beginning_of(line)
+
+    def content_of(self, line: bytes, begin: int) -> MessageContent | None:
+        """Return the message in a line; None if the line is no message.
+
+        Parameters
+        ----------
+        line : bytes
+            The line, with its line feed.
+        begin : int
+            Where the line begins in its file [bytes].
+        """
+        return line
+
+
+class RunFeed(RecordedFeed):
+    """A NetCDF file with the group `observed` of a run: observations, and controls in force.
+
+    Raises
+    ------
+    MissionInputError
+        If the file cannot be read, or has other sensors or controls than the scenario.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario) -> None:
+        super().__init__(path, scenario)
+        role = scenario.observation.role
+        try:
+            group: xr.Dataset = read_groups(path)["observed"].to_dataset()
+            records = self._records_of(group)
+        except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
+            reason = str(error).rstrip(".")
+            raise MissionInputError(
+                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {reason}."
+            ) from None
+        self._lines = "".join(f"{json.dumps(record)}\n" for record in records).encode()
+
+    def _records_of(self, group: xr.Dataset) -> list[JsonObject]:
+        """Return a message for each step of the group `observed`."""
+        role = self.scenario.observation.role
+        rows = group[role].values.tolist()
+        controls = []
+        if "control_index" in group:
+            controls = group["control_index"].values.tolist()
+        self._check_shape(group, rows, controls)
+        records: list[JsonObject] = []
+        for row, step in zip(rows, group["step"].values.tolist(), strict=True):
+            records.append({role: row, "step": int(step)})
+        for _, _, name, _ in self.scenario.readings:
+            if name in group:
+                _add_finite_values(records, name, group[name].values.tolist())
+        covariance = group.get(f"{role}_covariance")  # of modes
+        if covariance is not None:
+            for record, triangle in zip(records, covariance.values, strict=False):
+                record["covariance"] = self._symmetric_matrix(triangle).tolist()
+        for record, control in zip(records, controls, strict=False):
+            record["control"] = self.scenario.control_names[int(control)]
+        return records
+
+    def _check_shape(
+        self, group: xr.Dataset, rows: Sequence[Sequence[float]], controls: Sequence[int]
+    ) -> None:
+        """Refuse a group with another number of sensors, or with controls that are not known."""
+        count = self.scenario.observation.count
+        lengths = {len(row) for row in rows}
+        known_controls = range(len(self.scenario.control_names))
+        has_unknown_control = any(control not in known_controls for control in controls)
+        if not lengths <= {count} or has_unknown_control:
+            shape = group[self.scenario.observation.role].shape
+            raise ValueError(
+                f"{count} sensors and the controls of the scenario are expected, and the shape "
+                f"{shape} came"
+            )
+
+    def _symmetric_matrix(self, triangle: Float) -> Float:
+        """Return the matrix with a lower triangle; a missing covariance (NaN) is zero."""
+        count = self.scenario.observation.count
+        matrix = np.zeros((count, count))
+        matrix[np.tril_indices(count)] = np.nan_to_num(triangle)
+        symmetric: Float = matrix + np.tril(matrix, -1).T
+        return symmetric
+
+    def open_file(self, position: Position | None) -> BinaryIO:
+        """Return the messages as a file with a line of JSON for each step."""
+        return io.BytesIO(self._lines)
+
+
+def _add_finite_values(records: Sequence[JsonObject], name: str, values: Sequence[float]) -> None:
+    """Add the value of each step to its record, if it is finite."""
+    for record, value in zip(records, values, strict=True):
+        if math.isfinite(value):
+            record[name] = value
+
+
+class FolderFeed(RecordedFeed):
+    """The journal of another run or watch, of any version: its observations as they came.
+
+    A damaged line is refused, and the lines after it are read on.
+
+    Raises
+    ------
+    MissionInputError
+        If the folder has no journal.
+    """
+
+    longest_line = math.inf
+
+    def __init__(self, folder: Path, scenario: Scenario) -> None:
+        super().__init__(folder / JOURNAL_NAME, scenario)
+        if not self.path.is_file():
+            raise MissionInputError(
+                f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME})."
+            )
+
+    def content_of(self, line: bytes, begin: int) -> MessageContent | None:
+        """Return the observation in a line; None if it has none, or was cut off by a kill."""
+        record = record_of_line(line, self.path)
+        if record is None and line.endswith(b"\n"):
+            number = self.path.read_bytes()[:begin].count(b"\n") + 1
+            return Refused(f"line {number} of {self.path.name} was changed or is damaged")
+        if record is None or "observed" not in record:
+            return None
+        try:
+            return self._message_of(record)
+        except (KeyError, TypeError, ValueError, IndexError):
+            return Refused("the line has another layout")
+
+    def _message_of(self, line: JournalLine) -> Message | Refused | None:
+        """Return the observation in a line of the journal; None for a step without a message."""
+        observed = array_from_json(line["observed"])
+        control = int(line["control_index"])
+        line_step = int(line["step"])
+        step = int(line.get("observation_step", line_step))
+        status = StepStatus.WITH_CONTROL  # a line of a simulated mission has no intake
+        if "intake" in line:
+            # The last character belongs to the step of the line, those before it to earlier steps
+            character = line["intake"]["given"][step - line_step - 1]
+            status = StepStatus(int(character))
+        if status is StepStatus.MISSING:
+            return None
+        count = self.scenario.observation.count
+        width = self.scenario.row_width
+        if len(observed) not in (count, width) or control >= len(self.scenario.control):
+            return Refused("it is of an asset with other sensors or controls")
+        row = np.full(width, np.nan)
+        row[: len(observed)] = observed  # it may have been recorded without covariances
+        has_assumed_control = status is not StepStatus.WITH_CONTROL
+        return Message(row, control, step=step, assumed=has_assumed_control)

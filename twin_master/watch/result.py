@@ -1,0 +1,131 @@
+"""The files of a watch beside its journal: `run.nc`, tables, summary and report."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import takewhile
+
+from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.mission.journal import last_step, records_backwards
+from twin_master.mission.replay import replay
+from twin_master.network.estimator import Notice
+from twin_master.store.mission_result import MissionResult
+from twin_master.store.summary import FigureGroup
+from twin_master.store.writing import store_flight
+from twin_master.watch.folder import WATCHED_ASSET, Watch
+from twin_master.watch.intake import Counts
+from twin_master.watch.records import JournalLine, JsonObject
+from twin_master.watch.rejected import REJECTED_NAME
+
+STORED_STEPS = 1_000
+"""Default number of last steps in `run.nc` and in the report; the journal has all steps."""
+
+
+def store_watch(
+    watch: Watch, counts: Counts, *, last: int = STORED_STEPS, report: bool = True
+) -> None:
+    """Write `run.nc`, tables, summary and report of the last steps of a watch.
+
+    Parameters
+    ----------
+    watch : Watch
+        The watch, which has ended.
+    counts : Counts
+        How many messages came, and what became of them.
+    last : int
+        The number of last steps that are stored.
+    report : bool
+        Whether to write the report.
+    """
+    step, _ = last_step(watch.journal_path)
+    step_count = step + 1
+    if not step_count:
+        watch.progress.note("Nothing was observed: there is nothing to report.")
+        return
+    result = _last_steps(watch, step_count, last)
+    attributes: JsonObject = {}
+    if watch.teaching.adopted_models:
+        model = watch.teaching.adopted_models[-1]
+        attributes["model_patch"] = model["patch"]
+        attributes["model_patch_from_step"] = model["from_step"]
+    with watch.progress.stage("Storing"):
+        store_flight(
+            watch.folder,
+            watch.config,
+            result,
+            FlownAndBelieved(WATCHED_ASSET, watch.source.origin.model),
+            steps=step_count,
+            figures=_summary_figures(watch, counts, step_count),
+            attributes=attributes,
+        )
+    if report:
+        from twin_master.report.page import write_report
+
+        with watch.progress.stage("Writing the report"):
+            write_report(watch.folder)
+
+
+def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
+    """Return the last of the steps of a watch, smoothed, as the result of a mission."""
+    first = max(0, step_count - last)
+    history, _ = replay(watch.journal_path, watch.models, None, first_step=first)
+    history = history.without_first(first - history.first_step)
+    history = replace(history, notices=notices_since(watch, first))
+    knowledge = watch.models[-1].knowledge
+    return MissionResult(watch.scenario, knowledge, history, models=watch.models)
+
+
+def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
+    """Return the notices of a watch from a step on, each sentence once, with its step.
+
+    A notice before the first step of the watch counts to that step.
+
+    Parameters
+    ----------
+    watch : Watch
+        The watch.
+    first_step : int
+        The first step whose notices are returned. The first alarm of the watch is returned in any
+        case.
+    """
+    records: list[tuple[int, JsonObject]] = []
+    first_alarm = watch.teaching.first_alarm
+    if first_alarm is not None and first_alarm[0] < first_step:
+        records.append(first_alarm)
+    for line in _lines_since(watch, first_step):
+        for notice in line.get("notices", []):
+            records.append((_step_of(line), notice))
+    notices: dict[str, tuple[int, Notice]] = {}
+    for step, record in records:
+        notice = Notice(**{**record, "sensors": tuple(record["sensors"])})
+        notices.setdefault(notice.sentence, (step, notice))
+    return list(notices.values())
+
+
+def _lines_since(watch: Watch, first_step: int) -> Sequence[JournalLine]:
+    """Return the lines of the journal from a step on, in their order."""
+    backwards = (line for line, _, _ in records_backwards(watch.journal_path))
+    lines = list(takewhile(lambda line: _step_of(line) >= first_step, backwards))
+    return lines[::-1]
+
+
+def _step_of(line: JournalLine) -> int:
+    """Return the step of a line; 0 for the header and for a line before the first step."""
+    return max(int(line.get("step", 0)), 0)
+
+
+def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[FigureGroup]:
+    """Return the figures for the summary: numbers of messages, and the gap of each patch."""
+    words = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
+    message_counts = [
+        step_count,
+        counts.missing,
+        counts.late,
+        counts.duplicates,
+        counts.rejected,
+    ]
+    figures = [FigureGroup("watch", words, message_counts)]
+    for model in watch.teaching.adopted_models:
+        residuals = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
+        fields = words | {"first": model["from_step"]}
+        figures.append(FigureGroup("patch", fields, residuals))
+    return figures

@@ -1,0 +1,94 @@
+"""The search for the cause of an alarm of a watch: `uav-twin discrepancy run` in its own process.
+
+This package hands the search in where a watch is begun, because `twin_master` does not import
+`discrepancy`.
+"""
+
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import ParamSpec, TypeVar
+
+from twin_master.watch.cause_search import RunningSearch, SearchRequest
+
+COMMAND = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
+"""The command that an alarm names, run by this interpreter."""
+NICENESS = 10
+"""Niceness of a search beside a live watch, whose steps come first."""
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+
+
+class _SearchProcess:
+    """A search in a process of its own."""
+
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        self._process = process
+
+    def has_ended(self) -> bool:
+        """Return whether the process has ended."""
+        return self._process.poll() is not None
+
+    def stop(self) -> None:
+        """End the process, if it still runs, and wait until it has ended."""
+        if not self.has_ended():
+            self._process.terminate()
+            self._process.wait()
+
+
+class DiscrepancySearch:
+    """Starts the workflow on discrepancies for an alarm; a `CauseSearch` of `twin_master`.
+
+    Parameters
+    ----------
+    command : sequence of str
+        The command that the options of the search are added to.
+    """
+
+    def __init__(self, command: Sequence[str] = COMMAND) -> None:
+        self._command = command
+
+    def start(self, request: SearchRequest) -> RunningSearch:
+        """Start a search and return without waiting for its end.
+
+        The process has a session of its own, so that no key of the terminal ends it.
+        """
+        options = {
+            "--from-run": request.run_folder,
+            "--from-step": request.first_step,
+            "--to-step": request.last_step,
+            "--out": request.verdict_folder,
+            "--seed": request.seed,
+        }
+        arguments = []
+        for option, value in options.items():
+            arguments += [option, str(value)]
+        with request.log.open("wb") as log:
+            process = subprocess.Popen(
+                [*self._command, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        if request.low_priority:
+            with suppress(ProcessLookupError):  # the process has ended already
+                os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+        return _SearchProcess(process)
+
+
+def with_discrepancy_search(
+    function: Callable[_Parameters, _Result],
+) -> Callable[_Parameters, _Result]:
+    """Return a function of `twin_master` with a `DiscrepancySearch` as default `cause_search`."""
+
+    @functools.wraps(function)
+    def with_search(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
+        options.setdefault("cause_search", DiscrepancySearch())
+        return function(*arguments, **options)
+
+    return with_search
