@@ -36,7 +36,7 @@ def run() -> list[Measurement]:
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / steps
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
-    observations = flown.row, flown.control_index
+    observations = flown.observation_rows, flown.control_index
     sensors = knowledge.sensor_model
     likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *observations)) / steps
     worsening = TransitionFamily.learnable(scenario)

@@ -252,7 +252,7 @@ def make_calibration() -> Callable[..., Calibration]:
 def no_report() -> Iterator[None]:
     """The report of a run has tests of its own and takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
+        patch.setattr("twin_master.workflow._write_report", lambda folder: (folder / "report.html").touch())
         yield
 
 

@@ -1,4 +1,4 @@
-"""Commands of one asset: `run`, which is `python -m twin_master`, too, `watch`, `view`, `scenario check`."""
+"""Commands of one asset: `run`, also as `python -m twin_master`, `watch`, `view`, `scenario check`."""
 
 import json
 import os
@@ -9,6 +9,7 @@ import time
 import traceback
 import webbrowser
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,9 +32,12 @@ from twin_master.command_options import (
     WorkersOption,
     complete_scenario,
 )
-from twin_master.errors import TwinMasterError, said
-from twin_master.fleet_command import engine_of, fly_and_show, shown
+from twin_master.errors import TwinMasterError
+from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
 from twin_master.watch.cause_search import CauseSearch
+
+Decision = Mapping[str, Any]
+"""The decision of a twin in a step, as `decision_from_line` returns it."""
 
 
 def run(
@@ -142,91 +146,191 @@ def run(
 
     Example: `uav-twin run level_turns --seed 3 --out runs/first`
     """
-    scenario, ssp = _flown(scenario, with_scenario)
+    scenario, ssp = _scenario_and_ssp(scenario, with_scenario)
     overrides = parts.Overrides(
-        seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt
+        seed=seed,
+        fmu=fmu,
+        binding=binding,
+        strain_library=strain_library,
+        in_process=in_process,
+        calibration=calibration,
+        ssp=ssp,
+        library=library,
+        learnt=learnt,
     )
     if seeds is not None:
-        if scenario is None or resume is not None or seed is not None or view or policy is not None:
-            raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
+        has_other_options = resume is not None or seed is not None or policy is not None or view
+        if scenario is None or has_other_options:
+            raise _wrong_use_of_seeds()
         fleet = parts.ensemble(scenario, parts.seed_range(seeds), overrides)
-        fly_and_show(
-            fleet, out, engine_of(workers, cluster), replace=replace, report=not no_report, json=json
-        )
+        engine = choose_engine(workers, cluster)
+        fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
     if workers is not None or cluster is not None:
-        given = "--workers" if cluster is None else "--cluster"
-        raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint=given)
+        raise typer.BadParameter(
+            "belongs to --seeds: one mission flies alone.",
+            param_hint="--workers" if cluster is None else "--cluster",
+        )
     loaded = None if scenario is None else parts.load_scenario(scenario)
+    has_changes = out is not None or policy is not None or overrides != parts.Overrides()
+    if resume is not None and (replace or has_changes):
+        raise _wrong_use_of_resume()
     if resume is not None:
-        if out is not None or replace or policy is not None or overrides != parts.Overrides():
-            raise typer.BadParameter(said("run_folder.resume"), param_hint="--resume")
+        fly_mission = partial(parts.resume, resume, loaded)
         folder = resume
-    else:
-        if loaded is None:
-            raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+    elif loaded is not None:
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
+        fly_mission = partial(parts.fly, loaded, folder, overrides, policy=policy, replace=replace)
+    else:
+        raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+    _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
 
-    def kept() -> str:
-        begun = (folder / "config.json").is_file()
-        hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
-        return f"nothing is lost: {hint}"
 
-    with shown(view) as begun, terminal.interruptible(kept):
-        told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report, "begun": begun}
-        if loaded is None or resume is not None:
-            outcome = parts.resume(folder, loaded, **told)
-        else:
-            outcome = parts.fly(loaded, folder, overrides, policy=policy, replace=replace, **told)
+def _wrong_use_of_seeds() -> typer.BadParameter:
+    """Return the error that options do not go together with --seeds."""
+    return typer.BadParameter(
+        "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor --view.",
+        param_hint="--seeds",
+    )
+
+
+def _wrong_use_of_resume() -> typer.BadParameter:
+    """Return the error that options do not go together with --resume."""
+    return typer.BadParameter(
+        "a run is continued with what its folder holds: give nothing beside it that would change it.",
+        param_hint="--resume",
+    )
+
+
+def _fly_and_print_mission(
+    fly_mission: "Callable[..., parts.RunOutcome]",
+    folder: Path,
+    *,
+    report: bool,
+    view: bool,
+    json: bool,
+) -> None:
+    """Fly a mission, and print its outcome.
+
+    Parameters
+    ----------
+    fly_mission : callable
+        `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and
+        `begun`.
+    folder : Path
+        The run folder.
+    report : bool
+        Whether to write the report.
+    view : bool
+        Whether to show the mission in the browser.
+    json : bool
+        Whether to print JSON.
+    """
+
+    def explain_interruption() -> str:
+        if (folder / "config.json").is_file():
+            return f"nothing is lost: continue with `uav-twin run --resume {folder}`"
+        return "nothing is lost: no run was begun"
+
+    with view_beside(view) as begun, terminal.interruptible(explain_interruption):
+        outcome = fly_mission(progress=terminal.progress(), report=report, begun=begun)
         if json:
-            terminal.print_json(_record(outcome))
+            terminal.print_json(_outcome_record(outcome))
         else:
-            show_outcome(outcome)
+            print_outcome(outcome)
 
 
-def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
-    """Return the scenario, and the SSP file that is flown in the place of its asset."""
+def _scenario_and_ssp(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
+    """Return the scenario, and the SSP file that is flown instead of its asset.
+
+    An SSP file in the place of the scenario is flown; the option --scenario then names the
+    scenario.
+    """
     if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
         if with_scenario is None:
-            raise typer.BadParameter(said("scenario.beside_ssp"), param_hint="--scenario")
+            raise typer.BadParameter(
+                "an SSP file says what is flown, not how: name a scenario as well.",
+                param_hint="--scenario",
+            )
         return with_scenario, Path(scenario)
     if with_scenario is not None:
         raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
     return scenario, None
 
 
-def _record(outcome: "parts.RunOutcome") -> dict[str, Any]:
-    """Return the content of `summary.json` with the places of run and report."""
-    record: dict[str, Any] = json.loads((outcome.folder / parts.SUMMARY_NAME).read_text(encoding="utf-8"))
+def _outcome_record(outcome: "parts.RunOutcome") -> dict[str, Any]:
+    """Return the content of `summary.json` with the paths of run and report."""
+    summary = (outcome.folder / parts.SUMMARY_NAME).read_text(encoding="utf-8")
     report = None if outcome.report is None else str(outcome.report)
-    return {"folder": str(outcome.folder), "report": report} | record
+    record: dict[str, Any] = {"folder": str(outcome.folder), "report": report}
+    record |= json.loads(summary)
+    return record
 
 
-def show_outcome(outcome: "parts.RunOutcome") -> None:
+def print_outcome(outcome: "parts.RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
-    rows: list[list[str]] = []
-    sources: dict[str, int] = {}
+    numbers_of_sources = _numbers_of_sources(outcome)
+    rows = []
     for figure in outcome.figures:
-        reference = _shown(figure.reference, figure.unit)
+        reference = printed_value(figure.reference, figure.unit)
         if figure.reference_source:
-            reference += f" ({sources.setdefault(figure.reference_source, len(sources) + 1)})"
-        rows.append([figure.title, _shown(figure.value, figure.unit, "none"), reference])
+            reference += f" ({numbers_of_sources[figure.reference_source]})"
+        value = printed_value(figure.value, figure.unit, missing="none")
+        rows.append([figure.title, value, reference])
+    terminal.print_table(["figure", "this run", "reference"], rows + _timing_rows(outcome))
+    terminal.say(f"The twin {outcome.control}.")
+    if outcome.origin.differ:
+        terminal.say(
+            f"Asset and twin's model differ: flown was the {outcome.origin.asset}, and the twin "
+            f"believes the {outcome.origin.model}."
+        )
+    for notice in outcome.notices:
+        terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
+    for source, source_number in numbers_of_sources.items():
+        terminal.say(f"  ({source_number}) {source}")
+    if outcome.report is not None:
+        terminal.say(f"Report: {outcome.report}")
+    else:
+        terminal.say(f"Run: {outcome.folder}")
+
+
+def _numbers_of_sources(outcome: "parts.RunOutcome") -> dict[str, int]:
+    """Return a number from 1 for each source of a reference."""
+    numbers: dict[str, int] = {}
+    for figure in outcome.figures:
+        if figure.reference_source and figure.reference_source not in numbers:
+            numbers[figure.reference_source] = len(numbers) + 1
+    return numbers
+
+
+def _timing_rows(outcome: "parts.RunOutcome") -> list[list[str]]:
+    """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
+    rows = []
     for part in ("asset", "twin", "checkpoint"):
-        if entry := outcome.timing.get(f"{part}_seconds"):
-            taken = f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)"
-            rows.append([f"{part}, per {outcome.step_name}", taken, ""])
+        seconds = outcome.timing.get(f"{part}_seconds")
+        if seconds:
+            median = 1e3 * seconds["median"]
+            largest = 1e3 * seconds["largest"]
+            time_of_step = f"{median:.3g} ms (largest {largest:.3g} ms)"
+            rows.append([f"{part}, per {outcome.step_name}", time_of_step, ""])
     rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
-    terminal.show("run", "twin_master", outcome=outcome, rows=rows, sources=sources)
+    return rows
 
 
-def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:
+def printed_value(value: float | int | str | None, unit: str, missing: str = "") -> str:
+    """Return a value with its unit; the text `missing` for None."""
     return missing if value is None else f"{number(value)} {unit}".strip()
 
 
-def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
+def run_command_line(application: Callable[[], None], *further_errors: type[Exception]) -> None:
     """Run a command line; an error of this project's packages becomes one sentence and exit code 1.
 
-    `others` are base classes of errors of packages that this one may not import.
+    Parameters
+    ----------
+    application : callable
+        The command line.
+    *further_errors : type of Exception
+        The base classes of errors of packages that this one may not import.
     """
     try:
         with former_names_as_lines(lambda: terminal.loudness.quiet):
@@ -234,9 +338,10 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
-        # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
-        ours = parts.FmuError, parts.FiniteElementError, parts.CalibrationError, ReportingError
-        if not isinstance(error, (OSError, TwinMasterError, *ours, *others)):
+        lower_layers = (parts.FmuError, parts.FiniteElementError, parts.CalibrationError)
+        our_errors = (TwinMasterError, ReportingError, *lower_layers, *further_errors)
+        # The system's refusals, such as a full disk, are no defects of the program either.
+        if not isinstance(error, (OSError, *our_errors)):
             raise
         sentence = str(error)
         if isinstance(error, OSError):
@@ -250,7 +355,8 @@ def main() -> None:
     """Run `python -m twin_master`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     application.command()(run)
-    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m twin_master"))
+    run_with_options = terminal.with_common_options(application)
+    run_command_line(lambda: run_with_options(prog_name="python -m twin_master"))
 
 
 @accepts_former_options(steps="--turns", from_step="--from-turn")
@@ -376,84 +482,97 @@ def watch(
     Example: `uav-twin watch watched_wing --out runs/watched`
     """
     watches: list[parts.Watch] = []
-    live = follow or observations is None or observations == "-" or parts.is_broker(observations)
+    comes_from_broker = parts.is_broker(observations or "")
+    is_live = follow or observations is None or observations == "-" or comes_from_broker
 
-    def decide(decision: Mapping[str, Any]) -> None:
-        heard = _say(watches[0], decision, flush=live)
+    def print_decision(decision: Decision) -> None:
+        has_reader = _print_decision(watches[0], decision, flush=is_live)
         time.sleep(pace)
-        if not heard and not parts.is_broker(observations or ""):
+        if not has_reader and not comes_from_broker:
             signal.raise_signal(signal.SIGINT)  # which ends a watch in order
 
-    with shown(view) as begun:
+    with view_beside(view) as begun:
 
-        def opened(watched: parts.Watch) -> None:
+        def begin_watch(watched: parts.Watch) -> None:
             watches.append(watched)
             begun(watched.folder)
 
         folder = parts.watch(
-            scenario, observations, out, {"seed": seed, "calibration": calibration, "library": library},
-            decide=decide, resume=resume, follow=follow, steps=steps, model_patch=model_patch,
-            from_step=from_step, teach=teach, allow_unknown=allow_unknown, ca_file=ca_file, replace=replace,
-            last=last, report=not no_report, otherwise="-", begun=opened, cause_search=cause_search,
+            scenario,
+            observations,
+            out,
+            {"seed": seed, "calibration": calibration, "library": library},
+            decide=print_decision,
+            resume=resume,
+            follow=follow,
+            steps=steps,
+            model_patch=model_patch,
+            from_step=from_step,
+            teach=teach,
+            allow_unknown=allow_unknown,
+            ca_file=ca_file,
+            replace=replace,
+            last=last,
+            report=not no_report,
+            otherwise="-",
+            begun=begin_watch,
+            cause_search=cause_search,
             progress=terminal.progress(),
-        )  # fmt: skip
-        _write("", flush=True)
-        if not terminal.loudness.quiet:
-            _say_where(folder, watches[0], report=not no_report)
-    complaint = watches[0].intake.complaint()
+        )
+        _write_to_output("", flush=True)
+        _print_end_of_watch(folder, watches[0], report=not no_report)
+    _exit_on_complaint(watches[0])
+
+
+def _exit_on_complaint(watched: "parts.Watch") -> None:
+    """End the command with exit code 1 if the observations of a watch were not in order."""
+    complaint = watched.intake.complaint()
     if complaint:
-        typer.secho(complaint, fg="red", err=True)
-        raise typer.Exit(1)
+        raise terminal.error_exit(complaint)
 
 
-def _say_where(folder: Path, watched: "parts.Watch", *, report: bool) -> None:
-    """Print how many messages a watch has had, and where its folder and its report are."""
+def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -> None:
+    """Print how many messages a watch has received, and where its folder and its report are."""
+    if terminal.loudness.quiet:
+        return
     counts = watched.intake.counts
     refused = ""
     if counts.rejected:
         refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
-    typer.echo(f"Watch: {folder}, {counted(counts.received, 'message')}{refused}.", err=True)
+    received = counted(counts.received, "message")
+    typer.echo(f"Watch: {folder}, {received}{refused}.", err=True)
     if report and (folder / parts.REPORT_NAME).is_file():
         typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
 
 
-def _say(watched: "parts.Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
-    """Print a decision; return whether anybody reads it."""
-    for notice in decision["notices"]:  # also where the decisions go to a program
+def _print_decision(watched: "parts.Watch", decision: Decision, *, flush: bool) -> bool:
+    """Print a decision and its notices; return whether the output still has a reader."""
+    # Notices go to the error stream, so that people see them also if a program reads the decisions.
+    for notice in decision["notices"]:
         sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
         typer.secho(sentence, fg="yellow", err=True)
     if terminal.loudness.quiet:
         return True
-    people = sys.stdout.isatty()
-    if people and "control" not in decision:  # nothing was decided yet, and nothing comes
+    is_for_people = sys.stdout.isatty()
+    if not is_for_people:
+        return _write_to_output(json.dumps(decision) + "\n", flush=flush)
+    if "control" not in decision:  # before the first observation nothing is decided
         return True
-    line = _line(watched.scenario, decision) if people else json.dumps(decision)
-    return _write(line + "\n", flush=flush or people)
+    return _write_to_output(parts.decision_line(watched.scenario, decision) + "\n", flush=True)
 
 
-def _write(text: str, *, flush: bool) -> bool:
-    """Write to standard output; return whether it still leads anywhere."""
+def _write_to_output(text: str, *, flush: bool) -> bool:
+    """Write to standard output; return whether it still has a reader."""
     try:
         sys.stdout.write(text)
         if flush:
             sys.stdout.flush()
-    except BrokenPipeError:  # `watch | head`: what is left in the buffer goes nowhere, without a word
+    except BrokenPipeError:
+        # The reader has ended, as in `watch | head`. Python would complain at its end that it
+        # cannot write the rest of the buffer, so the rest goes to the null device.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return False
     return True
-
-
-def _line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
-    """Return a decision for people: a line of a terminal."""
-    health = "no state is believed"
-    if decision.get("state_believed", True):
-        health = ", ".join(f"{name} {said}" for name, said in parts.health_in_words(decision).items())
-    line = (
-        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
-        f"next {decision['next_control']} with probability {decision['probability']:.3f}"
-    )
-    chosen = decision.get("decided_by", "model")
-    return line if chosen == "model" else f"{line}; by {chosen} ({decision['hypotheses'][chosen]:.2f})"
 
 
 def view(
@@ -489,12 +608,13 @@ def view(
     Example: `uav-twin view runs/first --browser`
     """
 
-    def ready(address: str) -> None:
+    def print_address(address: str) -> None:
         typer.echo(f"{folder}: {address} (Ctrl-C ends it)")
         if browser:
             webbrowser.open(address)
 
-    (parts.serve_fleet if parts.is_fleet(folder) else parts.serve)(folder, port, ready)
+    serve = parts.serve_fleet if parts.is_fleet(folder) else parts.serve
+    serve(folder, port, print_address)
 
 
 def list_scenarios() -> None:
@@ -503,8 +623,21 @@ def list_scenarios() -> None:
     Example: `uav-twin scenarios`
     """
     files = scenario_files()
-    shown = {name: parts.load_scenario(path).scenario for name, path in files.items()}
-    terminal.show("scenarios", "twin_master", shown=shown, folder=next(iter(files.values())).parent)
+    rows = []
+    for name, path in files.items():
+        scenario = parts.load_scenario(path).scenario
+        levels = {factor.name: len(factor.levels) for factor in scenario.state}
+        controls = ", ".join(scenario.control_names)
+        steps = str(scenario.mission.steps)
+        rows.append([name, scenario.mission.title, steps, _levels_in_words(levels), controls])
+    terminal.print_table(["scenario", "title", "steps", "states", "controls"], rows)
+    folder = next(iter(files.values())).parent
+    terminal.say(f"The files, to copy and change: {folder}")
+
+
+def _levels_in_words(levels: Mapping[str, int]) -> str:
+    """Return the state factors with the number of their levels."""
+    return ", ".join(f"{factor} ({count} levels)" for factor, count in levels.items())
 
 
 def check_scenario(
@@ -526,4 +659,15 @@ def check_scenario(
     Example: `uav-twin scenario check level_turns`
     """
     record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
-    terminal.answer("scenario check", "twin_master", record, json=json)
+    if json:
+        terminal.print_json(record)
+        return
+    memory = record["memory"] / 2**20
+    terminal.say(f"{record['name']}: {record['title']}")
+    terminal.say(f"Flown: {record['flown']}.")
+    terminal.say(f"Believed: {record['believed']}.")
+    terminal.say(f"Uncertain: {record['uncertain']}, {record['draws']} draws.")
+    terminal.say(f"State: {record['states']} states, {_levels_in_words(record['levels'])}.")
+    terminal.say(f"Controls: {', '.join(record['controls'])}. Sensors: {record['sensors']}.")
+    terminal.say(f"Mission: {record['steps']} {record['step_name']}s, {record['prediction_steps']} ahead.")
+    terminal.say(f"Memory of the twin: about {memory:.3g} MiB.")

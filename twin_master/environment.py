@@ -1,7 +1,8 @@
-"""A scenario as an environment of gymnasium (extra `uav-twin[gym]`): for policies that others learn.
+"""A scenario as an environment of gymnasium (extra `uav-twin[gym]`), for reinforcement learning.
 
-An action is a control of the scenario, an observation what its sensors say, the reward that of the scenario
-for what really happened, eqs. (9) and (10) of Kapteyn et al. 2021 with its weights.
+An action is a control of the scenario, an observation is that of its sensors. The reward is that of
+the scenario for the true state: eqs. (9) and (10) of Kapteyn et al. 2021 with the scenario's
+weights.
 """
 
 from collections.abc import Mapping
@@ -15,12 +16,13 @@ import numpy as np
 from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
+from reporting.words import comma_list
 from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.fleet.checks import source_of
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.steps import Plant, decided_to_end
+from twin_master.mission.steps import Plant, sentence_of_ending_action
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 
 try:
@@ -28,43 +30,56 @@ try:
 except ImportError:
     raise MissionInputError("a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'.") from None
 
+Info = dict[str, Any]
+"""What is known of a step beside its observation, see `ScenarioEnvironment`."""
+
 
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     """The asset of a scenario, its damage and its sensors, step by step.
 
-    The first step of the mission is flown by `reset` under the scenario's first control. An episode has as
-    many steps as the mission, and then is truncated. A lost sensor shows zero; `info` holds NaN for it.
+    `reset` flies the first step of the mission, under the scenario's first control. An episode has
+    as many steps as the mission, and then is truncated. A lost sensor shows zero; `info` has NaN
+    for it.
 
     Parameters
     ----------
     scenario : LoadedScenario, str or Path
         The scenario, its shipped name, or its file.
     overrides : Overrides or mapping, optional
-        What differs from the file, as `fly` takes it.
+        What differs from the file, as for `fly`.
     progress : Progress, optional
-        Where the modelling reports.
+        Shows the stages of the modelling.
 
     Attributes
     ----------
+    scenario : Scenario
+        The scenario with the overrides.
     knowledge : Knowledge
-        What a twin of the scenario knows; `knowledge.twin()` is one, whose decisions are our own policy.
+        What a twin of the scenario knows; `knowledge.twin()` is one, whose decisions are our own
+        policy.
     action_space : Discrete(U)
-        Index of a control.
+        The index of a control.
     observation_space : Box (G,)
-        What the sensors say, SI, without bounds.
+        The sensor values, SI, without bounds.
 
     Raises
     ------
     MissionInputError
-        gymnasium is not installed, or the scenario observes modes.
+        If gymnasium is not installed, or the scenario observes modes.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
-        With one clear sentence.
+        If the scenario cannot be modelled; the error is one clear sentence.
 
     Notes
     -----
-    `info` of a step holds `observed` (G,), NaN where lost; `control`, its index; `step`; `seed`, that of the
-    mission: `reset(seed=s)` meets the noise and damage of `uav-twin run --seed s`; `state`, the true state by
-    name, SI; `reward_health` and `reward_control`, unweighted.
+    The entries of `info` after a step are
+
+    - `observed`: the sensor values (G,), NaN for a lost sensor;
+    - `control`: the index of the control;
+    - `step`: the number of the step;
+    - `seed`: the seed of the mission; `reset(seed=s)` meets the noise and damage of
+      `uav-twin run --seed s`;
+    - `state`: the true state by name, SI;
+    - `reward_health`, `reward_control`: the rewards without weights.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as the base class has it
@@ -78,112 +93,159 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     ) -> None:
         self.scenario = resolve_scenario(load_scenario(scenario), overrides)
         if self.scenario.observation.role == "modes":
-            raise MissionInputError(said("environment.modes", name=self.scenario.mission.name))
+            raise MissionInputError(
+                f"the scenario {self.scenario.mission.name} observes modes with a covariance, "
+                "which are no vector of sensors: take a scenario that observes sensors."
+            )
         source = source_of(self.scenario)
         source.check()
-        with ExitStack() as opened:  # what is packed is held as long as it is flown
-            self._folder = Path(opened.enter_context(TemporaryDirectory(prefix="uav_twin_")))
+        with ExitStack() as resources:
+            folder = resources.enter_context(TemporaryDirectory(prefix="uav_twin_"))
+            self._folder = Path(folder)
             source.prepare(self._folder, progress or SilentProgress())
             self.knowledge = prepare_knowledge(self.scenario, source, self.scenario.mission.seed)
             self._asset: Asset | None = source.open()
-            opened.callback(self._let_go)
-            self._start = self._asset.save_state()
-            self._opened = opened.pop_all()
+            resources.callback(self._close_asset)
+            self._initial_state = self._asset.save_state()
+            # Nothing failed: folder and asset stay open until `close`.
+            self._resources = resources.pop_all()
         self._plant: Plant | None = None
-        self._step, self._seed, self._control = 0, 0, 0
-        self._seen: Float = np.empty(0)
-        self._info: dict[str, Any] = {}
-        sensors = self.scenario.observation.count + len(self.scenario.readings)
+        self._step = 0
+        self._seed = 0
+        self._control = 0
+        self._last_observation: Float = np.empty(0)
+        self._last_info: Info = {}
+        values = self.scenario.observation.count + len(self.scenario.readings)
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (sensors,), np.float64)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (values,), np.float64)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float, Info]:
         """Begin a mission, and fly its first step under the first control of the scenario.
 
         Parameters
         ----------
         seed : int, optional
-            Seed of the mission; without it, it is drawn from the generator that the last seed began.
+            The seed of the mission; if left out, it is drawn.
         options : dict, optional
             Not used.
+
+        Returns
+        -------
+        (G,) array
+            The observation.
+        dict
+            The entries of `info`.
         """
         super().reset(seed=seed)
         if self._asset is None:
             raise MissionInputError("the environment is closed: make a new one.")
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
-        if getattr(self.scenario.asset, "seeds", ()):  # chance of its own, which begins with it
-            self._let_go()
+        asset_draws_by_itself = bool(getattr(self.scenario.asset, "seeds", ()))
+        if asset_draws_by_itself:
+            # Such an asset takes its seed when it is opened.
+            self._close_asset()
             scenario = self.scenario.with_seed(self._seed)
             source = scenario.asset.source(scenario)
             source.use_prepared_folder(self._folder)
             self._asset = source.open()
         else:
-            self._asset.restore_state(self._start)
+            self._asset.restore_state(self._initial_state)
         self._plant = self.knowledge.plant(self.knowledge.truth(self._seed), self._asset)
         self._step = 0
-        observation, _, info = self._fly(self.knowledge.twin().proposed_control, None)
+        first_control = self.knowledge.twin().proposed_control
+        observation, _reward, info = self._fly(first_control, None)
         return observation, info
 
-    def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, dict[str, Any]]:
-        """Fly one step under a control: observation, reward, terminated, truncated, info.
+    def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, Info]:
+        """Fly one step under a control.
 
-        An asset that ends its simulation by itself terminates the episode, with the last observation, no
-        reward and the sentence in `info["ended"]`, and so does an action that ends the mission, with what
-        came of it; the last step of the mission truncates it.
+        The episode is terminated if an action ends the mission, or if the asset ends its simulation
+        by itself; then `info["ended"]` holds the sentence. In the latter case the observation is
+        that of the step before, and the reward is zero. After the last step of the mission the
+        episode is truncated.
+
+        Parameters
+        ----------
+        action : int
+            The index of the control.
+
+        Returns
+        -------
+        (G,) array
+            The observation.
+        float
+            The reward.
+        bool
+            Whether the episode is terminated.
+        bool
+            Whether the episode is truncated.
+        dict
+            The entries of `info`.
 
         Raises
         ------
         gymnasium.error.ResetNeeded
-            The mission has not begun, or is over.
+            If the mission has not begun, or is over.
         gymnasium.error.InvalidAction
-            There is no such control.
+            If there is no such control.
         """
-        if self._plant is None or self._step >= self.scenario.mission.steps:
+        steps = self.scenario.mission.steps
+        if self._plant is None or self._step >= steps:
             raise gymnasium.error.ResetNeeded("the mission is over or has not begun: call reset().")
         if not self.action_space.contains(action):
-            known = self.scenario.control_names
-            raise gymnasium.error.InvalidAction(said("environment.control", known=known, action=action))
-        ended, last = "", self.scenario.mission.steps
+            raise gymnasium.error.InvalidAction(
+                "expected the index of one of the controls "
+                f"{comma_list(self.scenario.control_names)}, got {action!r}"
+            )
+        ended = ""
         try:
             observation, reward, info = self._fly(int(action), self._control)
             if self.scenario.ends(int(action)):
-                ended = decided_to_end(self.scenario, int(action))
+                ended = sentence_of_ending_action(self.scenario, int(action))
         except FmuEndedError as error:
-            observation, reward, info, ended = self._seen.copy(), 0.0, self._info, error.sentence
-        if ended:
-            self._step, info = last, info | {"ended": ended}
-        return observation, reward, bool(ended), not ended and self._step >= last, info
+            observation = self._last_observation.copy()
+            reward = 0.0
+            info = self._last_info
+            ended = error.sentence
+        terminated = ended != ""
+        if terminated:
+            self._step = steps
+            info = info | {"ended": ended}
+        truncated = not terminated and self._step >= steps
+        return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Let go of the asset and what was packed for it."""
-        self._opened.close()
+        """Close the asset, and remove the files that were made for it."""
+        self._resources.close()
         self._plant = None
 
-    def _let_go(self) -> None:
+    def _close_asset(self) -> None:
         if self._asset is not None:
             self._asset.close()
         self._asset = None
 
-    def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
+    def _fly(self, control: int, previous_control: int | None) -> tuple[Float, float, Info]:
+        """Fly one step under a control; return the observation (G,), the reward and `info`."""
         assert self._plant is not None
-        reading = self._plant.fly_step(control, before)
-        sensed, happened = reading.observed, reading.happened
-        assert happened is not None
-        rewards, weights = self.knowledge.rewards, self.scenario.rewards
-        health = float(rewards.health(happened.observation))
-        worth = rewards.control_reward[control]
-        reward = weights.health_weight * health + weights.control_weight * worth
+        reading = self._plant.fly_step(control, previous_control)
+        ground_truth = reading.ground_truth
+        assert ground_truth is not None  # a plant is simulated
+        weights = self.scenario.rewards
+        rewards = self.knowledge.rewards
+        health_reward = float(rewards.health(ground_truth.observation))
+        control_reward = rewards.control_reward[control]
+        reward = weights.health_weight * health_reward + weights.control_weight * control_reward
         info = {
-            "observed": sensed,
+            "observed": reading.observed,
             "control": control,
             "step": self._step,
             "seed": self._seed,
-            "state": dict(zip(self.scenario.state_names, happened.state.tolist(), strict=True)),
-            "reward_health": health,
-            "reward_control": worth,
+            "state": dict(zip(self.scenario.state_names, ground_truth.state.tolist(), strict=True)),
+            "reward_health": health_reward,
+            "reward_control": control_reward,
         }
-        self._control, self._step = control, self._step + 1
-        self._seen, self._info = np.nan_to_num(sensed, nan=0.0), info
-        return self._seen.copy(), reward, info
+        self._control = control
+        self._step += 1
+        self._last_observation = np.nan_to_num(reading.observed, nan=0.0)
+        self._last_info = info
+        return self._last_observation.copy(), reward, info

@@ -1,11 +1,8 @@
-"""What can go wrong in the twin, by cause, and why it refuses what it is given: a file of sentences."""
+"""The errors of `twin_master`, by cause."""
 
 from collections.abc import Collection, Iterable, Mapping
 
 from reporting.errors import StandsForOthersError
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said
 
 
 class TwinMasterError(StandsForOthersError):
@@ -13,7 +10,7 @@ class TwinMasterError(StandsForOthersError):
 
 
 class InvalidModelError(TwinMasterError, ValueError):
-    """State space, controls, sensors or rewards do not fit together, or a distribution is none."""
+    """States, controls, sensors or rewards do not fit, or probabilities do not sum to one."""
 
 
 class InvalidObservationError(TwinMasterError, ValueError):
@@ -21,7 +18,7 @@ class InvalidObservationError(TwinMasterError, ValueError):
 
 
 class PlanningError(TwinMasterError, RuntimeError):
-    """Value iteration was given no solvable problem, or did not converge."""
+    """There is no plan: no policy solves the problem, or the file of a policy is wrong."""
 
 
 class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the name says it all
@@ -30,34 +27,40 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
     Attributes
     ----------
     twin : str
-        Name of the twin.
+        The name of the twin.
     step : int
-        Step of the observation.
+        The step of the observation.
     worst_residuals : dict of str to float
-        The sensors that fit worst, with their standardised residuals; empty if unknown.
+        The residuals of the sensors that fit worst, in standard deviations; empty if unknown.
     """
 
     def __init__(self, twin: str, step: int, worst_residuals: Mapping[str, float] | None = None) -> None:
         self.twin = twin
         self.step = step
         self.worst_residuals = dict(worst_residuals or {})
-        worst = ", ".join(f"{name}: {value:+.3g} sd" for name, value in self.worst_residuals.items())
+        sensors = ""
+        if self.worst_residuals:
+            residuals = [f"{name}: {value:+.3g} sd" for name, value in self.worst_residuals.items()]
+            sensors = f" (worst residuals {', '.join(residuals)})"
         super().__init__(
-            f"twin {twin!r}, step {step}: the observation has probability zero in every state that the "
-            f"belief still allows{f' (worst residuals {worst})' if worst else ''}; "
-            "check these sensors, or the transitions and the prior that rule out the true state"
+            f"twin {twin!r}, step {step}: the observation has probability zero in every state that "
+            f"the belief still allows{sensors}; check these sensors, or the transitions and the "
+            "prior that rule out the true state"
         )
 
-    def __reduce__(self) -> "tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]":
+    def __reduce__(
+        self,
+    ) -> "tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]":
+        # Workers of a fleet send the error to another process: it is made anew of its arguments.
         return type(self), (self.twin, self.step, self.worst_residuals)
 
 
 class ScenarioError(TwinMasterError, ValueError):
-    """A scenario file cannot be read or does not keep to the schema."""
+    """A scenario file cannot be read, or violates the schema."""
 
 
 class RunFolderError(TwinMasterError, RuntimeError):
-    """A run folder cannot be used as asked, such as one that exists already."""
+    """A run folder cannot be used as asked, for example because it exists already."""
 
 
 class NotResumableError(RunFolderError):
@@ -65,7 +68,7 @@ class NotResumableError(RunFolderError):
 
 
 class MissionInputError(TwinMasterError, ValueError):
-    """Something that a mission was told to use, or what flies, is not there or does not fit."""
+    """An input of a mission, or the asset that is flown, is missing or does not fit."""
 
 
 class FleetError(TwinMasterError, RuntimeError):
@@ -77,28 +80,34 @@ class ViewError(TwinMasterError, RuntimeError):
 
 
 def check_names(
-    whose: str,
-    where: str,
+    owner: str,
+    reference: str,
     rows: Iterable[tuple[str, Iterable[str], Collection[str]]],
     advice: str = "",
 ) -> None:
-    """Check names of several sorts against those that are known.
+    """Check that all names are known to a binding, a model or a scenario.
 
     Parameters
     ----------
-    whose : str
-        What has the names: "the scenario has the".
-    where : str
+    owner : str
+        What has the names, as the beginning of the sentence: "the scenario has the".
+    reference : str
         What knows names: "the binding uav_wing".
-    rows : iterable of (str, names, known names)
-        What the names are of, in the singular.
+    rows : iterable of (str, iterable of str, collection of str)
+        For each kind of name: what is named, in the singular; the names; the known names.
     advice : str
-        What to do, behind a colon.
+        What the user can do.
+
+    Raises
+    ------
+    MissionInputError
+        If a name is not known; the sentence lists the known ones.
     """
-    for what, names, known in rows:
-        unknown = sorted({*names} - {*known})
+    for kind, names, known_names in rows:
+        unknown = sorted({*names} - {*known_names})
         if unknown:
+            what_to_do = f": {advice}" if advice else ""
             raise MissionInputError(
-                f"{whose} {what} {', '.join(unknown)}, which {where} does not know; it knows "
-                f"{', '.join(known) or 'none'}{f': {advice}' if advice else ''}."
+                f"{owner} {kind} {', '.join(unknown)}, which {reference} does not know; it knows "
+                f"{', '.join(known_names) or 'none'}{what_to_do}."
             )

@@ -1,4 +1,4 @@
-"""`uav-twin fleet`, and `uav-twin run --seeds`; the process behind `--view` of all commands."""
+"""`uav-twin fleet`, and `uav-twin run --seeds`; the process of `--view` for all commands."""
 
 import json
 import os
@@ -6,7 +6,8 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,9 +30,11 @@ from twin_master.command_options import (
 from twin_master.errors import TwinMasterError
 
 WORDS = "twin_master.fleet"
-"""Package whose words are printed."""
+"""The package whose words are printed."""
+Standing = Mapping[str, Any]
+"""How each asset of a watched fleet stands, as `FleetWatch.standing` tells it."""
 ROWS = 20
-"""Assets that the table on the console shows, the worst first."""
+"""The number of assets in the table on the console, the worst first."""
 
 
 @accepts_former_options(steps="--turns")
@@ -78,12 +81,21 @@ def watch(
     folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
     watched = parts.FleetWatch(
-        fleet, folder, console.tell, console.say, follow=follow, steps=steps, authority=ca_file
+        fleet,
+        folder,
+        console.tell,
+        console.say,
+        follow=follow,
+        steps=steps,
+        authority=ca_file,
     )
-
-    fleet_view = parts.is_fleet, parts.serve_fleet
+    server = ViewServer(parts.is_fleet, parts.serve_fleet)
     try:
-        with parts.call_on_end_signal(watched.ask), shown(view, fleet_view) as begun, console.showing:
+        with (
+            parts.call_on_end_signal(watched.ask),
+            view_beside(view, server) as begun,
+            console.live_display,
+        ):
             begun(folder)
             watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:
@@ -97,65 +109,85 @@ def watch(
 
 
 class _Console:
-    """Decisions as lines of JSON for a program, or a table for people; what is wrong as a line for both."""
+    """The output of a watched fleet.
+
+    A program gets decisions as lines of JSON; people see a table. Both get notices as lines of
+    text.
+
+    Attributes
+    ----------
+    live_display : context manager
+        While it is open, people see the table.
+    """
 
     def __init__(self) -> None:
-
-        self._people = sys.stdout.isatty()
+        self._is_for_people = sys.stdout.isatty()
         self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
-        self._shown: Mapping[str, Any] = {}
-        self.showing: Any = self._live if self._people and not terminal.loudness.quiet else nullcontext()
+        self._last_standing: Standing = {}
+        self.live_display: AbstractContextManager[object] = nullcontext()
+        if self._is_for_people and not terminal.loudness.quiet:
+            self.live_display = self._live
 
     def tell(self, asset: "parts.WatchedAsset", decision: Mapping[str, Any]) -> None:
-        """Tell a decision to a program, and to people what is new of it."""
+        """Print the new notices of a decision and, for a program, the decision."""
         for notice in decision["notices"]:
-            if notice["sentence"] not in asset.alarms:  # which are told once
+            was_told = notice["sentence"] in asset.alarms
+            if not was_told:
                 sentence = notice["sentence"].replace(" DIR", f" {asset.watch.folder}")
                 self.say(f"{asset.name}: {sentence}")
-        if not self._people and not terminal.loudness.quiet:
-            try:
-                sys.stdout.write(json.dumps({"asset": asset.name, **decision}) + "\n")
-            except BrokenPipeError:
-                signal.raise_signal(signal.SIGINT)  # which ends the watch in order
+        if self._is_for_people or terminal.loudness.quiet:
+            return
+        try:
+            sys.stdout.write(json.dumps({"asset": asset.name, **decision}) + "\n")
+        except BrokenPipeError:  # the reader has ended
+            signal.raise_signal(signal.SIGINT)  # which ends the watch in order
 
     def say(self, text: str) -> None:
-        """Say a sentence."""
-        if self._people:
+        """Print a sentence: above the table for people, on the error stream for a program."""
+        if self._is_for_people:
             self._live.console.print(text, soft_wrap=True, markup=False, highlight=False)
         else:
             typer.echo(text, err=True)
 
-    def refresh(self, standing: Mapping[str, Any]) -> None:
-        """Show the table where it has changed, and hand on what was told."""
-        if not self._people:
+    def refresh(self, standing: Standing) -> None:
+        """Show the table if it has changed; pass on the printed decisions to a program."""
+        if not self._is_for_people:
             sys.stdout.flush()
-        elif standing is not self._shown:
-            self._shown = standing
-            self._live.update(_watched_table(standing), refresh=True)
+        elif standing is not self._last_standing:
+            self._last_standing = standing
+            self._live.update(_table_of_worst_assets(standing), refresh=True)
 
 
-def _heading(standing: Mapping[str, Any]) -> str:
-
+def _heading(standing: Standing) -> str:
+    """Return how many assets are watched, with their steps and alarms, in words."""
     return parts.Words(WORDS).say("heading", counts=parts.counts_of(standing))
 
 
-def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
+def _table_of_worst_assets(standing: Standing) -> "parts.Table":
+    """Return the table of the assets with the most alarms and the most severe damage."""
+    assets = {}
+    for name, asset in standing["assets"].items():
+        if asset["last"] is not None:  # it has had a step
+            assets[name] = asset
 
-    told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
+    def urgency(name: str) -> tuple[int, float]:
+        """Return alarms and severity, which is infinite for an asset whose state is not believed."""
+        severity = assets[name]["severity"]
+        return assets[name]["alarms"], inf if severity is None else severity
 
-    def urgency(row: tuple[str, Mapping[str, Any]]) -> tuple[int, float]:
-        """Return alarms and severity of an asset; one in no state that is believed is the worst."""
-        _, asset = row
-        return asset["alarms"], inf if asset["severity"] is None else asset["severity"]
-
-    worst = sorted(told, key=urgency, reverse=True)[:ROWS]
-    states, rows = list(dict.fromkeys(name for _, asset in worst for name in asset["last"]["health"])), []
-    for name, asset in worst:
-        last, health = asset["last"], parts.health_in_words(asset["last"])
+    worst = sorted(assets, key=urgency, reverse=True)[:ROWS]
+    states: dict[str, None] = {}  # the names of all state factors, in their order
+    for name in worst:
+        states |= dict.fromkeys(assets[name]["last"]["health"])
+    rows = []
+    for name in worst:
+        last = assets[name]["last"]
+        health = parts.health_in_words(last)
         cells = [health.get(state, "") for state in states]
-        alarms = str(asset["alarms"] or "")
-        rows.append((name, str(last["step"]), last["control"], *cells, last["next_control"], alarms))
-    headings = "asset", "step", "control", *states, "next", "alarms"
+        alarms = str(assets[name]["alarms"] or "")
+        row = [name, str(last["step"]), last["control"], *cells, last["next_control"], alarms]
+        rows.append(row)
+    headings = ["asset", "step", "control", *states, "next", "alarms"]
     table = terminal.console_table(headings, rows, terminal.console().width)
     table.title = _heading(standing)
     return table
@@ -188,9 +220,9 @@ def run(
 
     Example: `uav-twin fleet run fleet.toml --workers 2`
     """
-    found = parts.load_fleet(file, seed)
-    engine = engine_of(workers, cluster)
-    fly_and_show(found, out, engine, replace=replace, report=not no_report, json=json)
+    fleet = parts.load_fleet(file, seed)
+    engine = choose_engine(workers, cluster)
+    fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
 
 
 def learn(
@@ -216,43 +248,89 @@ def learn(
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
-    record = parts.learn_from_fleet(folder, out, progress=terminal.progress())
+    lessons = parts.learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
-        _report(folder)
-    told, rows = {"file": str(out), **record}, parts.lesson_rows(record)
-    terminal.answer("learn", WORDS, told, json=json, rows=rows, out=out)
+        _write_report(folder)
+    record = {"file": str(out), **lessons}
+    rows = parts.lesson_rows(lessons)
+    terminal.answer("learn", WORDS, record, json=json, rows=rows, out=out)
 
 
-def engine_of(workers: int | None, cluster: str | None) -> "parts.Engine":
-    """Return who flies, by what the user said."""
+def choose_engine(workers: int | None, cluster: str | None) -> "parts.Engine":
+    """Return the processes that fly a fleet.
+
+    Parameters
+    ----------
+    workers : int or None
+        The number of processes on this machine; None is one for each processor.
+    cluster : str or None
+        The address of the scheduler of a Dask cluster.
+    """
     if cluster is not None:
         if workers is not None:
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
         return parts.Engine(cluster=cluster)
-    return parts.Engine(len(os.sched_getaffinity(0)) if workers is None else workers)
+    if workers is None:
+        workers = len(os.sched_getaffinity(0))
+    return parts.Engine(workers)
 
 
-def fly_and_show(
-    fleet: "parts.Fleet", out: Path | None, engine: "parts.Engine", *, replace: bool, report: bool, json: bool
+def fly_and_print_fleet(
+    fleet: "parts.Fleet",
+    out: Path | None,
+    engine: "parts.Engine",
+    *,
+    replace: bool,
+    report: bool,
+    json: bool,
 ) -> "parts.FleetOutcome":
-    """Fly a fleet and print what became of it."""
+    """Fly a fleet, and print its figures.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        The fleet.
+    out : Path or None
+        Its folder; ``runs/NAME`` if None.
+    engine : Engine
+        The processes that fly.
+    replace : bool
+        Whether to replace another fleet in the folder.
+    report : bool
+        Whether to write the report.
+    json : bool
+        Whether to print JSON.
+    """
     folder = out if out is not None else Path("runs") / fleet.head.name
-    with terminal.interruptible(lambda: f"what was flown is kept in {folder}: repeat the command to go on"):
+    hint = f"what was flown is kept in {folder}: repeat the command to go on"
+    with terminal.interruptible(lambda: hint):
         outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     if report:
-        _report(outcome.folder)
-    figures = _figures([outcome.folder])
-    told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
-    told |= {"failures": outcome.failures, "ended": outcome.ended, "groups": figures}
+        _write_report(outcome.folder)
+    figures = _figures_by_group([outcome.folder])
+    record = {
+        "folder": str(outcome.folder),
+        "twins": outcome.twins,
+        "failed": len(outcome.failures),
+        "failures": outcome.failures,
+        "ended": outcome.ended,
+        "groups": figures,
+    }
     terminal.answer(
-        "run", WORDS, told, json=json, outcome=outcome, rows=parts.figure_rows(figures), groups=list(figures),
-        told=[*outcome.failures.items(), *outcome.ended.items()], page=outcome.folder / "report.html",
-    )  # fmt: skip
+        "run",
+        WORDS,
+        record,
+        json=json,
+        outcome=outcome,
+        rows=parts.figure_rows(figures),
+        groups=list(figures),
+        told=[*outcome.failures.items(), *outcome.ended.items()],
+        page=outcome.folder / "report.html",
+    )
     return outcome
 
 
-def _report(folder: Path) -> None:
-
+def _write_report(folder: Path) -> None:
     with terminal.progress().stage("Writing the report"):
         parts.write_fleet_report(folder)
 
@@ -272,43 +350,64 @@ def compare(
 
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
-    figures = _figures(folders)
-    terminal.answer(
-        "compare", WORDS, figures, json=json, rows=parts.figure_rows(figures), groups=list(figures)
-    )
+    figures = _figures_by_group(folders)
+    rows = parts.figure_rows(figures)
+    terminal.answer("compare", WORDS, figures, json=json, rows=rows, groups=list(figures))
 
 
 Figures = dict[str, dict[str, "parts.Estimated | int"]]
+"""The figures of each group, by the name of the group and of the figure."""
 
 
-def _figures(folders: list[Path]) -> Figures:
-    """Return the figures of each group; with the folder's name where there are several folders."""
-    found = {}
+def _figures_by_group(folders: list[Path]) -> Figures:
+    """Return the figures of each group; if there are several folders, its name has the folder."""
+    figures = {}
     for folder in folders:
         for name, group in parts.open_fleet(folder).items():
-            found[name if len(folders) == 1 else f"{folder}: {name}"] = parts.group_figures(group)
-    return found
+            full_name = name if len(folders) == 1 else f"{folder}: {name}"
+            figures[full_name] = parts.group_figures(group)
+    return figures
 
 
-_LOOK_AGAIN = 0.05
-"""Seconds between two looks for a flight that is being prepared."""
-_COURTESY = 5
-"""Niceness of a view beside a mission: the mission comes first."""
+_POLLING_INTERVAL = 0.05
+"""Seconds between two looks whether a flight can be shown yet."""
+_NICENESS_OF_VIEW = 5
+"""The niceness of the process that shows a mission: the mission itself comes first."""
 
-Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]]
-"""Whether a folder can be shown, and what shows it, as `viewer.server.serve`."""
+
+@dataclass(frozen=True)
+class ViewServer:
+    """What shows a flight or a fleet in the browser.
+
+    Attributes
+    ----------
+    is_ready : callable
+        Takes a folder; returns whether it can be shown yet.
+    serve : callable
+        Takes a folder, a port, a function that is called with the address, and one that returns
+        whether to go on; serves the page until then.
+    """
+
+    is_ready: Callable[[Path], bool]
+    serve: Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]
 
 
 @contextmanager
-def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None]]:
-    """Give what shows a mission from its beginning in a process beside it; at the end wait for Ctrl-C.
+def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Callable[[Path], None]]:
+    """Show a mission in the browser, in a process of its own; at the end wait for Ctrl-C.
 
     Parameters
     ----------
-    wanted
-        Whether to show it at all; if not, what is given does nothing.
-    server
-        Says whether a folder can be shown yet, and shows it; that of one flight if left out.
+    wanted : bool
+        Whether to show the mission at all.
+    server : ViewServer, optional
+        What shows the mission; the view of one flight if left out.
+
+    Yields
+    ------
+    callable
+        To be called with the folder of the mission once it exists; it does nothing if `wanted` is
+        false.
     """
     if not wanted:
         yield lambda _folder: None
@@ -320,14 +419,16 @@ def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path
     def begin(folder: Path) -> None:
         nonlocal process
         context = multiprocessing.get_context("spawn")
-        process = context.Process(target=_beside, args=(folder, os.getpid(), server), daemon=True)
+        arguments = (folder, os.getpid(), server)
+        process = context.Process(target=_serve_mission, args=arguments, daemon=True)
         process.start()
 
     try:
         yield begin
         if process is not None and process.is_alive():
-            with suppress(KeyboardInterrupt):  # from the sentence on, which a quick hand may answer at once
-                _say("The view stays until Ctrl-C.")
+            # The user may press Ctrl-C as soon as the sentence is printed.
+            with suppress(KeyboardInterrupt):
+                _print_beside_results("The view stays until Ctrl-C.")
                 process.join()
     finally:
         if process is not None:
@@ -335,24 +436,26 @@ def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path
             process.join()
 
 
-def _beside(folder: Path, mission: int, server: "Server | None") -> None:
-    """Show a mission as soon as it is prepared; end with the process that flies it."""
-    prepared, serving = server or (parts.is_prepared, parts.serve)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mission ends it
-    os.nice(_COURTESY)
+def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None) -> None:
+    """Show a mission once it is prepared, until the process that flies it ends."""
+    if server is None:
+        server = ViewServer(parts.is_prepared, parts.serve)
+    # Ctrl-C is for the mission, which then ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICENESS_OF_VIEW)
 
-    def wanted() -> bool:
-        return os.getppid() == mission
+    def is_mission_alive() -> bool:
+        return os.getppid() == mission_process
 
-    while wanted() and not prepared(folder):
-        time.sleep(_LOOK_AGAIN)
+    while is_mission_alive() and not server.is_ready(folder):
+        time.sleep(_POLLING_INTERVAL)
     try:
-        serving(folder, 0, lambda address: _say(f"View: {address}"), wanted)
+        server.serve(folder, 0, lambda address: _print_beside_results(f"View: {address}"), is_mission_alive)
     except (TwinMasterError, ReportingError) as error:
         typer.secho(f"The view ended: {error}", fg="red", err=True)
 
 
-def _say(text: str) -> None:
-    """Print beside the results of a mission, which may be JSON."""
+def _print_beside_results(text: str) -> None:
+    """Print a line on the error stream, because the results on the output may be JSON."""
     if not terminal.loudness.quiet:
         typer.echo(text, err=True)

@@ -1,4 +1,4 @@
-"""What commands take from the rooms and other packages, imported when it is used; `--help` needs none."""
+"""What commands import from other modules, each when it is used; `--help` needs none of it."""
 
 from reporting.lazy import lazy_getattr
 

@@ -1,7 +1,7 @@
-"""`uav-twin plan` and `uav-twin design`: what is decided by the belief, what it is worth, what tells most."""
+"""Commands `uav-twin plan` and `uav-twin design`: plans on the belief, choices of sensors."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -11,9 +11,32 @@ import typer
 from reporting import terminal
 from reporting.command_options import JsonOption
 from reporting.files import atomic_write_bytes
+from reporting.words import comma_list
 from twin_master import parts
 from twin_master.command_options import CalibrationOption, ScenarioArgument, SeedOption
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
+
+Record = dict[str, Any]
+"""The result of a command, as it is printed as JSON."""
+
+
+@dataclass(frozen=True)
+class _PlannedMission:
+    """A plan on the belief, and what it brings.
+
+    Attributes
+    ----------
+    problem : DecisionProblem
+        The decision problem.
+    plan : BeliefPlan
+        The plan.
+    simulated : ComparedPolicy
+        Its returns in simulated missions.
+    """
+
+    problem: "parts.DecisionProblem"
+    plan: "parts.BeliefPlan"
+    simulated: "parts.ComparedPolicy"
 
 
 def plan(
@@ -49,86 +72,180 @@ def plan(
 
     Example: `uav-twin plan inspected_wing --out policy.npz`
     """
-    knowledge, _ = _knowledge(scenario, seed, calibration)
-    blind = _without(knowledge, [value_of]) if value_of is not None else None
-    problem, plan, promised = _planned(knowledge)
+    knowledge = _prepare(scenario, seed, calibration).knowledge
+    without_value_of = None
+    if value_of is not None:
+        without_value_of = _without_information(knowledge, [value_of])
+    planned = _plan_mission(knowledge)
     if out is not None:
-        atomic_write_bytes(out, parts.policy_file(plan.policy, knowledge.model))
+        atomic_write_bytes(out, parts.encode_policy(planned.plan.policy, knowledge.model))
     if picture is not None:
-        _draw(picture, parts.plan_figure(plan.policy, knowledge.model))
-    record: dict[str, Any] = {
-        "lower": plan.lower,
-        "upper": plan.upper,
-        "simulated": promised.mean,
-        "half_width": promised.half_width,
-        "beyond_limit": parts.risk_of(knowledge.scenario, problem, knowledge.rewards, plan.policy),
+        _write_picture(picture, parts.plan_figure(planned.plan.policy, knowledge.model))
+    record: Record = {
+        "lower": planned.plan.lower,
+        "upper": planned.plan.upper,
+        "simulated": planned.simulated.mean,
+        "half_width": planned.simulated.half_width,
+        "beyond_limit": parts.share_beyond_limit(
+            knowledge.scenario, planned.problem, knowledge.rewards, planned.plan.policy
+        ),
     }
-    rows = [promised, *([] if blind else parts.compared(knowledge.scenario, problem))]
-    if blind is not None:
-        without = _planned(blind)[2]
-        worth = promised.beyond(without)
-        rows.append(replace(without, name=f"planned without {value_of}"))
-        record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
-    record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
-    terminal.answer("plan", "twin_master", record, json=json)
+    rules = [planned.simulated]
+    if without_value_of is None:
+        rules += parts.compare_simple_rules(knowledge.scenario, planned.problem)
+    else:
+        simulated_without = _plan_mission(without_value_of).simulated
+        rules.append(replace(simulated_without, name=f"planned without {value_of}"))
+        value = planned.simulated.beyond(simulated_without)
+        record["value"] = {"of": value_of, "mean": value.mean, "half_width": value.half_width}
+    record["rules"] = {rule.name: [rule.mean, rule.half_width] for rule in rules}
+    if json:
+        terminal.print_json(record)
+    else:
+        _print_plan(record)
 
 
-def _knowledge(
-    scenario: str, seed: int | None, calibration: Path | None, candidates: str | None = None
-) -> "tuple[parts.Knowledge, tuple[parts.Float | None, list[parts.Float]]]":
-    """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
-    given = {"seed": seed, "calibration": calibration}
-    resolved = parts.resolve_scenario(parts.load_scenario(scenario), given)
-    parts.believed_source(resolved).check()
+def _print_plan(record: Record) -> None:
+    """Print the returns of the rules, the bounds of the plan, and the value of an information."""
+    rows = []
+    for rule, (mean, half_width) in record["rules"].items():
+        rows.append([rule, f"{mean:.4g}", f"{half_width:.2g}"])
+    terminal.print_table(["rule", "expected return", "± (95 %)"], rows)
+    lower = record["lower"]
+    upper = record["upper"]
+    terminal.say(
+        f"Bounds of the return, were the mission without end: {lower:.5g} to {upper:.5g}, a gap of "
+        f"{upper - lower:.2g}."
+    )
+    percent = 100 * record["beyond_limit"]
+    terminal.say(f"Beyond a health limit: {percent:.3g} % of the steps, discounted.")
+    if "value" in record:
+        value = record["value"]
+        worth = f"{value['mean']:.3g} ± {value['half_width']:.2g}"
+        terminal.say(f"{value['of']} is worth {worth} (95 %).")
+
+
+@dataclass(frozen=True)
+class _GaugePlaces:
+    """Where the gauges are, for pictures.
+
+    Attributes
+    ----------
+    positions : (G, 3) array or None
+        The positions of the gauges, in metres; None if no file gives them.
+    outlines : list of (N, 2) array
+        The outlines of a wing and its regions, in metres; empty for other structures.
+    """
+
+    positions: "parts.Float | None" = None
+    outlines: "list[parts.Float]" = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What the twin of a scenario knows before any plan on the belief, and where its gauges are."""
+
+    knowledge: "parts.Knowledge"
+    places: _GaugePlaces
+
+
+def _prepare(
+    scenario_name: str,
+    seed: int | None,
+    calibration: Path | None,
+    candidates: str | None = None,
+) -> _Prepared:
+    """Return the knowledge of a scenario's twin, perhaps with further gauges.
+
+    Parameters
+    ----------
+    scenario_name : str
+        A shipped scenario or a scenario file.
+    seed : int or None
+        The seed, if not that of the scenario.
+    calibration : Path or None
+        A calibration file, if not that of the scenario.
+    candidates : str, optional
+        Candidates for gauges, as for `add_candidate_gauges`.
+    """
+    loaded = parts.load_scenario(scenario_name)
+    scenario = parts.resolve_scenario(loaded, {"seed": seed, "calibration": calibration})
+    parts.believed_source(scenario).check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
-            resolved = parts.with_candidates(resolved, candidates, Path(folder, "candidates"))
-        found = parts.prepared_alone(resolved, parts.believed_source(resolved), terminal.progress())
-        return found, _places(resolved)
+            scenario = parts.add_candidate_gauges(scenario, candidates, Path(folder, "candidates"))
+        source = parts.believed_source(scenario)
+        knowledge = parts.prepare_without_folder(scenario, source, terminal.progress())
+        return _Prepared(knowledge, _find_gauges(scenario))
 
 
-def _planned(
-    knowledge: "parts.Knowledge",
-) -> "tuple[parts.DecisionProblem, parts.BeliefPlan, parts.ComparedPolicy]":
-    """Return what is decided on, the plan, and what it promises."""
-    scenario, problem = knowledge.scenario, knowledge.problem
-    plan = parts.expected_plan(scenario, problem, knowledge.rewards)[0]
-    return problem, plan, parts.promised(scenario, problem, plan.policy)
+def _plan_mission(knowledge: "parts.Knowledge") -> _PlannedMission:
+    """Plan on the belief, and simulate the plan."""
+    scenario = knowledge.scenario
+    problem = knowledge.problem
+    plan = parts.plan_within_limit(scenario, problem, knowledge.rewards).plan
+    return _PlannedMission(problem, plan, parts.simulate_policy(scenario, problem, plan.policy))
 
 
-def _without(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowledge":
-    """Return what is known where actions that inspect show nothing, or gauges are not there."""
+_BLIND = 1e6
+"""The standard deviation of a blind sensor, relative to the largest value that it could show."""
+
+
+def _without_information(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowledge":
+    """Return the knowledge of a twin for which some gauges or inspections show nothing.
+
+    They keep their place, but their noise becomes so large that their readings tell nothing.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        The knowledge with all gauges and inspections.
+    names : sequence of str
+        The titles of gauges, and the names of actions that inspect.
+    """
     import numpy as np
 
     scenario = knowledge.scenario
-    titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
+    titles = _sensor_titles(scenario)
+    _check_names(scenario, names)
+    largest_value = np.abs(knowledge.predicted).max(axis=(0, 1, 2))  # (G,)
+    deviation = np.broadcast_to(scenario.observation.standard_deviation, len(titles))
+    is_blind = [title in names for title in titles]
+    deviation = np.where(is_blind, deviation + _BLIND * largest_value, deviation)
+    largest_level = np.abs(knowledge.model.states.coordinates).max()
+    blind_inspection = {"standard_deviation": _BLIND * (1.0 + largest_level)}
+    actions = []
+    for action in scenario.action:
+        changes = blind_inspection if action.name in names else {}
+        actions.append(action.model_copy(update=changes))
+    blind_scenario = scenario.with_changes("observation", standard_deviation=tuple(deviation.tolist()))
+    blind_scenario = blind_scenario.model_copy(update={"action": tuple(actions)})
+    return replace(knowledge, scenario=blind_scenario)
+
+
+def _check_names(scenario: "parts.Scenario", names: Sequence[str]) -> None:
+    """Refuse names that are neither a gauge nor an action that inspects."""
+    titles = _sensor_titles(scenario)
+    inspecting = [action.name for action in scenario.action if action.inspects]
     for name in names:
         if name not in (*titles, *inspecting):
-            known, gauges = inspecting or ["there is none"], f"{titles[0]} to {titles[-1]}"
-            raise MissionInputError(said("plan_command.value_of", inspecting=known, gauges=gauges, name=name))
-    shown = np.abs(knowledge.predicted).max(axis=(0, 1, 2))
-    each = np.broadcast_to(scenario.observation.standard_deviation, len(titles))
-    blind = np.where([title in names for title in titles], each + _BLIND * shown, each)
-    levels = np.abs(knowledge.model.states.coordinates).max()
-    unread = {"standard_deviation": _BLIND * (1.0 + levels)}
-    actions = tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action)
-    bare = scenario.with_changes("observation", standard_deviation=tuple(blind.tolist()))
-    return replace(knowledge, scenario=bare.model_copy(update={"action": actions}))
+            actions = comma_list(inspecting or ["there is none"])
+            raise MissionInputError(
+                f"--value-of names an action that inspects ({actions}) or a gauge ({titles[0]} to "
+                f"{titles[-1]}), and `{name}` came."
+            )
 
 
-def _titles(scenario: "parts.Scenario") -> tuple[str, ...]:
-    """Return what the sensors are called: their titles, or numbers from 1."""
+def _sensor_titles(scenario: "parts.Scenario") -> tuple[str, ...]:
+    """Return the titles of the sensors; if they have none, their numbers from 1."""
     section = scenario.observation
     return section.titles or tuple(str(number + 1) for number in range(section.count))
 
 
-_BLIND = 1e6
-"""Standard deviation of a sensor that shows nothing, over the largest that it could show."""
-
-
-def _draw(path: Path, figure: "parts.Figure") -> None:
-
-    atomic_write_bytes(path, parts.to_png(figure) if path.suffix.lower() == ".png" else parts.to_svg(figure))
+def _write_picture(path: Path, figure: "parts.Figure") -> None:
+    """Write a figure as PNG or SVG, by the suffix of the file."""
+    picture = parts.to_png(figure) if path.suffix.lower() == ".png" else parts.to_svg(figure)
+    atomic_write_bytes(path, picture)
 
 
 def design(
@@ -186,72 +303,138 @@ def design(
 
     Example: `uav-twin design level_turns --sensors 6 --picture gauges.svg`
     """
-    knowledge, places = _knowledge(scenario, None, calibration, candidates)
-    titles = _titles(knowledge.scenario)
-    wanted = titles if among is None else tuple(among.split(","))
-    if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
-        raise MissionInputError(said("plan_command.among", first=titles[0], last=titles[-1], among=among))
-    pool, readings = [titles.index(name) for name in wanted], parts.drawn_readings(knowledge)
-    found = parts.chosen_sensors(readings, pool, sensors)
-    names = [titles[sensor] for sensor in found.sensors]
-    apart = parts.separations(knowledge, readings, pool)
-    record: dict[str, Any] = {
-        "sensors": names,
-        "information": list(found.information),
-        "of_all": found.of_all,
-        "not_separated": [_between(knowledge, *place) for place, far in apart.items() if far < 1.0],
+    prepared = _prepare(scenario, None, calibration, candidates)
+    knowledge = prepared.knowledge
+    titles = _sensor_titles(knowledge.scenario)
+    candidate_titles = _candidate_titles(titles, among)
+    candidate_indices = [titles.index(title) for title in candidate_titles]
+    readings = parts.draw_readings(knowledge)
+    choice = parts.choose_sensors(readings, candidate_indices, sensors)
+    chosen_titles = [titles[sensor] for sensor in choice.sensors]
+    not_separated = []
+    separations = parts.level_separations(knowledge, readings, candidate_indices)
+    for (factor, level), separation in separations.items():
+        if separation < 1.0:
+            not_separated.append(_levels_in_words(knowledge, factor, level))
+    record: Record = {
+        "sensors": chosen_titles,
+        "information": list(choice.information),
+        "of_all": choice.of_all,
+        "not_separated": not_separated,
     }
     if worth:
-        others = [title for title in titles if title not in names]
-        rest = [title for title in titles if title not in wanted]
-        few, every = (_planned(_without(knowledge, some))[2] for some in (others, rest))
-        compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
-        record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
-    _draw_design(picture, vtu, places, record, found.sensors)
-    terminal.answer("design", "twin_master", record, json=json, candidates=len(pool))
+        record["worth"] = _compare_returns(knowledge, chosen_titles, candidate_titles)
+    if vtu is not None:
+        _write_vtu(vtu, prepared.places, choice)
+    if picture is not None:
+        _write_design_picture(picture, prepared.places, choice, chosen_titles)
+    if json:
+        terminal.print_json(record)
+    else:
+        _print_design(record, len(candidate_indices))
 
 
-def _between(knowledge: "parts.Knowledge", name: str, level: int) -> str:
-    """Return two neighbouring levels of a state in words."""
-    place = knowledge.scenario.state_names.index(name)
-    factor = knowledge.scenario.state[place]
+def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]:
+    """Return the titles that the option --among names; all titles if it is not given."""
+    if among is None:
+        return titles
+    candidates = tuple(among.split(","))
+    are_known = {*candidates} <= {*titles}
+    are_different = len({*candidates}) == len(candidates)
+    if not are_known or not are_different:
+        raise MissionInputError(
+            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
+        )
+    return candidates
+
+
+def _compare_returns(
+    knowledge: "parts.Knowledge", chosen: Sequence[str], candidates: Sequence[str]
+) -> dict[str, list[float]]:
+    """Return the returns with the chosen sensors and with all candidates, as mean and half width."""
+    titles = _sensor_titles(knowledge.scenario)
+    not_chosen = [title for title in titles if title not in chosen]
+    no_candidates = [title for title in titles if title not in candidates]
+    with_chosen = _plan_mission(_without_information(knowledge, not_chosen)).simulated
+    with_all = _plan_mission(_without_information(knowledge, no_candidates)).simulated
+    compared = {
+        "chosen": with_chosen,
+        "all": with_all,
+        "all beyond chosen": with_all.beyond(with_chosen),
+    }
+    return {name: [returns.mean, returns.half_width] for name, returns in compared.items()}
+
+
+def _print_design(record: Record, candidates: int) -> None:
+    """Print the chosen sensors with their information, and what no candidate separates."""
+    for sensor, information in zip(record["sensors"], record["information"], strict=True):
+        terminal.say(f"{sensor}: {information:.3f} bit with those before it.")
+    terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")
+    for levels in record["not_separated"]:
+        terminal.say(f"No gauge separates {levels}: less than one standard deviation by all candidates.")
+    for sensors, (mean, half_width) in record.get("worth", {}).items():
+        terminal.say(f"Expected return, {sensors}: {mean:.4g} ± {half_width:.2g} (95 %).")
+
+
+def _levels_in_words(knowledge: "parts.Knowledge", factor_name: str, level: int) -> str:
+    """Return a level of a state factor, given by its index, and the next one in words."""
+    index = knowledge.scenario.state_names.index(factor_name)
+    factor = knowledge.scenario.state[index]
     scale, unit = parts.printed_state(factor.unit)
-    low, high = (scale * value for value in factor.levels[level : level + 2])
-    return f"{name} of {low:g} {unit} from {high:g} {unit}"
+    low = scale * factor.levels[level]
+    high = scale * factor.levels[level + 1]
+    return f"{factor_name} of {low:g} {unit} from {high:g} {unit}"
 
 
-def _draw_design(
-    picture: Path | None, vtu: Path | None, where: "tuple[parts.Float | None, list[parts.Float]]",
-    record: Mapping[str, Any], chosen: Sequence[int],
-) -> None:  # fmt: skip
+def _write_vtu(path: Path, places: _GaugePlaces, choice: "parts.SensorDesign") -> None:
+    """Write the gauges as points; their rank is 1 for the first chosen one, and 0 if not chosen."""
     import numpy as np
 
-    places, outlines = where
-    if vtu is not None:
-        if places is None:
-            raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
-        rank = np.zeros(len(places))
-        rank[list(chosen)] = np.arange(1, len(chosen) + 1)
-        parts.write_vtu(vtu, places, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
-    if picture is not None:
-        if places is not None:  # the two axes along which they are spread most
-            places = places[:, np.sort(np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])]
-        figure = parts.design_figure(
-            record["information"], record["of_all"], record["sensors"], places, chosen, outlines
-        )
-        _draw(picture, figure)
+    if places.positions is None:
+        raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
+    rank = np.zeros(len(places.positions))
+    rank[list(choice.sensors)] = np.arange(1, len(choice.sensors) + 1)
+    cells = ("vertex", np.arange(len(rank))[:, None])
+    parts.write_vtu(path, places.positions, cells, {"rank": rank}, {})
 
 
-def _places(scenario: "parts.Scenario") -> "tuple[parts.Float | None, list[parts.Float]]":
-    """Return where the gauges are (G, 3) [m], None where no file says it, and outlines (N, 2) of a wing."""
+def _write_design_picture(
+    path: Path,
+    places: _GaugePlaces,
+    choice: "parts.SensorDesign",
+    chosen_titles: Sequence[str],
+) -> None:
+    """Draw the information of the chosen sensors, and where they are."""
+    import numpy as np
+
+    positions = places.positions
+    if positions is not None:
+        # The picture shows the two axes along which the gauges extend most.
+        axes_by_extent = np.argsort(-np.ptp(positions, axis=0), kind="stable")
+        positions = positions[:, np.sort(axes_by_extent[:2])]
+    figure = parts.design_figure(
+        list(choice.information),
+        choice.of_all,
+        chosen_titles,
+        positions,
+        choice.sensors,
+        places.outlines,
+    )
+    _write_picture(path, figure)
+
+
+def _find_gauges(scenario: "parts.Scenario") -> _GaugePlaces:
+    """Return where the gauges are, from the structure file or the design of a wing."""
     import numpy as np
 
     files = scenario.belief.all_files()
-    places = parts.gauge_places(files.get(parts.MODEL_COPY))
-    if places is not None and scenario.observation.role == "strain":
-        return places, []
-    file = files.get(parts.DESIGN_COPY)
-    wing = parts.planform_of(None if file is None else parts.load_design(file), scenario)
-    if wing is None:
-        return None, []
-    return np.insert(wing.gauges, 2, 0.0, axis=1), [wing.outline, *wing.regions]
+    positions = parts.gauge_places(files.get(parts.MODEL_COPY))
+    if positions is not None and scenario.observation.role == "strain":
+        return _GaugePlaces(positions)
+    design_file = files.get(parts.DESIGN_COPY)
+    wing_design = None if design_file is None else parts.load_design(design_file)
+    planform = parts.planform_of(wing_design, scenario)
+    if planform is None:
+        return _GaugePlaces()
+    positions = np.insert(planform.gauges, 2, 0.0, axis=1)  # at z = 0
+    return _GaugePlaces(positions, [planform.outline, *planform.regions])

@@ -1,6 +1,6 @@
-"""The run folder: made whole or not at all, never overwritten by mistake, resumable at any moment.
+"""The run folder: complete or absent, never overwritten by mistake, resumable at any moment.
 
-Layout: see `docs/run_folder.md`.
+`docs/run_folder.md` describes its layout.
 """
 
 import json
@@ -9,183 +9,255 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from reporting.files import atomic_write_text, remove_leftovers, write_members
 from reporting.folders import closing_lock, lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
-from twin_master.errors import NotResumableError, RunFolderError, said
+from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
+JsonObject = dict[str, Any]
+"""An object of JSON: strings, numbers, lists and further objects by their keys."""
+
 CONFIG_NAME = "config.json"
+"""The file of a run folder with its configuration."""
 FIELD_NAME = "wing.vtu"
+"""The file of a run folder with the last estimated field."""
 TEACHING = "teaching"
-"""Folder of the verdicts of a watch."""
+"""The folder of a watch with its verdicts."""
 VERDICT, PATCH, PICTURE = "verdict.json", "patch.json", "figures/missing_force.svg"
-"""In the folder of a verdict: what it says, the patch where it names one, and the force that the model lacks
-where motion was observed."""
+"""Files in the folder of a verdict: the verdict, its patch, if it names one, and the picture of the
+missing force, if motion was observed."""
 KIND = "uav-twin run"
-"""Value of `kind` in `config.json`, by which a run folder is known."""
+"""The value of `kind` in the `config.json` of a run folder."""
 HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
-"""A run may be resumed after a change of these: no stored figure depends on them."""
+"""Packages that may change before a run is resumed, because no stored figure depends on them."""
 
 
-def to_json(record: Mapping[str, Any]) -> str:
-    """Return a record as JSON text that is the same for the same record."""
-    return json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+def to_json(record: Mapping[str, object]) -> str:
+    """Return a record as JSON text; equal records give equal texts."""
+    text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return text + "\n"
 
 
-def folder_config(folder: Path, *kinds: str) -> dict[str, Any] | None:
-    """Return the configuration of a folder of one of some kinds, by default a run; None where it is none."""
+def find_config(folder: Path, *kinds: str) -> JsonObject | None:
+    """Return the configuration of a folder, if it has one and is of one of the kinds; else None.
+
+    Without `kinds` only the folder of a run counts.
+    """
     try:
         record = read_json(folder / CONFIG_NAME, NotResumableError)
     except NotResumableError:
         return None
-    return record if isinstance(record, dict) and record.get("kind") in (kinds or (KIND,)) else None
+    if isinstance(record, dict) and record.get("kind") in (kinds or (KIND,)):
+        return record
+    return None
 
 
 @contextmanager
 def create_run_folder(
     folder: Path,
-    config: Mapping[str, Any],
+    config: JsonObject,
     files: Mapping[str, bytes] | None = None,
     *,
     replace: bool = False,
 ) -> Iterator[None]:
-    """Make a folder that holds its configuration and copies of what is flown, in one step, and hold it.
+    """Create a folder with its configuration and copies of what is flown, in one step, and lock it.
+
+    The folder is locked until the context ends.
 
     Parameters
     ----------
-    folder
-        Where; an empty folder is as good as none.
-    config
-        Content of `config.json`.
-    files
-        Further files: path inside the folder, content.
-    replace
-        Put the new folder in the place of an existing one of its kind. Anything else is never replaced.
+    folder : Path
+        The folder; it must be absent or empty unless `replace` is given.
+    config : dict
+        The content of `config.json`.
+    files : mapping of str to bytes, optional
+        The contents of further files, by their paths in the folder.
+    replace : bool
+        Whether to replace an existing folder of the same kind. Any other folder is never replaced.
 
     Raises
     ------
     RunFolderError
-        The folder exists and is not to be replaced, or is no run folder; or another process is flying in the
-        folder that is to be replaced.
+        If the folder exists and is not to be replaced, or is no run folder, or if another process
+        is flying in the folder that is to be replaced.
     FileNotWrittenError
-        The disk is full or the place is not writable.
+        If the disk is full or the folder cannot be written.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise RunFolderError(f"{folder} exists and is no folder: choose another --out.")
-    occupied = folder.is_dir() and any(folder.iterdir())
-    if occupied and folder_config(folder, config["kind"]) is None:
-        raise RunFolderError(said("run_folder.foreign", folder=folder))
-    if occupied and not replace:
-        raise RunFolderError(said("run_folder.there", folder=folder))
-    with ExitStack() as holding:
-        with whole_folder(folder, lock_run_folder, holding) as fresh:
-            write_members(fresh, files or {})
-            atomic_write_text(fresh / CONFIG_NAME, to_json(config))
+    is_occupied = folder.is_dir() and any(folder.iterdir())
+    if is_occupied and find_config(folder, config["kind"]) is None:
+        raise RunFolderError(
+            f"{folder} exists and holds something else, so it is not touched: choose another --out."
+        )
+    if is_occupied and not replace:
+        raise RunFolderError(
+            f"{folder} holds a run already: choose another --out, go on with it by --resume, or "
+            "give --replace."
+        )
+    with ExitStack() as locks:
+        with whole_folder(folder, lock_run_folder, locks) as new_folder:
+            write_members(new_folder, files or {})
+            atomic_write_text(new_folder / CONFIG_NAME, to_json(config))
         yield
 
 
-def read_config(folder: Path) -> dict[str, Any]:
+def read_config(folder: Path) -> JsonObject:
     """Return the configuration of a run folder.
 
     Raises
     ------
     NotResumableError
-        There is none, or it is damaged.
+        If there is no configuration, or it is damaged.
     """
     if not folder.is_dir():
-        raise NotResumableError(said("run_folder.none", folder=folder))
-    config = folder_config(folder)
+        raise NotResumableError(
+            f"there is no run folder {folder}: nothing was begun there, fly the mission with --out."
+        )
+    config = find_config(folder)
     if config is None:
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
-    for name in ("scenario", "scenario_file", "provenance", "inputs"):
-        if not isinstance(config.get(name, {} if name == "inputs" else None), dict):
-            raise NotResumableError(said("run_folder.damaged", path=folder / CONFIG_NAME, name=name))
+    required_tables = ["scenario", "scenario_file", "provenance"]
+    if "inputs" in config:  # they are written once the asset is prepared
+        required_tables.append("inputs")
+    for table in required_tables:
+        if not isinstance(config.get(table), dict):
+            raise NotResumableError(
+                f"{folder / CONFIG_NAME} is damaged, its table `{table}` is missing: "
+                "fly the mission again with --replace."
+            )
     return config
 
 
 def lock_run_folder(folder: Path) -> int:
-    """Take the folder for this process; return a file descriptor to close at the end.
+    """Lock a folder for this process; return a file descriptor, whose closing ends the lock.
 
     Raises
     ------
     RunFolderError
-        Another process is flying in the folder.
+        If another process is flying in the folder.
     """
     descriptor = lock_folder(folder)
     if descriptor is None:
         raise RunFolderError(f"another process is flying in {folder}: wait for it to end.")
+    # Another process may have replaced the folder after it was opened for the lock.
     if not folder.is_dir() or not os.path.samestat(os.fstat(descriptor), folder.stat()):
         os.close(descriptor)
         raise RunFolderError(f"another process has just put another run into {folder}: look at that one.")
     return descriptor
 
 
-def tidy(folder: Path) -> None:
-    """Remove what killed processes left half-written."""
-    for path in list(folder.glob(f".{FIELD_NAME}.*")):  # the finite elements write in a folder of their own
-        if path.is_dir():
+def remove_half_written_files(folder: Path) -> None:
+    """Remove the files that killed processes left half-written in a folder and its subfolders."""
+    for path in list(folder.glob(f".{FIELD_NAME}.*")):
+        if path.is_dir():  # the field is written in a folder of its own
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-    for place in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
-        remove_leftovers(place)
+    subfolders = [path for path in folder.rglob("*") if path.is_dir()]
+    for directory in [folder, *subfolders]:
+        remove_leftovers(directory)
 
 
-def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
-    """Refuse to go on with other code than the run was begun with.
+def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
+    """Refuse to continue a run with other code than it was begun with.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder.
+    config : dict
+        The content of its `config.json`.
+    seed : int
+        The seed of the run.
 
     Raises
     ------
     NotResumableError
-        With the packages that changed.
+        If packages have changed; the sentence names them.
     """
     recorded = config["provenance"]
-    now = collect_provenance(seed).as_dict()
-    for what in ("versions", "source_hashes"):
-        known = recorded.get(what)
-        known = known if isinstance(known, dict) else {}
-        another = {name for name, value in now[what].items() if known.get(name) != value}
-        changed = sorted(another - HARMLESS_PACKAGES)
-        if changed:
-            raise NotResumableError(said("run_folder.version", folder=folder, names=", ".join(changed)))
+    current = collect_provenance(seed).as_dict()
+    for table in ("versions", "source_hashes"):
+        recorded_values = recorded.get(table)
+        if not isinstance(recorded_values, dict):
+            recorded_values = {}
+        changed = set()
+        for name, value in current[table].items():
+            if recorded_values.get(name) != value:
+                changed.add(name)
+        names = sorted(changed - HARMLESS_PACKAGES)
+        if names:
+            raise NotResumableError(
+                f"{folder} was begun with another version of {', '.join(names)}, so its results "
+                "could not be the same: fly the mission again with --replace."
+            )
 
 
-def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
-    """Note the hashes of what is flown; refuse to go on with something else.
+def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:
+    """Write the hashes of what is flown into the configuration, or check them if they are there.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder.
+    config : dict
+        The content of its `config.json`.
+    hashes : mapping of str to str
+        The SHA-256 hash of each input.
+
+    Returns
+    -------
+    dict
+        The configuration with the hashes.
 
     Raises
     ------
     NotResumableError
-        With the inputs that changed.
+        If inputs have changed since the run was begun; the sentence names them.
     """
     recorded = config.get("inputs")
-    if recorded is not None and recorded != dict(hashes):
-        changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
-        names = ", ".join(changed).replace("_", " ")
-        raise NotResumableError(said("run_folder.changed", names=names, folder=folder))
     if recorded is None:
         config = {**config, "inputs": dict(hashes)}
         atomic_write_text(folder / CONFIG_NAME, to_json(config))
+        return config
+    if recorded != dict(hashes):
+        changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
+        names = ", ".join(changed).replace("_", " ")
+        raise NotResumableError(
+            f"the {names} changed since the run in {folder} was begun: fly the mission again with --replace."
+        )
     return config
 
 
-Held = Iterator[tuple[dict[str, Any], Scenario]]
-"""Configuration of a folder that this process holds, and its scenario located in it."""
+class LockedRun(NamedTuple):
+    """A run or a watch whose folder this process holds.
+
+    Attributes
+    ----------
+    config : dict
+        The content of `config.json`.
+    scenario : Scenario
+        The scenario, with the paths of its files in the folder.
+    """
+
+    config: JsonObject
+    scenario: Scenario
 
 
-def kept_scenario(folder: Path) -> Scenario:
+def read_scenario(folder: Path) -> Scenario:
     """Return the scenario in the configuration of a folder."""
     return parse_scenario(read_config(folder)["scenario"], str(folder / CONFIG_NAME))
 
 
 @contextmanager
-def begun_folder(
+def new_run_folder(
     resolved: Scenario,
     file: Mapping[str, str],
     folder: Path,
@@ -193,71 +265,72 @@ def begun_folder(
     *,
     replace: bool,
     watched: bool = False,
-) -> Held:
-    """Make the folder of a run or a watch.
+) -> Iterator[LockedRun]:
+    """Create and lock the folder of a run or a watch.
 
     Parameters
     ----------
-    resolved
-        The scenario with all that was given beside its file.
-    file
-        Name and hash of its file, see `LoadedScenario.file`.
-    folder
-        Where.
-    files
-        Of what is believed or flown, and further ones: path inside the folder, content.
-    replace
-        Take the place of an existing run folder.
-    watched
+    resolved : Scenario
+        The scenario with all overrides.
+    file : mapping of str to str
+        The name and the hash of its file, see `LoadedScenario.file`.
+    folder : Path
+        The folder to create.
+    files : mapping of str to bytes
+        The contents of the files that belong to asset and belief, and of further ones, by their
+        paths in the folder.
+    replace : bool
+        Whether to replace an existing run folder.
+    watched : bool
         Whether a real asset is watched.
 
     Raises
     ------
     RunFolderError
-        The folder exists.
+        If the folder exists.
     """
-    config = {
-        "kind": KIND,
-        "format": 1,
-        **({"watched": True} if watched else {}),
-        "scenario": resolved.portable().to_dict(),
-        "scenario_file": dict(file),
-        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
-    }
+    config: JsonObject = {"kind": KIND, "format": 1}
+    if watched:
+        config["watched"] = True
+    config["scenario"] = resolved.portable().to_dict()
+    config["scenario_file"] = dict(file)
+    config["provenance"] = collect_provenance(resolved.mission.seed).as_dict()
     with create_run_folder(folder, config, files, replace=replace):
-        yield config, resolved.portable().with_paths_from(folder)
+        yield LockedRun(config, resolved.portable().with_paths_from(folder))
 
 
 @contextmanager
-def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
-    """Take up the folder of a run or a watch.
+def hold_run_folder(folder: Path, loaded: LoadedScenario | None) -> Iterator[LockedRun]:
+    """Lock the folder of an earlier run or watch, in order to continue it.
 
     Parameters
     ----------
-    folder
+    folder : Path
         The folder.
-    loaded
-        The scenario that the user believes to be there; checked against the folder.
+    loaded : LoadedScenario or None
+        The scenario that the user expects there; it is compared with that of the folder.
 
     Raises
     ------
     NotResumableError
-        The folder holds no run, or one of another scenario.
+        If the folder holds no run, or one of another scenario.
     RunFolderError
-        Another process holds it.
+        If another process holds the folder.
     """
     config = read_config(folder)
-    scenario, file = kept_scenario(folder), config["scenario_file"]
+    scenario = read_scenario(folder)
+    file = config["scenario_file"]
     if loaded is not None and file.get("sha256") != loaded.content_hash:
-        does = "watches" if config.get("watched") else "flies"
-        other = f"{scenario.mission.name}, {file.get('name')}"
-        there = {"folder": folder, "does": does, "other": other}
-        raise NotResumableError(said("mission.another", **there, path=loaded.path))
+        verb = "watches" if config.get("watched") else "flies"
+        raise NotResumableError(
+            f"{folder} {verb} another scenario ({scenario.mission.name}, {file.get('name')}) than "
+            f"{loaded.path}: resume it without naming a scenario."
+        )
     with closing_lock(lock_run_folder(folder)):
-        yield config, scenario.with_paths_from(folder)
+        yield LockedRun(config, scenario.with_paths_from(folder))
 
 
 def restore(folder: Path, progress: Progress) -> None:
-    """Put back a run that a killed --replace had moved aside."""
+    """Put back a run whose replacement was killed after the run had been moved aside."""
     if restore_folder(folder):
         progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")

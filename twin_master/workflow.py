@@ -1,6 +1,7 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report.
 
-A scenario can be checked before: only it and the small files beside it are read, so that it takes no time.
+`check_scenario` checks a scenario before: it reads only the scenario and the small files beside it,
+which takes no time.
 """
 
 import time
@@ -17,7 +18,11 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
-from twin_master.assets.asset_source import AssetSource, calibration_sentence, noise_free_observations
+from twin_master.assets.asset_source import (
+    AssetSource,
+    calibration_sentence,
+    noise_free_observations,
+)
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
@@ -25,11 +30,11 @@ from twin_master.assets.resolution import (
     resolve_scenario,
     scenario_bytes,
 )
-from twin_master.errors import NotResumableError, said
+from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
-from twin_master.mission.planning import policy_file, read_policy
-from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
+from twin_master.mission.planning import encode_policy, read_policy
+from twin_master.mission.preparation import Knowledge, prepare_knowledge, save_knowledge
 from twin_master.mission.steps import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
@@ -37,15 +42,21 @@ from twin_master.scenario.consistency import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import another_truth
-from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
+from twin_master.store.summary import truth_mismatch
+from twin_master.store.writing import (
+    TIMING_NAME,
+    RunOutcome,
+    finished_run,
+    read_outcome,
+    store_flight,
+)
 
 POLICY_NAME = "policy.npy"
-"""In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
+"""The file of a run folder with the policy that is flown instead of a plan."""
 
 
 Begun = Callable[[Path], None]
-"""Told the run folder once it is there and held, before anything is modelled."""
+"""Is called with the run folder once it exists and is locked, before anything is modelled."""
 
 
 def fly(
@@ -63,48 +74,58 @@ def fly(
 
     Parameters
     ----------
-    scenario
+    scenario : LoadedScenario, str or Path
         The scenario, its shipped name, or its file.
-    folder
+    folder : Path or str, optional
         The run folder to make; ``runs/NAME`` by default.
-    overrides
-        What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu": "wing.fmu"}``.
-    policy : (S, U), BeliefPolicy or Path
-        To fly instead of planning: p(U | D), row-stochastic, states in the order of `Knowledge.model.states`,
-        controls in that of the scenario; or a policy on the belief, or its file. The run folder keeps it.
-    replace
-        Take the place of an existing run folder.
-    report
-        Draw the report.
-    progress
+    overrides : Overrides or mapping, optional
+        What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu":
+        "wing.fmu"}``.
+    policy : (S, U) array, BeliefPolicy or Path, optional
+        The policy that is flown instead of a plan: p(U | D), row-stochastic, states in the order of
+        `Knowledge.model.states`, controls in that of the scenario; or a policy on the belief, or
+        its file. The run folder keeps it.
+    replace : bool
+        Whether to replace an existing run folder.
+    report : bool
+        Whether to write the report.
+    progress : Progress, optional
         Shows the stages.
-    begun
+    begun : callable, optional
         Called with the run folder before the first stage.
+
+    Returns
+    -------
+    RunOutcome
+        The figures of the run, and its files.
 
     Raises
     ------
     RunFolderError
-        The folder exists.
+        If the folder exists.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError
-        With one clear sentence; the run folder stays resumable.
+        If the mission cannot be flown; the error is one clear sentence, and the run folder stays
+        resumable.
     """
     loaded = load_scenario(scenario)
     resolved = resolve_scenario(loaded, overrides)
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
-    files = {}
+    policy_files = {}
     if policy is not None:
         model = build_graphical_model(resolved)
-        given = read_policy(policy, model) if isinstance(policy, Path) else policy
-        files[POLICY_NAME] = policy_file(given, model)
+        checked_policy = read_policy(policy, model) if isinstance(policy, Path) else policy
+        policy_files[POLICY_NAME] = encode_policy(checked_policy, model)
     if loaded.remark:
         progress.note(loaded.remark)
     run_folder.restore(folder, progress)
     source = asset_source(resolved)
-    source.check()  # what is not there costs the user no folder
-    opened = run_folder.begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
-    with opened as (config, located):
-        return _run(folder, config, located, progress, begun, report=report)
+    source.check()  # before the folder is made, so that missing input leaves none behind
+    new_folder = run_folder.new_run_folder(
+        resolved, loaded.file, folder, source.files() | policy_files, replace=replace
+    )
+    with new_folder as locked:
+        return _run(folder, locked, progress, begun, report=report)
 
 
 def resume(
@@ -115,182 +136,228 @@ def resume(
     progress: Progress | None = None,
     begun: Begun | None = None,
 ) -> RunOutcome:
-    """Continue an interrupted run; the results are those of an uninterrupted one, bit for bit.
+    """Continue an interrupted run; the results are those of an uninterrupted one, to the bit.
 
     Parameters
     ----------
-    folder
+    folder : Path or str
         The run folder.
-    loaded
-        The scenario that the user believes to be flown; checked against the folder.
-    report
-        Draw the report.
-    progress
+    loaded : LoadedScenario, optional
+        The scenario that the user expects to be flown; it is compared with that of the folder.
+    report : bool
+        Whether to write the report.
+    progress : Progress, optional
         Shows the stages.
-    begun
+    begun : callable, optional
         Called with the run folder before the first stage.
 
     Raises
     ------
     NotResumableError
-        The folder holds no run, or one of another scenario or another version.
+        If the folder holds no run, or one of another scenario or another version.
     """
-    folder, progress = Path(folder), progress or SilentProgress()
+    folder = Path(folder)
+    progress = progress or SilentProgress()
     run_folder.restore(folder, progress)
-    with run_folder.resumed_folder(folder, loaded) as (config, scenario):
+    with run_folder.hold_run_folder(folder, loaded) as locked:
         finished = finished_run(folder)
         if finished is not None and (finished.report or not report):
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
-        run_folder.check_versions(folder, config, scenario.mission.seed)
-        return _run(folder, config, scenario, progress, begun, report=report)
+        run_folder.check_versions(folder, locked.config, locked.scenario.mission.seed)
+        return _run(folder, locked, progress, begun, report=report)
 
 
 def _run(
     folder: Path,
-    config: dict[str, Any],
-    scenario: Scenario,
+    locked: run_folder.LockedRun,
     progress: Progress,
     begun: Begun | None,
     *,
     report: bool,
 ) -> RunOutcome:
-    run_folder.tidy(folder)
+    """Go through all stages of a run; those of an interrupted run are taken up where it stopped."""
+    scenario = locked.scenario
+    run_folder.remove_half_written_files(folder)
     if begun is not None:
         begun(folder)
-    start, stages = time.perf_counter(), dict[str, float]()
+    start = time.perf_counter()
+    seconds_of_stages: dict[str, float] = {}
 
     @contextmanager
-    def timed(name: str) -> Iterator[None]:
+    def timed(stage: str) -> Iterator[None]:
         begin = time.perf_counter()
-        with _noted(folder):
+        with _advice_on_error(folder):
             yield
-        stages[name] = time.perf_counter() - begin
+        seconds_of_stages[stage] = time.perf_counter() - begin
 
     source = asset_source(scenario)
     with timed("asset"):
-        hashes, policy, given = dict(source.prepare(folder, progress)), None, folder / POLICY_NAME
-        if given.is_file():
-            hashes["policy"] = hash_file(given)
-            policy = read_policy(given, build_graphical_model(scenario))
-    config = run_folder.with_inputs(folder, config, hashes)
+        hashes = dict(source.prepare(folder, progress))
+        policy = None
+        policy_path = folder / POLICY_NAME
+        if policy_path.is_file():
+            hashes["policy"] = hash_file(policy_path)
+            policy = read_policy(policy_path, build_graphical_model(scenario))
+    config = run_folder.record_inputs(folder, locked.config, hashes)
     with timed("calibration"), progress.stage("Calibrating and planning"):
-        knowledge = _known(folder, config, scenario, source, policy, progress)
+        knowledge = _prepare_knowledge(folder, config, scenario, source, policy, progress)
     with timed("mission"):
         result = _fly(folder, config, knowledge, source, progress)
     with timed("store"), progress.stage("Storing"):
         store_flight(
-            folder, config, result, source.origin, steps=scenario.mission.steps,
-            misfit=_misfit(knowledge, source), write_field=_field_writer(source, result),
-        )  # fmt: skip
-    timing = _timing(result.flight)
-    del knowledge, result  # before the report is drawn
+            folder,
+            config,
+            result,
+            source.origin,
+            steps=scenario.mission.steps,
+            misfit=_model_misfit(knowledge, source),
+            write_field=_field_writer(source, result),
+        )
+    timing = _timing_record(result.flight)
+    del knowledge, result  # their memory is needed for the report
     if report:
         with timed("report"), progress.stage("Writing the report"):
-            _report(folder)
-    timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
-    # The only file with figures of a clock.
+            _write_report(folder)
+    timing["stages_seconds"] = seconds_of_stages
+    timing["total_seconds"] = time.perf_counter() - start
+    # Times stand in a file of their own, so that all other files of a run can be compared by bytes.
     atomic_write_text(folder / TIMING_NAME, run_folder.to_json(timing))
     return read_outcome(folder)
 
 
-def _known(
+def _prepare_knowledge(
     folder: Path,
-    config: Mapping[str, Any],
+    config: run_folder.JsonObject,
     scenario: Scenario,
     source: AssetSource,
     policy: Float | BeliefPolicy | None,
     progress: Progress,
 ) -> Knowledge:
-    """Return what the twin knows before its flight, and keep it."""
+    """Return what the twin knows before its flight, once it is saved in the run folder."""
     knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
-    draws, origin = knowledge.draws, source.origin
+    draws = knowledge.draws
     truth = scenario.asset.true_parameters.get(draws.name)
-    # The true asset of the scenario may not be the one that the calibration file describes.
+    # The scenario may give the flown asset another parameter than the calibrated one has.
     if scenario.calibration.source == "file" and truth is not None:
-        sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
-        if sentence is not None:
-            progress.note(said("mission.truth", sentence=sentence, name=draws.name))
-    told = calibration_sentence(draws.record or {}, origin.asset, origin.model, config["inputs"])
-    if told is not None:
-        progress.note(told)
-    keep_knowledge(folder, knowledge)
-    # Steps without observations on a twin of its own compile the inner loops before the flight.
-    compiling = knowledge.twin()
-    for _ in range(2):
-        compiling.step(np.full(scenario.observation.count, np.nan), 0)
-    compiling.smoothed()
+        mismatch = truth_mismatch(draws.name, truth, draws.mean, draws.standard_deviation)
+        if mismatch is not None:
+            progress.note(
+                f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` in "
+                "the scenario's table `asset`."
+            )
+    calibrated = calibration_sentence(
+        draws.record or {}, source.origin.asset, source.origin.model, config["inputs"]
+    )
+    if calibrated is not None:
+        progress.note(calibrated)
+    save_knowledge(folder, knowledge)
+    _compile_twin(knowledge)
     return knowledge
 
 
+def _compile_twin(knowledge: Knowledge) -> None:
+    """Let a twin assimilate two steps without observations, which compiles its inner loops.
+
+    Otherwise the first steps of the flight would take seconds longer than the others.
+    """
+    twin = knowledge.twin()
+    nothing_observed = np.full(knowledge.scenario.observation.count, np.nan)
+    for _ in range(2):
+        twin.step(nothing_observed, 0)
+    twin.smoothed()
+
+
 @contextmanager
-def _noted(folder: Path) -> Iterator[None]:
-    """Add to any error how the run can be continued, or begun anew before its first step."""
+def _advice_on_error(folder: Path) -> Iterator[None]:
+    """Add to any error how the run can be continued, or begun again before its first step."""
     try:
         yield
     except NotResumableError:
         raise
     except Exception as error:
-        error.add_note(
-            said("mission.flown", folder=folder)
-            if (folder / JOURNAL_NAME).exists()
-            else said("mission.begun")
-        )
+        if (folder / JOURNAL_NAME).exists():
+            error.add_note(
+                f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where "
+                "the scenario itself is to be changed, fly the changed one with --replace."
+            )
+        else:
+            error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
         raise
 
 
 def _fly(
-    folder: Path, config: Mapping[str, Any], knowledge: Knowledge, source: AssetSource, progress: Progress
+    folder: Path,
+    config: run_folder.JsonObject,
+    knowledge: Knowledge,
+    source: AssetSource,
+    progress: Progress,
 ) -> MissionResult:
+    """Fly the mission, or the rest of an interrupted one, with a journal of its steps."""
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
-    with closing(source.open()) as asset, JournalFile(folder, hash_record(config)) as journal:
+    with (
+        closing(source.open()) as asset,
+        JournalFile(folder, hash_record(config)) as journal,
+    ):
         plant = knowledge.plant(truth, asset)
-        flown = loop.taken_up(journal, knowledge, plant)
-        keep = loop.kept_in(journal, plant)
-        flight = loop.fly(scenario, flown.twin, plant, keep, history=flown, progress=progress)
+        earlier_steps = loop.restore_flight(journal, knowledge, plant)
+        flight = loop.fly(
+            scenario,
+            earlier_steps.twin,
+            plant,
+            loop.journal_sink(journal, plant),
+            history=earlier_steps,
+            progress=progress,
+        )
         return MissionResult(scenario, knowledge, flight, truth, asset.units)
 
 
-def _misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
-    """Return by which shares (S, U, G) predictions and asset differ, where their models are known to."""
-    # An asset with damage of its own cannot be asked at a state of the twin's choice.
+def _model_misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
+    """Return the relative difference of predicted to true observations (S, U, G).
+
+    None is returned if asset and model are not known to differ.
+    """
+    # An asset with damage of its own cannot be put into a state that the twin chooses.
     if not source.origin.differ or knowledge.scenario.truth.kind == "asset":
         return None
+    states = knowledge.model.states.coordinates
     with closing(source.open()) as asset:
-        shown = noise_free_observations(knowledge.scenario, knowledge.model.states.coordinates, asset)
-    shown[shown == 0.0] = np.nan
-    return np.asarray((knowledge.sensor_model.mean - shown) / shown)
+        observation = noise_free_observations(knowledge.scenario, states, asset)
+    observation[observation == 0.0] = np.nan
+    return np.asarray((knowledge.sensor_model.mean - observation) / observation)
 
 
 def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:
-    """Return what writes the field under the last estimate and the last control."""
-    last, scenario = result.flight.steps[-1].concluded, result.scenario
-    estimate = result.knowledge.model.states.mean(last.filtered).tolist()
-    # A belief that is sure of the last level may round to a little beyond it, where no model holds.
-    state = {
-        factor.name: min(max(value, factor.levels[0]), factor.levels[-1])
-        for factor, value in zip(scenario.state, estimate, strict=True)
-    }
-    control = scenario.control[last.control_index].values
+    """Return a function that writes the field under the last estimate and the last control."""
+    scenario = result.scenario
+    last_step = result.flight.steps[-1].twin_step
+    estimate = result.knowledge.model.states.mean(last_step.filtered).tolist()
+    state = {}
+    for factor, value in zip(scenario.state, estimate, strict=True):
+        # Rounding may put the mean a little beyond the last level, where no model holds.
+        state[factor.name] = min(max(value, factor.levels[0]), factor.levels[-1])
+    control = scenario.control[last_step.control_index].values
     return lambda path: source.write_field(path, state, control)
 
 
-def _timing(flight: History) -> dict[str, Any]:
-    """Return the seconds of the steps flown by this process."""
+def _timing_record(flight: History) -> run_folder.JsonObject:
+    """Return the times of the steps that this process flew, in seconds."""
     seconds = flight.seconds[flight.resumed_at :]
-    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "steps": len(seconds)}
-    for name, values in zip(("asset", "twin", "checkpoint"), seconds.T if len(seconds) else (), strict=False):
+    record: run_folder.JsonObject = {"resumed_at": flight.resumed_at, "steps": len(seconds)}
+    if len(seconds) == 0:
+        return record
+    for name, seconds_of_part in zip(("asset", "twin", "checkpoint"), seconds.T, strict=True):
         record[f"{name}_seconds"] = {
-            "total": float(values.sum()),
-            "median": float(np.median(values)),
-            "largest": float(values.max()),
-            "last": float(values[-1]),
+            "total": float(seconds_of_part.sum()),
+            "median": float(np.median(seconds_of_part)),
+            "largest": float(seconds_of_part.max()),
+            "last": float(seconds_of_part[-1]),
         }
     return record
 
 
-def _report(folder: Path) -> None:
+def _write_report(folder: Path) -> None:
     from twin_master.report.page import write_report
 
     write_report(folder)
@@ -298,33 +365,45 @@ def _report(folder: Path) -> None:
 
 def check_scenario(
     loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return what a scenario is with the overrides, once everything that it names was looked at.
+) -> run_folder.JsonObject:
+    """Check a scenario and all that it names, and return what it flies and what its twin takes.
 
-    Beside what it flies and believes, in words, these are the sizes of the twin: `levels` of each factor,
-    joint `states`, `controls`, `sensors`, and the `memory` of all its arrays [bytes].
+    Parameters
+    ----------
+    loaded : LoadedScenario
+        The scenario.
+    overrides : Overrides or mapping, optional
+        What differs from the file, as for `fly`.
+
+    Returns
+    -------
+    dict
+        What is flown and believed, in words, and the size of the twin: the number of `levels` of
+        each factor, of joint `states` and of `sensors`, the `controls`, and the `memory` of all
+        arrays in bytes.
 
     Raises
     ------
     MissionInputError
-        A file is missing, or a name of the scenario is none of its binding's.
+        If a file is missing, or the binding does not know a name of the scenario.
     InvalidModelError
-        The twin does not fit in memory.
+        If the twin does not fit in memory.
     BindingError, InvalidDesignError, DesignFileError
-        The binding or the design is wrong.
+        If the binding or the design is wrong.
     """
     scenario = resolve_scenario(loaded, overrides)
-    watched = scenario.asset.kind == WATCHED_KIND
-    source = believed_source(scenario) if watched else asset_source(scenario)
+    is_watched = scenario.asset.kind == WATCHED_KIND
+    source = believed_source(scenario) if is_watched else asset_source(scenario)
     source.check()
-    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.draw_summary()
+    mission = scenario.mission
+    origin_of_draws, draws = source.draw_summary()
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return {
         "name": mission.name,
         "title": mission.title,
-        "flown": "nothing, a real asset is watched" if watched else origin.asset,
-        "believed": origin.model,
-        "uncertain": f"{scenario.calibration.parameter}, from {drawn}",
+        "flown": "nothing, a real asset is watched" if is_watched else source.origin.asset,
+        "believed": source.origin.model,
+        "uncertain": f"{scenario.calibration.parameter}, from {origin_of_draws}",
         "draws": draws,
         "levels": levels,
         "states": prod(levels.values()),

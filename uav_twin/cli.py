@@ -192,6 +192,6 @@ structure_group.command("fmu")(structure.fmu)
 
 def main() -> None:
     """Run `uav-twin`."""
-    command.guarded(
+    command.run_command_line(
         lambda: terminal.with_common_options(app)(prog_name="uav-twin"), DiscrepancyError
     )

@@ -60,7 +60,9 @@ def flights(known: Knowledge, first: int, count: int) -> Flights:
 def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     """Return the likelihood of the probabilities to worsen."""
     worsening = TransitionFamily.learnable(known.scenario)
-    likelihood, _ = scaled_likelihood(known.sensor_model, flown.row, flown.control_index)
+    likelihood, _ = scaled_likelihood(
+        known.sensor_model, flown.observation_rows, flown.control_index
+    )
 
     def log_likelihood(points: Float) -> Float:
         evidence = transition_evidence(worsening, points, likelihood, flown.control_index)

@@ -59,7 +59,7 @@ from twin_master.run_folder import create_run_folder
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import groups_of
+from twin_master.store.results import run_groups
 from twin_master.store.writing import write_run
 
 STEPS = 50
@@ -266,7 +266,7 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Mi
         "seed": seed,
         "parameter": knowledge.draws.name,
     }
-    write_run(folder, groups_of(result), attributes)
+    write_run(folder, run_groups(result), attributes)
     error = flight.filtered @ knowledge.model.states.coordinates - flight.state
     is_covered = in_credible_set(knowledge.model, flight.filtered, flight.state, 0.9)
     is_sharp = flight.control_index == scenario.control_names.index("3g")

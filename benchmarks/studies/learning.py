@@ -104,7 +104,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> TwinRes
         begin = time.process_time()
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
-        flights.put(number, flight)
+        flights.store_history(number, flight)
         # Revising the last step with its own observation changes nothing, and returns the learnt e
         last_step = twin.steps - 1
         learnt = twin.revise(last_step, twin.observed(last_step)).learnt

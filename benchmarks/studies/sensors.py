@@ -18,7 +18,7 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.sensor_design import chosen_sensors, drawn_readings
+from twin_master.mission.sensor_design import choose_sensors, draw_readings
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.tables import SensorFault
@@ -52,7 +52,7 @@ def choices(knowledge: Knowledge) -> dict[str, tuple[int, ...]]:
     table = (mean_readings - mean_readings.mean(axis=0)).reshape(-1, mean_readings.shape[-1])
     rng = np.random.default_rng(1)
     gauges = {
-        "by information": chosen_sensors(drawn_readings(knowledge), range(24), COUNT).sensors,
+        "by information": choose_sensors(draw_readings(knowledge), range(24), COUNT).sensors,
         "pivoted QR": tuple(qr(table, pivoting=True, mode="r")[1][:COUNT].tolist()),
     }
     for number in range(RANDOM):

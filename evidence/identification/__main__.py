@@ -19,7 +19,7 @@ from evidence.identification.workflow import run_identification, write_identific
 from fe.wing.design import load_design
 from reporting import terminal
 from reporting.errors import FileNotWrittenError
-from twin_master.command import guarded
+from twin_master.command import run_command_line
 
 
 def identify(
@@ -91,7 +91,9 @@ def main() -> None:
     """Run `python -m evidence.identification`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     application.command()(identify)
-    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m evidence.identification"))
+    run_command_line(
+        lambda: terminal.with_common_options(application)(prog_name="python -m evidence.identification")
+    )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from fe.verification.wing_checks import QUICK_REFINEMENTS, Check
 from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
-from twin_master.command import guarded
+from twin_master.command import run_command_line
 from uav_twin.check_table import exit_if_broken, print_checks
 
 
@@ -100,7 +100,9 @@ def main() -> None:
     """Run `python -m evidence.sandwich_plate`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     application.command()(compare)
-    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m evidence.sandwich_plate"))
+    run_command_line(
+        lambda: terminal.with_common_options(application)(prog_name="python -m evidence.sandwich_plate")
+    )
 
 
 if __name__ == "__main__":

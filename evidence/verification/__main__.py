@@ -21,7 +21,7 @@ from fe.verification.wing_checks import Check
 from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
-from twin_master.command import guarded
+from twin_master.command import run_command_line
 from uav_twin.check_table import exit_if_broken, print_checks
 
 # R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
@@ -79,7 +79,9 @@ def main() -> None:
     """Run `python -m evidence.verification`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     application.command()(check)
-    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m evidence.verification"))
+    run_command_line(
+        lambda: terminal.with_common_options(application)(prog_name="python -m evidence.verification")
+    )
 
 
 if __name__ == "__main__":

@@ -24,10 +24,10 @@ from twin_master.assets.strain_library_source import StrainLibrarySource, load_s
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
-    line_of,
+    decode_state,
+    encode_line,
+    encode_state,
     records,
-    state_of,
-    state_text,
 )
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
@@ -162,12 +162,12 @@ def with_former_names(folder: Path) -> None:
         if "config_hash" in record:
             record["config_hash"] = hash_record(config)
         if "settled" in record:
-            arrays = arrays_from_bytes(state_of(record["settled"]["state"]), "the state")
+            arrays = arrays_from_bytes(decode_state(record["settled"]["state"]), "the state")
             arrays = {re.sub(r"\bsteps$", "turns", name): values for name, values in arrays.items()}
-            record["settled"]["state"] = state_text(arrays_to_bytes(arrays))
+            record["settled"]["state"] = encode_state(arrays_to_bytes(arrays))
         if "standing" in record:
             record["standing"]["begin"] = len(content)
-        content += line_of(record)
+        content += encode_line(record)
     assert b'"step' not in content
     path.write_bytes(content)
 

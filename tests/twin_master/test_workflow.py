@@ -123,7 +123,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
 def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     """A mean of 0.8000000000000003 lies outside every model that ends at 0.8."""
     model = SimpleNamespace(states=SimpleNamespace(mean=lambda _belief: np.array([0.8000000000000003, 0.3])))
-    step = SimpleNamespace(concluded=SimpleNamespace(filtered=None, control_index=0))
+    step = SimpleNamespace(twin_step=SimpleNamespace(filtered=None, control_index=0))
     knowledge, flight = SimpleNamespace(model=model), SimpleNamespace(steps=[step])
     scenario, seen = load_scenario("level_turns").scenario, list[dict[str, float]]()
     result = SimpleNamespace(scenario=scenario, knowledge=knowledge, flight=flight)
@@ -182,7 +182,7 @@ def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flo
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
 
-    monkeypatch.setattr(workflow, "_report", report)
+    monkeypatch.setattr(workflow, "_write_report", report)
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "_run", None)  # nothing is done again
         notes = noted(patch)

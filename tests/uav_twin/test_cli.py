@@ -354,7 +354,7 @@ def test_records_show_themselves_in_a_few_words(library_file):
 def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file, monkeypatch):
     from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError
 
-    monkeypatch.setattr("twin_master.workflow._report", None)  # none is drawn where none is asked for
+    monkeypatch.setattr("twin_master.workflow._write_report", None)  # none is drawn where none is asked for
     flown = {"strain_library": library_file}
     known = uav_twin.prepare_twin("level_turns", flown)
     controls = known.model.controls

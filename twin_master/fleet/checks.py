@@ -8,7 +8,7 @@ from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.store import dimension_sizes
-from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
@@ -80,7 +80,7 @@ def _objections_to_scenarios(group: Group) -> list[str]:
         try:
             _check_scenario(group, scenario)
             source_of(with_parameters(scenario, mean_parameters), is_real=is_real).check()
-        except IN_FLIGHT as error:
+        except FLIGHT_ERRORS as error:
             asset = group.name
             if len(group.scenarios) > 1:
                 asset += f" {group.members[number].name}"
@@ -96,7 +96,7 @@ def _objections_to_recordings(group: Group) -> list[str]:
     for member in group.members:
         try:
             file_feed(member.file or Path(), group.scenarios[0])
-        except IN_FLIGHT as error:
+        except FLIGHT_ERRORS as error:
             objections.append(f"{group.name}: {error}")
     return objections
 

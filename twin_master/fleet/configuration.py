@@ -71,7 +71,7 @@ def locked_fleet_folder(
         If the fleet was begun with another version of the program.
     """
     config = {"kind": kind, "format": 1, "fleet": record}
-    former_config = None if replace_old else run_folder.folder_config(folder, kind)
+    former_config = None if replace_old else run_folder.find_config(folder, kind)
     if former_config is None:
         check()
         provenance = collect_provenance(record["seed"]).as_dict()
@@ -107,7 +107,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
     RunFolderError
         If the folder does not hold such a fleet.
     """
-    config = run_folder.folder_config(folder, *(kinds or (KIND,)))
+    config = run_folder.find_config(folder, *(kinds or (KIND,)))
     if config is None or "fleet" not in config:
         if folder.exists():
             raise RunFolderError(f"{folder} is not the folder of a fleet.")

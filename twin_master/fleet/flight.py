@@ -28,8 +28,8 @@ from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.shard import ShardResult, result_of_unflown
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
-from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
@@ -208,7 +208,7 @@ def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> b
     source = source_of(located, is_real=is_real)
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
-        keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
+        save_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
     model = None
     if flies_model(scenario) and not is_real and isinstance(source, ReducedModelSource):
         model = source.prepared_model
@@ -305,7 +305,7 @@ class _FleetFlight:
             try:
                 kit = self._packed_kit(number, members[0].scenario_number)
                 recorded = tuple(_with_recording(group, member) for member in members)
-            except IN_FLIGHT as error:
+            except FLIGHT_ERRORS as error:
                 if len(group.scenarios) == 1:
                     raise
                 self._store(number, members, result_of_unflown(members[0], str(error)))

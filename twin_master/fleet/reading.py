@@ -19,7 +19,7 @@ from twin_master.fleet.store import (
     flown_rows,
     open_group,
 )
-from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability
 from twin_master.scenario.schema import Scenario
@@ -272,7 +272,7 @@ def flown_twins(
         home = folder / GROUPS / record["name"] / str(number)
         scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(home)
         rows = flown[scenario_numbers == number]
-        yield TwinsOfScenario(rows, home, kept_knowledge(home, scenario))
+        yield TwinsOfScenario(rows, home, load_knowledge(home, scenario))
 
 
 def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:

@@ -26,10 +26,11 @@ from twin_master.errors import FleetError
 from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import FAILED, stored_variables
-from twin_master.mission.loop import BelievedModel, filtered_again, operate
-from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import Knowledge, load_knowledge
+from twin_master.mission.replay import BelievedModel, refilter
 from twin_master.mission.side_by_side import (
-    IN_FLIGHT,
+    FLIGHT_ERRORS,
     Flights,
     fly_one_by_one,
     fly_side_by_side,
@@ -61,7 +62,7 @@ def flights_of_recordings(
     for number, messages in enumerate(recordings):
         try:
             history = _history_of_recording(knowledge, messages)
-        except IN_FLIGHT as error:
+        except FLIGHT_ERRORS as error:
             flights.failure[number] = str(error)
             continue
         step_count = len(history.steps)
@@ -73,7 +74,7 @@ def flights_of_recordings(
                 "set `steps` of the group."
             )
         else:
-            flights.put(number, history)
+            flights.store_history(number, history)
     return flights
 
 
@@ -96,7 +97,7 @@ def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) ->
             has_late_message = True
         intake_notices += [(number, notice) for notice in intake.notices]
     if has_late_message:
-        history = filtered_again(reading_of_step, [BelievedModel(0, knowledge)])
+        history = refilter(reading_of_step, [BelievedModel(0, knowledge)])
     history.notices += intake_notices
     return history
 
@@ -142,7 +143,7 @@ class Kit:
         write_members(folder, files)
         self._folder = folder
         self.scenario = Scenario.model_validate(scenario).with_paths_from(folder)
-        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
+        self.knowledge: Knowledge = load_knowledge(folder, self.scenario)
 
     def without_folder(self, sentence: str) -> str:
         """Return a sentence without the temporary folder, which no user knows."""
@@ -216,7 +217,7 @@ def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
     with _AssetPool(kit, members) as pool:
         if kit.scenario.learning is None and kit.scenario.notice is None:
             # If opening the assets fails, it will fail again, for each twin by itself.
-            with suppress(*IN_FLIGHT):
+            with suppress(*FLIGHT_ERRORS):
                 assets = pool.open_stateless_assets()
                 if assets:
                     return fly_side_by_side(knowledge, truths, assets)

@@ -121,7 +121,7 @@ def stored_variables(
     values: dict[str, Any] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
-        "observed": flights.row,
+        "observed": flights.observation_rows,
         "control_index": flights.control_index,
         "state": flights.state,
         "mean": mean,

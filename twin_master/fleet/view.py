@@ -11,7 +11,7 @@ from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.report import fleet_page
 from twin_master.fleet.watched_asset import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.run_folder import folder_config
+from twin_master.run_folder import find_config
 from twin_master.viewer.server import ServedText, package_text, serve_texts
 
 ATTENTION_ROWS = 50
@@ -20,7 +20,7 @@ ATTENTION_ROWS = 50
 
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
-    return folder_config(folder, KIND, WATCHED_KIND) is not None
+    return find_config(folder, KIND, WATCHED_KIND) is not None
 
 
 def _always() -> bool:

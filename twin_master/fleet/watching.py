@@ -18,7 +18,7 @@ from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.watch_sources import LARGEST_FLEET, FileSource, Source, TopicSource
 from twin_master.fleet.watched_asset import STATE_NAME, WatchedAsset, read_standing
-from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.watch.broker_address import is_broker
 from twin_master.watch.feed import Feed
@@ -324,7 +324,7 @@ class FleetWatch:
         """
         if isinstance(error, DiskFullError):
             raise error
-        if isinstance(error, IN_FLIGHT):
+        if isinstance(error, FLIGHT_ERRORS):
             sentence = str(error)
         else:
             sentence = f"{type(error).__name__}: {error}"

@@ -1,7 +1,8 @@
-"""The journal of a run or a watch, `journal.jsonl`: a line for each step, behind the SHA-256 of it.
+"""The journal of a run or a watch, `journal.jsonl`: one line for each step, after its SHA-256 hash.
 
-The file only grows. A line that was cut off by a kill ends without a line feed and is dropped; any other line
-that does not have its hash was changed. It is read line by line, however long it is.
+The file only grows. A line that was cut off when the process was killed ends without a line feed
+and is dropped. Any other line without its hash was changed. The file is read line by line, however
+long it is.
 """
 
 import base64
@@ -11,11 +12,11 @@ import math
 import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
 
@@ -23,8 +24,9 @@ from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_error
 from reporting.former_names import with_present_names
 from reporting.json_file import plain
-from twin_master.errors import NotResumableError, said
-from twin_master.mission.steps import Happened, MissionStep, Reading
+from twin_master.errors import NotResumableError
+from twin_master.mission.steps import GroundTruth, MissionStep, Reading
+from twin_master.run_folder import JsonObject
 
 JOURNAL_NAME = "journal.jsonl"
 PRESENT_NAMES = {
@@ -46,95 +48,138 @@ PRESENT_NAMES = {
     "standing.teaching.trial.to_turn": "to_step",
     "standing.teaching.adopted.from_turn": "from_step",
 }
-"""The present name of each key of a journal, by the location that it had before."""
-_DIGEST = 64
-_PIECE = 1_000_000
+"""The present name of each key of a journal, by the location of its former name."""
+_HASH_LENGTH = 64
+"""Characters of a SHA-256 hash in hexadecimal digits."""
+_BLOCK_SIZE = 1_000_000
+"""Bytes that are read at once from the end of a journal."""
+_WRONG_HASH = "it does not have the hash that stands before it"
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
 
 
-def state_text(state: bytes) -> str:
-    """Return the state of an asset or a twin as lines hold it."""
+class JournalLine(NamedTuple):
+    """A line of a journal that has its hash.
+
+    Attributes
+    ----------
+    record : dict
+        The content of the line.
+    begin, end : int
+        Where the line begins and ends in the file, in bytes.
+    """
+
+    record: JsonObject
+    begin: int
+    end: int
+
+
+def encode_state(state: bytes) -> str:
+    """Return the state of an asset or a twin as compressed text for a line of the journal."""
     return base64.b64encode(zlib.compress(state, 1)).decode("ascii")
 
 
-def state_of(text: Any) -> bytes:
-    """Return a state from its text; raises `TypeError`, `ValueError` or `zlib.error`."""
+def decode_state(text: str) -> bytes:
+    """Return the state from its text in a line.
+
+    Raises
+    ------
+    TypeError, ValueError, zlib.error
+        If the text is not a state that `encode_state` wrote.
+    """
     return zlib.decompress(base64.b64decode(text))
 
 
-def array_of(values: Any) -> Float:
-    """Return numbers of JSON as an array, null as NaN."""
+def array_from_json(values: Iterable[float | None]) -> Float:
+    """Return the numbers of a JSON list as an array, with NaN for null."""
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def step_record(step: MissionStep) -> dict[str, Any]:
-    """Return what a line says of a step: what came, and the belief for viewers, who need not filter again."""
-    concluded = step.concluded
-    record: dict[str, Any] = {
-        "step": concluded.step,
+def step_record(step: MissionStep) -> JsonObject:
+    """Return the content of the journal's line of a step.
+
+    The line also holds the belief, so that a viewer need not filter the observations again.
+    """
+    twin_step = step.twin_step
+    record: JsonObject = {
+        "step": twin_step.step,
         "observed": plain(step.reading.observed),
-        "control_index": concluded.control_index,
-        "next_control": concluded.next_control,
-        "decision_probability": concluded.decision_probability.tolist(),
-        "filtered": concluded.filtered.tolist(),
-        "log_evidence": concluded.log_evidence,
+        "control_index": twin_step.control_index,
+        "next_control": twin_step.next_control,
+        "decision_probability": twin_step.decision_probability.tolist(),
+        "filtered": twin_step.filtered.tolist(),
+        "log_evidence": twin_step.log_evidence,
     }
-    if step.reading.happened is not None:
-        record |= plain(step.reading.happened._asdict())
-    if concluded.learnt:
-        record["learnt"] = {name: vars(learnt) for name, learnt in concluded.learnt.items()}
-    if concluded.notices:
-        record["notices"] = [notice.as_record() for notice in concluded.notices]
-    if concluded.suspicion is not None:
-        record["suspicion"] = plain(vars(concluded.suspicion))
+    if step.reading.ground_truth is not None:
+        record |= plain(step.reading.ground_truth._asdict())
+    if twin_step.learnt:
+        record["learnt"] = {name: vars(learnt) for name, learnt in twin_step.learnt.items()}
+    if twin_step.notices:
+        record["notices"] = [notice.as_record() for notice in twin_step.notices]
+    if twin_step.suspicion is not None:
+        record["suspicion"] = plain(vars(twin_step.suspicion))
     return record
 
 
-def reading_of(record: Mapping[str, Any]) -> Reading:
-    """Return what came in a step, from its line; raises `KeyError`, `TypeError` or `ValueError`."""
-    happened = None
+def reading_from_line(record: JsonObject) -> Reading:
+    """Return the reading in a line of the journal; that of a simulated asset has its ground truth.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If the record has another layout.
+    """
+    ground_truth = None
     if "monitors" in record:
-        told = dict(zip(record["monitors"], array_of(record["monitors"].values()).tolist(), strict=True))
-        happened = Happened(array_of(record["state"]), array_of(record["observation"]), told)
-    return Reading(array_of(record["observed"]), int(record["control_index"]), happened=happened)
+        values = array_from_json(record["monitors"].values()).tolist()
+        ground_truth = GroundTruth(
+            state=array_from_json(record["state"]),
+            observation=array_from_json(record["observation"]),
+            monitors=dict(zip(record["monitors"], values, strict=True)),
+        )
+    observed = array_from_json(record["observed"])
+    return Reading(observed, int(record["control_index"]), ground_truth=ground_truth)
 
 
 class JournalFile:
-    """The journal of a run folder that this process holds, open to be continued.
+    """The journal of a run folder that this process holds, open for appending.
 
     Parameters
     ----------
     folder : Path
-        The run folder; the file need not exist.
+        The run folder; the journal in it need not exist yet.
     config_hash : str
-        SHA-256 of the configuration that it belongs to.
+        The SHA-256 hash of the configuration that the journal belongs to.
     flush_seconds : float
-        Seconds after which what was appended is flushed to the disk; 0 flushes after every line. A kill of
-        the process loses nothing either way: only a machine that loses its power needs the flush.
+        The time after which appended lines are flushed to the disk, in seconds; 0 flushes after
+        every line. If the process is killed, no line is lost in either case: the flush protects
+        only against a loss of power.
 
     Attributes
     ----------
     path : Path
+        The file.
     size : int
-        Bytes of its whole lines.
+        The bytes of its whole lines.
 
     Raises
     ------
     NotResumableError
-        It was changed or is damaged, or belongs to another configuration.
+        If the journal was changed or is damaged, or belongs to another configuration.
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
 
     def __init__(self, folder: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
-        self.path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
-        self._flushed = time.monotonic()
+        self.path = folder / JOURNAL_NAME
+        self._flush_seconds = flush_seconds
+        self._flushed_at = time.monotonic()
         with explained_write_errors(self.path):
             check_header(self.path, config_hash)
-            self.size = next((end for _, _, end in records_backwards(self.path)), 0)
+            last_line = next(records_backwards(self.path), None)
+            self.size = 0 if last_line is None else last_line.end
             self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
             os.truncate(self._descriptor, self.size)
-            if not self.size:
+            if self.size == 0:
                 self.append({"config_hash": config_hash})
                 self.flush()
                 synchronise(folder)
@@ -148,23 +193,24 @@ class JournalFile:
         os.close(self._descriptor)
 
     def truncate(self, size: int) -> None:
-        """Drop what lies beyond a size in bytes, the end of some line."""
+        """Drop all lines after the first `size` bytes, which must be the end of a line."""
         self.size = size
         os.truncate(self._descriptor, size)
 
-    def append(self, record: Mapping[str, Any]) -> None:
-        """Add a line; it survives a kill of this process when this returns.
+    def append(self, record: Mapping[str, object]) -> None:
+        """Append a line; once this returns, the line survives if the process is killed.
 
         Raises
         ------
         FileNotWrittenError
-            The disk is full or the folder cannot be written; the lines before are still there.
+            If the disk is full or the folder cannot be written; the earlier lines are still there.
         """
-        line, written = line_of(record), 0
+        line = encode_line(record)
+        written = 0
         try:
             while written < len(line):
                 written += os.write(self._descriptor, line[written:])
-            if time.monotonic() - self._flushed >= self._flush_seconds:
+            if time.monotonic() - self._flushed_at >= self._flush_seconds:
                 self.flush()
         except OSError as error:
             with suppress(OSError):
@@ -173,71 +219,88 @@ class JournalFile:
         self.size += len(line)
 
     def flush(self) -> None:
-        """Flush what was appended to the disk."""
+        """Flush the appended lines to the disk."""
         os.fsync(self._descriptor)
-        self._flushed = time.monotonic()
+        self._flushed_at = time.monotonic()
 
 
-def line_of(record: Mapping[str, Any]) -> bytes:
-    """Return a record as a line with its hash."""
+def encode_line(record: Mapping[str, object]) -> bytes:
+    """Return a record as a line of the journal: hash, blank, JSON, line feed."""
     text = _ENCODER.encode(record).encode("ascii")
     return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
 
 
 def check_header(path: Path, config_hash: str) -> None:
-    """Refuse a journal whose first line was changed or is damaged, or of another configuration."""
-    header = line_of({"config_hash": config_hash})
+    """Refuse a journal whose first line is damaged or names another configuration.
+
+    A journal that does not exist, or whose first line was cut off by a kill, passes.
+
+    Raises
+    ------
+    NotResumableError
+        If the first line was changed or is damaged, or belongs to another configuration.
+    """
+    header = encode_line({"config_hash": config_hash})
     with suppress(FileNotFoundError), path.open("rb") as file:
-        found = file.readline()
-        if whole_record(found, path) is None and not header.startswith(found):  # nor cut off by a kill
-            raise damaged(path, 0, "it does not have the hash that stands before it")
-        if not header.startswith(found):
-            raise NotResumableError(said("mission.journal", path=path))
+        first_line = file.readline()
+        if header.startswith(first_line):  # the header, or its beginning if a kill cut it off
+            return
+        if record_of_line(first_line, path) is None:
+            raise damaged_line_error(path, 0, _WRONG_HASH)
+        raise NotResumableError(
+            f"the journal {path} belongs to another configuration than the config.json beside it: "
+            "begin again with --replace."
+        )
 
 
-def records(path: Path, begin: int = 0) -> Iterator[tuple[dict[str, Any], int, int]]:
-    """Return the record of each whole line with where it begins and ends in bytes; the header is left out.
+def records(path: Path, begin: int = 0) -> Iterator[JournalLine]:
+    """Yield the lines of a journal in their order; the header is left out.
 
     A journal that does not exist, or whose header was cut off, has no lines.
 
     Parameters
     ----------
     path : Path
+        The journal.
     begin : int
-        Of the first line, in bytes.
+        The position of the first line to read, in bytes.
 
     Raises
     ------
     NotResumableError
-        A line was changed or is damaged.
+        If a line was changed or is damaged.
     """
     if path.exists():
         with path.open("rb") as file:
-            yield from records_of(file, path, begin)
+            yield from records_in_file(file, path, begin)
 
 
-def records_of(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[tuple[dict[str, Any], int, int]]:
-    """Return the records of an open journal, see `records`."""
+def records_in_file(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[JournalLine]:
+    """Yield the lines of an open journal in their order, as `records` does."""
     file.seek(begin)
     for line in file:
         if not line.endswith(b"\n"):
-            return  # cut off by a kill
-        record = whole_record(line, path)
+            return  # the last line, cut off by a kill
+        record = record_of_line(line, path)
         if record is None:
-            raise damaged(path, begin, "it does not have the hash that stands before it")
-        if begin:
-            yield record, begin, begin + len(line)
-        begin += len(line)
+            raise damaged_line_error(path, begin, _WRONG_HASH)
+        end = begin + len(line)
+        is_header = begin == 0
+        if not is_header:
+            yield JournalLine(record, begin, end)
+        begin = end
 
 
-def whole_record(line: bytes, path: Path) -> dict[str, Any] | None:
-    """Return the record of a line of the journal at `path`, or None where the line was changed.
+def record_of_line(line: bytes, path: Path) -> dict[str, Any] | None:
+    """Return the record of a line, or None if the line does not have its hash.
 
-    Each line has a hash of its own. A line of an earlier version is returned with the present names.
+    Each line has a hash of its own. A line of an earlier version is returned with the present
+    names.
     """
-    text = line[_DIGEST + 1 :].rstrip(b"\n")
-    whole = sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
-    record = json.loads(text) if whole else None
+    text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
+    if sha256(text).hexdigest().encode("ascii") != line[:_HASH_LENGTH]:
+        return None
+    record = json.loads(text)
     if not isinstance(record, dict):
         return None
     if "turn" in record:
@@ -245,63 +308,112 @@ def whole_record(line: bytes, path: Path) -> dict[str, Any] | None:
     return record
 
 
-def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict[str, Any], int, int]]:
-    """Return the record of each line with where it begins and ends in bytes, the last one first.
+def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLine]:
+    """Yield the lines of a journal from the last one back to the header.
 
-    The header is the last of them. A journal that does not exist has no lines. It is read, and checked, no
-    further than it is asked.
+    A journal that does not exist has no lines. The file is read and checked only as far back as the
+    caller iterates.
 
     Parameters
     ----------
     path : Path
+        The journal.
     end : int, optional
-        Of a line, in bytes: those behind it are left out.
+        The end of the last line to read, in bytes; the end of the file if left out.
 
     Raises
     ------
     NotResumableError
-        A line was changed or is damaged.
+        If a line was changed or is damaged.
     """
     if not path.exists():
         return
     with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        begin = after = size if end is None else end
-        rest = b""
-        while begin:
-            piece = min(begin, _PIECE)
-            begin -= piece
-            file.seek(begin)
-            first, *lines = io.BytesIO(file.read(piece) + rest).readlines()
-            rest, lines = (first, lines) if begin else (b"", [first, *lines])
-            for line in reversed(lines):
-                after -= len(line)
-                record = whole_record(line, path) if line.endswith(b"\n") else None
-                if record is not None:
-                    yield record, after, after + len(line)
-                elif line.endswith(b"\n") or after + len(line) < size:  # else cut off by a kill
-                    raise damaged(path, after, "it does not have the hash that stands before it")
+        file_size = file.seek(0, os.SEEK_END)
+        line_end = file_size if end is None else end
+        for line in _lines_backwards(file, line_end):
+            line_begin = line_end - len(line)
+            is_complete = line.endswith(b"\n")
+            record = record_of_line(line, path) if is_complete else None
+            was_cut_off_by_kill = not is_complete and line_end >= file_size
+            if record is not None:
+                yield JournalLine(record, line_begin, line_end)
+            elif not was_cut_off_by_kill:
+                raise damaged_line_error(path, line_begin, _WRONG_HASH)
+            line_end = line_begin
+
+
+def _lines_backwards(file: BinaryIO, end: int) -> Iterator[bytes]:
+    """Yield the lines of a file that end at or before `end`, the last one first."""
+    block_begin = end
+    end_of_split_line = b""  # of the line that begins in an earlier block
+    while block_begin > 0:
+        block_size = min(block_begin, _BLOCK_SIZE)
+        block_begin -= block_size
+        file.seek(block_begin)
+        lines = io.BytesIO(file.read(block_size) + end_of_split_line).readlines()
+        if block_begin > 0:
+            end_of_split_line = lines.pop(0)
+        yield from reversed(lines)
 
 
 def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
-    """Return the last step of a journal up to a limit, -1 for none, and where its lines end in bytes.
+    """Return the last step of a journal that is not above a limit, and the end of its last line.
+
+    Parameters
+    ----------
+    path : Path
+        The journal.
+    limit : float
+        The largest step that counts.
+
+    Returns
+    -------
+    int
+        The number of the step; -1 if there is none.
+    int
+        The end of the last line of that step, in bytes; 0 if there is none.
 
     Raises
     ------
     NotResumableError
-        A line at the end was changed or is damaged.
+        If one of the lines that are read was changed or is damaged.
     """
-    lines = ((int(record.get("step", -1)), end) for record, _, end in records_backwards(path))
-    return next(((step, end) for step, end in lines if step <= limit), (-1, 0))
+    for line in records_backwards(path):
+        step = int(line.record.get("step", -1))
+        if step <= limit:
+            return step, line.end
+    return -1, 0
 
 
-def damaged(path: Path, begin: int, why: str) -> NotResumableError:
-    """Return the exception for the line that begins at so many bytes, which cannot be believed."""
-    number, whole, end = 1, {True: 0, False: 0}, 0
+def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError:
+    """Return the error that says which line of a journal is damaged.
+
+    Parameters
+    ----------
+    path : Path
+        The journal.
+    begin : int
+        Where the damaged line begins, in bytes.
+    reason : str
+        How the damage shows.
+    """
+    line_number = 1
+    whole_lines_before = 0
+    whole_lines_after = 0
+    line_begin = 0
     with path.open("rb") as file:
         for line in file:
-            number += end < begin
-            whole[end < begin] += end != begin and whole_record(line, path) is not None
-            end += len(line)
-    found = {"line": number, "before": whole[True], "behind": whole[False]}
-    return NotResumableError(said("mission.damaged", path=path, why=why, **found))
+            if line_begin < begin:
+                line_number += 1
+            if line_begin != begin and record_of_line(line, path) is not None:
+                if line_begin < begin:
+                    whole_lines_before += 1
+                else:
+                    whole_lines_after += 1
+            line_begin += len(line)
+    return NotResumableError(
+        f"line {line_number} of the journal {path} was changed or is damaged ({reason}); "
+        f"{whole_lines_before} before it are whole, and {whole_lines_after} behind it: "
+        "begin again with --replace."
+    )

@@ -1,318 +1,58 @@
-"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any step.
+"""The one loop: a source gives observations, the twin decides; a mission can be resumed."""
 
-The journal of a run or a watch is read back: what was told, the twin as it was, steps to be stored.
-"""
-
-import math
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Protocol
 
-import numpy as np
-
-from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from twin_master.errors import (
     ImpossibleObservation,
     InvalidObservationError,
-    NotResumableError,
     TwinMasterError,
-    said,
 )
-from twin_master.learning.expectation import Expectation, concatenate_expectations, expectation_of_draws
 from twin_master.mission.journal import (
     JournalFile,
-    array_of,
-    damaged,
-    reading_of,
+    damaged_line_error,
+    decode_state,
+    encode_state,
     records_backwards,
-    state_of,
-    state_text,
     step_record,
 )
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import History, MissionStep, Plant, Reading
-from twin_master.network.estimator import Notice, is_state_believed
-from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import known_control
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin, TwinStep
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import printed_state
-
-_SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
-"""What is told of a suspicion."""
-
-
-def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
-    """Return what the operator is told with a line of a journal: never a control without its certainty.
-
-    Nothing where it tells no decision. Of a state that is not believed, because none explains the sensors, no
-    moments are told.
-    """
-    for reason in ("quiet", "refused"):  # the last decision was told again
-        if reason in line:
-            return dict(line[reason])
-    if "filtered" not in line:
-        return {}
-    filtered = array_of(line["filtered"])
-    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
-    controls, coming = scenario.control_names, line["next_control"]
-    believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
-    record = {
-        "step": line["step"],
-        "control": controls[line.get("control_in_force", line["control_index"])],
-        "state_believed": believed,
-        "health": {
-            factor.name: {
-                "mean": mean[index] if believed else None,
-                "standard_deviation": deviation[index] if believed else None,
-                "unit": factor.unit,
-            }
-            for index, factor in enumerate(scenario.state)
-        },
-        "next_control": controls[coming],
-        "probability": min(float(line["decision_probability"][coming]), 1.0),
-        "lost_sensors": line["observed"][: scenario.observation.count].count(None),
-        "log_evidence": line["log_evidence"],
-        "notices": line.get("notices", []),
-    }
-    if "suspicion" in line:
-        record |= {name: line["suspicion"][name] for name in _SUSPECTED}
-    if "control_in_force" in line:
-        record["revised_by_step"] = line["observation_step"]
-    if "learnt" in line:
-        record["learnt"] = line["learnt"]
-    return record
-
-
-def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
-    """Return mean and standard deviation of each factor of the state, as a decision tells them.
-
-    Of a state that is not believed it is said that it is not.
-    """
-    told = {}
-    for name, known in decision["health"].items():
-        if known["mean"] is None:
-            told[name] = "not believed"
-            continue
-        scale, unit = printed_state(known["unit"])
-        digits = ".0f" if unit == "%" else ".3g"
-        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
-        told[name] = f"{mean} ± {deviation} {unit}"
-    return told
-
-
-def expected_in(
-    history: History, knowledge: Knowledge, name: str, belief: Float
-) -> tuple[Expectation, Float]:
-    """Return what is expected in the steps of a history, and the probability of each control there.
-
-    Parameters
-    ----------
-    history : History
-    knowledge : Knowledge
-        Of the twin in these steps.
-    name : str
-        `filtered`, `smoothed` or `predicted`.
-    belief : (T, S), or (T, H, S) where it is predicted
-        Of that name.
-    """
-    learns, rows, more = knowledge.expectation, None, tuple[Any, ...]()
-    if name == "predicted":
-        asked = knowledge.asked(history.unexplained)
-        joint = belief[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
-        belief, more = history.filtered, (asked, belief.shape[1])
-    else:
-        rows, more = history.row, (history.observed,)
-        joint = known_control(belief, history.control_index, len(knowledge.model.controls))
-    if learns is None:
-        expected = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, rows)
-    else:
-        carried = [step.concluded.carried for step in history.steps]
-        expected = getattr(learns, name)(carried, belief, *more)
-    return expected, joint.sum(axis=-2)
-
-
-def spans_of(history: History, given: "Sequence[BelievedModel]") -> list[tuple[Knowledge, slice]]:
-    """Return what a twin knew, and in which of the steps of a history, by the models that it believed."""
-    models = successive_models(given)
-    starts = [max(0, model.from_step - history.first_step) for model in models]
-    parts = map(slice, starts, [*starts[1:], len(history.steps)])
-    return [(model.knowledge, part) for model, part in zip(models, parts, strict=True)]
-
-
-def gap_of(history: History, from_step: int, models: "Sequence[BelievedModel]") -> dict[str, Any]:
-    """Return root mean square residual and log evidence of the steps from one on; None without any.
-
-    The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
-    """
-    left = history.behind(from_step - history.first_step)
-    if not left.steps or np.isnan(left.observed).all():
-        return {"rms_residual": None, "log_evidence": None}
-    parts = [(known, replace(left, steps=left.steps[part])) for known, part in spans_of(left, models)]
-    expected = concatenate_expectations(
-        expected_in(own, known, "filtered", own.filtered)[0] for known, own in parts if own.steps
-    )
-    residual = (left.observed - expected.mean) / expected.noise
-    return {
-        "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
-        "log_evidence": float(np.sum(left.log_evidence)),
-    }
-
-
-@dataclass(frozen=True)
-class BelievedModel:
-    """What the twin believes from a step on.
-
-    Attributes
-    ----------
-    from_step : int
-        The first step that is filtered with it.
-    knowledge : Knowledge
-        Its predicted observations.
-    patch : Path or None
-        Of the model, where it has one.
-    """
-
-    from_step: int
-    knowledge: Knowledge
-    patch: Path | None = None
-
-
-def replay(
-    path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_step: int | None = None,
-    end: int | None = None, question: BelievedModel | None = None,
-) -> tuple[History, dict[str, Any]]:  # fmt: skip
-    """Filter the steps of a journal again, what came late in its place.
-
-    The journal is read from its end to the last state of the twin that lies before what is wanted.
-
-    Parameters
-    ----------
-    path : Path
-        The journal.
-    models : sequence of BelievedModel
-        The model of the beginning, and those that were adopted later.
-    lag : int or None
-        Of the twin.
-    first_step : int, optional
-        The first step whose belief is wanted; if left out the twin alone, from the last state.
-    end : int, optional
-        Bytes of the journal that are read; all of it if left out.
-    question : BelievedModel, optional
-        What would be believed with one model more, from its step on.
-
-    Returns
-    -------
-    History
-        The steps behind that state, with the twin behind the last one.
-    dict
-        The last line; empty where there is none.
-
-    Raises
-    ------
-    NotResumableError
-        The journal was changed or is damaged, or decided otherwise.
-    """
-    wanted = [] if first_step is None else [first_step]
-    wanted += [] if question is None else [question.from_step]
-    seen: dict[int, Reading] = {}
-    decided, stands = dict[int, int](), math.inf  # decisions from some step on were revised by later lines
-    settled, last = (-1, b""), dict[str, Any]()
-    behind, place = -1, 0  # the step of the line behind, and where it begins
-    for record, begin, _ in records_backwards(path, end):
-        try:
-            step = int(record["step"]) if begin else -1
-            if last and behind - step not in (0, 1):
-                raise damaged(path, place if step < behind else begin, f"step {behind} is out of place")
-            if not begin or step <= settled[0]:
-                break
-            last, behind, place = last or record, step, begin
-            if settled[0] < 0 and "settled" in record:
-                kept, state = int(record["settled"]["step"]), record["settled"]["state"]
-                # Only one before what is wanted, and before all models that are adopted behind it.
-                if all(kept < other for other in wanted):
-                    settled = kept, state_of(state)
-            if step < stands:
-                decided.setdefault(step, record["next_control"])
-            if "model" in record:
-                stands = min(stands, int(record["model"]["from_step"]))
-                wanted.append(int(record["model"]["from_step"]))
-            elif "observed" in record:
-                observed = int(record.get("observation_step", step))
-                stands = min(stands, observed)
-                seen.setdefault(observed, reading_of(record))
-        except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
-            raise damaged(path, begin, f"it has another layout, {error}") from error
-    found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
-    for again in found.steps if question is None else ():
-        number, control = again.concluded.step, again.concluded.next_control
-        if decided.get(number, control) != control:
-            other = f"begin another watch, in another folder, with `--observations {path.parent}`"
-            advice = other if "intake" in last else "fly the mission again with --replace"
-            raise NotResumableError(said("mission.decided", step=number, advice=advice))
-    return found, last
-
-
-def successive_models(given: Sequence[BelievedModel]) -> list[BelievedModel]:
-    """Return the models that are believed one after the other.
-
-    One that was adopted from an earlier step on than one before it takes its place altogether.
-    """
-    return [
-        model
-        for index, model in enumerate(given)
-        if all(later.from_step > model.from_step for later in given[index + 1 :])
-    ]
-
-
-def filtered_again(
-    seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
-    settled: tuple[int, bytes] = (-1, b""),
-) -> History:  # fmt: skip
-    """Return the steps that a twin filters of what was seen in each, from a settled state on."""
-    models = successive_models(given)
-    at = max(
-        index for index, model in enumerate(models) if not index or model.from_step <= max(settled[0], 0)
-    )
-    twin = models[at].knowledge.twin(lag=lag)
-    if settled[1]:
-        twin.restore_state(settled[1])
-    found = History(twin, models[at].knowledge.scenario.observation.count)
-    while twin.steps in seen:
-        if at + 1 < len(models) and models[at + 1].from_step <= twin.steps:
-            at += 1
-            state, twin = twin.save_state(), models[at].knowledge.twin(lag=lag)
-            twin.restore_state(state)
-            found.twin = twin
-        reading = seen[twin.steps]
-        found.add(MissionStep(reading, twin.step(reading.observed, reading.control)))
-    return found
 
 
 class Source(Protocol):
     """Where observations come from: a simulated asset, a file, a broker."""
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next observation of what the twin watches; None where there are no more."""
+        """Return the next observation for the twin; None if there are no more."""
 
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return what is assimilated in the place of one that no state allows, or that has no weight."""
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Return what the twin assimilates in place of a reading that it refused with an error."""
 
 
-def operate(twin: Twin, source: Source, *sinks: Callable[[MissionStep], None]) -> Iterator[MissionStep]:
-    """Let a twin assimilate and decide until its source ends; each step is kept before it is given.
+StepSink = Callable[[MissionStep], None]
+"""Stores a step, such as in a journal or in a history."""
+
+
+def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionStep]:
+    """Let a twin assimilate and decide until its source ends; yield each step once it is stored.
 
     Parameters
     ----------
     twin : Twin
+        The twin.
     source : Source
-        Asked for the next observation when the step before it was taken in.
+        The source; it is asked for an observation when the step before was stored.
     *sinks : callable
-        Told each step, one after the other: a journal, a history.
+        What stores each step, called one after the other.
     """
     while True:
         begin = time.perf_counter()
@@ -321,19 +61,20 @@ def operate(twin: Twin, source: Source, *sinks: Callable[[MissionStep], None]) -
             return
         received = time.perf_counter()
         try:
-            concluded = _assimilated(twin, reading)
+            twin_step = _assimilate(twin, reading)
         except (ImpossibleObservation, InvalidObservationError) as error:
-            reading = source.impossible(reading, error)
-            concluded = _assimilated(twin, reading)
+            reading = source.replace_impossible(reading, error)
+            twin_step = _assimilate(twin, reading)
         decided = time.perf_counter()
-        step = MissionStep(reading, concluded)
+        step = MissionStep(reading, twin_step)
         for sink in sinks:
             sink(step)
-        kept = time.perf_counter()
-        yield replace(step, seconds=(received - begin, decided - received, kept - decided))
+        stored = time.perf_counter()
+        yield replace(step, seconds=(received - begin, decided - received, stored - decided))
 
 
-def _assimilated(twin: Twin, reading: Reading) -> TwinStep:
+def _assimilate(twin: Twin, reading: Reading) -> TwinStep:
+    """Let the twin take in a reading, as its next step or as the revision of an earlier one."""
     if reading.revises is not None:
         return twin.revise(reading.revises, reading.observed, reading.control)
     return twin.step(reading.observed, reading.control)
@@ -343,96 +84,123 @@ def fly(
     scenario: Scenario,
     twin: Twin,
     plant: Plant,
-    *sinks: Callable[[MissionStep], None],
+    *sinks: StepSink,
     history: History | None = None,
     progress: Progress | None = None,
 ) -> History:
-    """Fly a mission, or the rest of one; an asset that ends its simulation ends the mission, and is a notice.
+    """Fly a mission to its end, from the step that twin and plant have reached.
+
+    An asset that ends its simulation early ends the mission; this is a notice to the operator.
 
     Parameters
     ----------
     scenario : Scenario
+        The mission.
     twin : Twin
+        The twin.
     plant : Plant
-        The asset and its truth, where the twin is.
+        The asset and its truth, at the same step as the twin.
     *sinks : callable
-        As of `operate`.
+        What stores each step, see `operate`.
     history : History, optional
-        Takes in the steps; what it has is there also where an error ends the flight.
+        The steps flown so far; the new ones are added to it, also if an error ends the flight.
     progress : Progress, optional
+        Shows the steps.
+
+    Returns
+    -------
+    History
+        All steps.
 
     Raises
     ------
     MissionInputError, ImpossibleObservation, FmuError, FiniteElementError
-        The mission cannot be flown on.
+        If the mission cannot go on.
     """
     history = history or History(twin, scenario.observation.count)
     history.resumed_at = twin.steps
+    progress = progress or SilentProgress()
     unit = f"{scenario.mission.step_name}s"
-    with (progress or SilentProgress()).stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
+    with progress.stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
         stage.advance(twin.steps)
         for step in operate(twin, plant, *sinks):
             history.add(step)
-            stage.advance(detail=scenario.control_names[step.concluded.control_index])
+            stage.advance(detail=scenario.control_names[step.twin_step.control_index])
     if plant.ended:
-        history.ended = ended_sentence(scenario, twin.steps, plant.ended)
+        history.ended = early_end_sentence(scenario, twin.steps, plant.ended)
         history.notices.append((twin.steps - 1, Notice("ended", history.ended)))
     return history
 
 
-def ended_sentence(scenario: Scenario, steps_flown: int, how: str) -> str:
-    """Return that an asset has ended its simulation after some steps of a mission."""
-    steps, unit = scenario.mission.steps, scenario.mission.step_name
-    return f"The asset ended the mission after {steps_flown} of {steps} {unit}s: {how}"
+def early_end_sentence(scenario: Scenario, steps_flown: int, reason: str) -> str:
+    """Return the sentence that the mission ended before its last step."""
+    mission = scenario.mission
+    steps = f"{steps_flown} of {mission.steps} {mission.step_name}s"
+    return f"The asset ended the mission after {steps}: {reason}"
 
 
 STATE_ALLOWANCE = 64_000_000
+"""Size of the journal up to which every step keeps the state of the asset, in bytes."""
 STATE_SHARE = 4_000
-"""Bytes of asset states that a checkpoint may hold, and how many more for each step.
+"""Beyond it, a state is kept once it takes at most so many bytes for each step since the last one.
 
-States that need more are kept less often, so that the file grows with the steps and not with their square
-(an asset that is replayed keeps the inputs of all its steps); the steps after the last one are flown again.
+An asset that is replayed keeps the inputs of all its steps in its state. If every step kept it, the
+journal would grow with the square of the number of steps. Steps after the last kept state are flown
+again when a mission is resumed.
 """
 
 
-def taken_up(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
-    """Return what an earlier process flew, with plant and journal where it stopped.
+def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
+    """Return the steps that an earlier process flew, and put plant and journal where it stopped.
 
-    Steps behind the last saved state of the asset are flown again.
+    Lines after the last saved state of the asset are dropped; these steps are flown again.
+
+    Parameters
+    ----------
+    journal : JournalFile
+        The journal of the run folder.
+    knowledge : Knowledge
+        The knowledge of the twin.
+    plant : Plant
+        The plant at its start.
 
     Raises
     ------
     NotResumableError
-        The journal is damaged, or the twin decides otherwise than an earlier process did.
+        If the journal is damaged, or if the twin now decides otherwise than the earlier process.
     """
-    for record, begin, end in records_backwards(journal.path):
-        if not begin or record.get("asset_state") is not None:
-            journal.truncate(end)
-            state = record.get("asset_state", "")
+    for line in records_backwards(journal.path):
+        is_header = line.begin == 0
+        if is_header or line.record.get("asset_state") is not None:
+            journal.truncate(line.end)
             break
     history, _ = replay(journal.path, [BelievedModel(0, knowledge)], None)
     if history.steps:
         try:
-            plant.restore(history, state_of(state))
+            plant.restore(history, decode_state(line.record.get("asset_state", "")))
         except (TypeError, ValueError, zlib.error) as error:
-            raise damaged(journal.path, begin, f"it has another layout, {error}") from error
+            reason = f"it has another layout, {error}"
+            raise damaged_line_error(journal.path, line.begin, reason) from error
     return history
 
 
-def kept_in(journal: JournalFile, plant: Plant) -> Callable[[MissionStep], None]:
-    """Return a sink that writes steps into a journal, with the state of the asset as often as it may.
+def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
+    """Return a sink that appends steps to a journal, sometimes with the state of the asset.
 
-    What a kill cuts off, or has no state of the asset behind it, is flown again to the same bits.
+    After a kill, steps without a state of the asset after them are flown again, to the same bits.
     """
-    since = 0
+    steps_since_state = 0
 
-    def keep(step: MissionStep) -> None:
-        nonlocal since
-        since += 1
-        state: str | None = state_text(plant.save_state())
-        if journal.size + len(state or "") > STATE_ALLOWANCE and len(state or "") > STATE_SHARE * since:
-            state = None
-        journal.append(step_record(step) | {"asset_state": state})
-        since *= state is None
+    def append_step(step: MissionStep) -> None:
+        nonlocal steps_since_state
+        steps_since_state += 1
+        state = encode_state(plant.save_state())
+        is_within_allowance = journal.size + len(state) <= STATE_ALLOWANCE
+        is_within_share = len(state) <= STATE_SHARE * steps_since_state
+        if is_within_allowance or is_within_share:
+            journal.append(step_record(step) | {"asset_state": state})
+            steps_since_state = 0
+        else:
+            journal.append(step_record(step) | {"asset_state": None})
 
-    return keep
+    return append_step

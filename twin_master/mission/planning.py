@@ -1,15 +1,17 @@
-"""The plan of a scenario on the belief: what it promises, and what other rules bring."""
+"""The plan of a scenario on the belief: its expected return, and that of simpler rules."""
 
 import io
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from twin_master.errors import PlanningError, said
+from reporting.words import comma_list
+from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import BeliefPlan, plan_on_belief
 from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.graphical_model import GraphicalModel
@@ -20,82 +22,131 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 MISSIONS = 400
-"""That are simulated for each rule."""
-PERIODS = (2, 3, 5, 8, 12, 20)
-"""Steps between two inspections of the rules that inspect by the clock."""
-_GAP, _PRICED_GAP = 0.005, 0.06
-"""Between the bounds of a plan, as a share of the return, and of those that are tried for a limit."""
-_HARDEST, _HALVINGS = 2.0**12, 4
-"""The largest price of a step beyond the limit, in rewards, and how often the interval of it is halved."""
+"""Number of missions that are simulated for each rule."""
+INSPECTION_PERIODS = (2, 3, 5, 8, 12, 20)
+"""Steps between two inspections, for the rules that inspect at fixed intervals."""
+_GAP = 0.005
+"""Relative gap between the bounds of a plan at which its search ends."""
+_GAP_OF_PRICED_PLANS = 0.06
+"""The same for the plans that are tried to keep a limit."""
+_LARGEST_PRICE = 2.0**12
+"""Largest price of a step beyond the health limit, in rewards."""
+_BISECTIONS = 4
+"""How often the interval of the price is halved."""
 
 
 def discounts(scenario: Scenario) -> Float:
-    """Return the discount behind a step under each control (U,): zero where it ends the mission."""
+    """Return the discount after a step under each control (U,); zero if it ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
 
 
-def expected_plan(
-    scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
-) -> tuple[BeliefPlan, float]:
-    """Return the plan on the belief, and the price of a step beyond a health limit that it is made with.
+class PricedPlan(NamedTuple):
+    """A plan, and the price of a step beyond the health limit that it was made with.
 
-    Without `planner.limit_probability` there is no price. With it the price is the least, of some that are
-    tried, under which the share of such steps stays below: a constraint on the mean by a multiplier, Altman
-    1999.
+    Attributes
+    ----------
+    plan : BeliefPlan
+        The plan on the belief.
+    price : float
+        The price, in rewards; zero without a limit.
+    """
+
+    plan: BeliefPlan
+    price: float
+
+
+def plan_within_limit(
+    scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
+) -> PricedPlan:
+    """Return the plan on the belief that keeps the health limit as often as the scenario asks.
+
+    The scenario may bound the share of steps beyond the limit (`planner.limit_probability`). Such a
+    constraint on the mean is met by a multiplier (Altman 1999): each step beyond the limit costs a
+    price. The plan has the least of the tried prices for which the bound holds.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The mission.
+    problem : DecisionProblem
+        Its decision problem, without a price.
+    rewards : RewardModel
+        The rewards, which contain the health limit.
 
     Raises
     ------
     PlanningError
-        No price is high enough.
+        If the bound does not hold even for the largest price.
     """
-    first = scenario.control_names.index(scenario.mission.first_control)
-    allowed, risk = scenario.planner.limit_probability, _risk(rewards)
+    first_control = scenario.control_names.index(scenario.mission.first_control)
+    allowed = scenario.planner.limit_probability
+    risk = _probability_beyond_limit(rewards)
 
-    gap = _GAP if allowed is None else _PRICED_GAP
+    def plan_with_price(price: float) -> PricedPlan:
+        priced_problem = replace(problem, reward=problem.reward - price * risk)
+        gap = _GAP if allowed is None else _GAP_OF_PRICED_PLANS
+        return PricedPlan(plan_on_belief(priced_problem, first=first_control, gap=gap), price)
 
-    def priced(price: float) -> tuple[BeliefPlan, float]:
-        costly = replace(problem, reward=problem.reward - price * risk)
-        return plan_on_belief(costly, first=first, gap=gap), price
+    def keeps_limit(candidate: PricedPlan) -> bool:
+        if allowed is None:
+            return True
+        share = share_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
+        return share <= allowed
 
-    def holds(plan: BeliefPlan) -> bool:
-        return allowed is None or risk_of(scenario, problem, rewards, plan.policy) <= allowed
+    without_price = plan_with_price(0.0)
+    if keeps_limit(without_price):
+        return without_price
 
-    below, price, found = 0.0, 1.0, priced(0.0)
-    if holds(found[0]):
-        return found
-    while not holds((found := priced(price))[0]):
-        below, price = price, 4.0 * price
-        if price > _HARDEST:
-            raise PlanningError(said("mission.no_plan", allowed=allowed))
-    for _ in range(_HALVINGS):
-        middle = priced(0.5 * (below + price))
-        if holds(middle[0]):
-            found, price = middle, middle[1]
+    # Raise the price until the bound holds.
+    too_low = 0.0
+    best = plan_with_price(1.0)
+    while not keeps_limit(best):
+        too_low = best.price
+        price = 4.0 * best.price
+        if price > _LARGEST_PRICE:
+            raise PlanningError(
+                f"no plan keeps the probability beyond a health limit at {allowed:g}: allow more, "
+                "or give the scenario a gentler control or a repair"
+            )
+        best = plan_with_price(price)
+
+    # Bisect between the largest price that is too low and the best one.
+    for _ in range(_BISECTIONS):
+        middle = plan_with_price(0.5 * (too_low + best.price))
+        if keeps_limit(middle):
+            best = middle
         else:
-            below = middle[1]
-    return found
+            too_low = middle.price
+    return best
 
 
-def _risk(rewards: RewardModel) -> Float:
-    """Return the probability of each state and control that a health limit is exceeded (S, U)."""
-    beyond = (rewards.health_per_draw < 0.0).astype(np.float64)
-    return np.asarray(np.tensordot(rewards.quantity.draw_weight, beyond, axes=1))
+def _probability_beyond_limit(rewards: RewardModel) -> Float:
+    """Return the probability that the health limit is exceeded in each state and control (S, U)."""
+    is_beyond = (rewards.health_per_draw < 0.0).astype(np.float64)
+    return np.asarray(np.tensordot(rewards.quantity.draw_weight, is_beyond, axes=1))
 
 
-def risk_of(
+def share_beyond_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
 ) -> float:
-    """Return the share of steps, discounted, beyond a health limit under a policy, in simulated missions."""
-    shares = [
-        promised(scenario, replace(problem, reward=reward), policy).mean
-        for reward in (_risk(rewards), np.ones_like(problem.reward))
-    ]
-    return shares[0] / shares[1]
+    """Return the discounted share of steps beyond the health limit under a policy.
+
+    The share is estimated in simulated missions. It is the expected return of a reward of one for
+    each step beyond the limit, relative to that of
+    a reward of one for each step.
+    """
+    beyond_limit = replace(problem, reward=_probability_beyond_limit(rewards))
+    all_steps = replace(problem, reward=np.ones_like(problem.reward))
+    steps_beyond = simulate_policy(scenario, beyond_limit, policy).mean
+    return steps_beyond / simulate_policy(scenario, all_steps, policy).mean
 
 
-def policy_file(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> bytes:
-    """Return a policy as files have it: (S, U) in NPY, or on the belief in NPZ, with what it is for."""
+def encode_policy(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> bytes:
+    """Return the content of a policy file.
+
+    A policy (S, U) is an NPY file; one on the belief is an NPZ file that also names its controls.
+    """
     content = io.BytesIO()
     if isinstance(policy, BeliefPolicy):
         np.savez(content, **vars(policy), controls=np.array(model.controls))
@@ -110,33 +161,45 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
     Raises
     ------
     PlanningError
-        It is none, or one for other states or controls.
+        If the file is not a policy, or its policy is for other states or controls.
     """
     try:
-        kept = np.load(path, allow_pickle=False)
-        if isinstance(kept, np.ndarray):
-            return model.policy(kept)
-        with kept:
-            policy, controls = BeliefPolicy.from_arrays(kept), tuple(kept["controls"].tolist())
+        content = np.load(path, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            return model.policy(content)
+        with content:
+            policy = BeliefPolicy.from_arrays(content)
+            controls = tuple(content["controls"].tolist())
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        # NumPy takes what it does not know for Python objects, and says how to load them unsafely.
-        reason = "it is neither NPY nor NPZ" if "pickle" in str(error) else error
-        raise PlanningError(said("mission.no_policy", path=path, error=reason)) from None
-    if controls != model.controls or policy.vectors.shape[1] != model.states.size:
-        own = {"states": policy.vectors.shape[1], "controls": controls}
-        raise PlanningError(said("mission.another_policy", path=path, **own, model=model))
+        reason: object = error
+        if "pickle" in str(error):
+            # NumPy takes a file that it does not know for Python objects, and advises to load it
+            # unsafely.
+            reason = "it is neither NPY nor NPZ"
+        raise PlanningError(
+            f"{path} is no policy, as of `uav-twin plan --out` ({reason}): give such a file, or "
+            "fly a run again whose copy is damaged"
+        ) from None
+    states = policy.vectors.shape[1]
+    if controls != model.controls or states != model.states.size:
+        raise PlanningError(
+            f"{path} is for {states} states and the controls {comma_list(controls)}, and the "
+            f"scenario has {model.states.size} and {comma_list(model.controls)}: plan it anew"
+        )
     return policy
 
 
 @dataclass(frozen=True)
 class ComparedPolicy:
-    """What a rule brings in simulated missions, or by how much more than another one.
+    """The returns of a rule in simulated missions, or their difference to those of another rule.
 
     Attributes
     ----------
     name : str
-    returns : (B,)
-        Of each mission; those of the same number of two rules are met by the same chance.
+        What the rule is called.
+    returns : (B,) array
+        The return of each mission. Missions of the same number meet the same random numbers under
+        all rules.
     """
 
     name: str
@@ -144,59 +207,79 @@ class ComparedPolicy:
 
     @property
     def mean(self) -> float:
-        """Expected return."""
+        """The expected return."""
         return float(self.returns.mean())
 
     @property
     def half_width(self) -> float:
-        """Of the 95 % interval of the mean."""
+        """The half width of the 95 % interval of the mean."""
         return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
 
     def beyond(self, other: "ComparedPolicy") -> "ComparedPolicy":
-        """Return by how much more it brings than another rule, mission by mission."""
+        """Return by how much the returns exceed those of another rule, mission by mission."""
         return ComparedPolicy(f"{self.name} beyond {other.name}", self.returns - other.returns)
 
 
-def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
-    """Return what a policy on the belief brings in simulated missions."""
-    returns = _simulated(scenario, problem, lambda belief, *_: policy.decide(belief))
+def simulate_policy(
+    scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy
+) -> ComparedPolicy:
+    """Return the returns of a policy on the belief in simulated missions."""
+    returns = _simulate(scenario, problem, lambda belief, _filtered, _step: policy.decide(belief))
     return ComparedPolicy("planned on the belief", returns)
 
 
-def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:
-    """Return what rules bring that are simpler than a plan on the belief.
+def compare_simple_rules(
+    scenario: Scenario, problem: DecisionProblem
+) -> tuple[ComparedPolicy, ...]:
+    """Return the returns of rules that are simpler than a plan on the belief.
 
-    The mode of the policy is decided on the belief that the scenario names. Inspection by the clock takes the
-    first action that inspects, and decides as QMDP between.
+    The mode of the policy by states is taken for the belief that the scenario decides on. A rule
+    that inspects at fixed intervals takes the first action that inspects, and decides as QMDP
+    between.
     """
-    known = value_iteration(problem.transition, problem.reward, problem.discount)
+    plan = value_iteration(problem.transition, problem.reward, problem.discount)
+    decides_on_predicted = scenario.planner.decide_on == "predicted"
 
-    def by_the_clock(every: int) -> Decide:
-        def rule(belief: Float, _filtered: Float, step: int) -> Index:
-            if step % every == 0:
-                return np.full(len(belief), scenario.readings[0][0])
-            return np.asarray(np.argmax(belief @ known.action_value, axis=1))
+    def mode_of_policy(belief: Float, filtered: Float, _step: int) -> Index:
+        decided_on = belief if decides_on_predicted else filtered
+        return np.asarray(np.argmax(decided_on @ plan.policy, axis=1))
+
+    def qmdp(belief: Float, _filtered: Float, _step: int) -> Index:
+        return np.asarray(np.argmax(belief @ plan.action_value, axis=1))
+
+    def inspect_every(period: int) -> Decide:
+        inspecting_control = scenario.readings[0][0]
+
+        def rule(belief: Float, filtered: Float, step: int) -> Index:
+            if step % period == 0:
+                return np.full(len(belief), inspecting_control)
+            return qmdp(belief, filtered, step)
 
         return rule
 
-    ahead = scenario.planner.decide_on == "predicted"
-    rules: dict[str, Decide] = {
-        "mode of the policy by states": lambda belief, filtered, _step: np.argmax(
-            (belief if ahead else filtered) @ known.policy, axis=1
-        ),
-        "QMDP": lambda belief, *_: np.argmax(belief @ known.action_value, axis=1),
-    }
-    for every in PERIODS if scenario.readings else ():
-        rules[f"inspection every {every} {scenario.mission.step_name}s"] = by_the_clock(every)
-    return tuple(ComparedPolicy(name, _simulated(scenario, problem, rule)) for name, rule in rules.items())
+    rules: dict[str, Decide] = {"mode of the policy by states": mode_of_policy, "QMDP": qmdp}
+    if scenario.readings:
+        for period in INSPECTION_PERIODS:
+            name = f"inspection every {period} {scenario.mission.step_name}s"
+            rules[name] = inspect_every(period)
+    compared = []
+    for name, rule in rules.items():
+        compared.append(ComparedPolicy(name, _simulate(scenario, problem, rule)))
+    return tuple(compared)
 
 
-def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
-    """Return the returns of simulated missions under a rule, behind the first control of the scenario."""
-    first = scenario.control_names.index(scenario.mission.first_control)
+def _simulate(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
+    """Return the returns (B,) of missions under a rule that decides from the second step on."""
+    first_control = scenario.control_names.index(scenario.mission.first_control)
+
+    def decide(belief: Float, filtered: Float, step: int) -> Index:
+        if step == 0:
+            return np.full(len(belief), first_control)
+        return rule(belief, filtered, step)
+
     return simulated_returns(
         problem,
-        lambda belief, now, step: rule(belief, now, step) if step else np.full(len(belief), first),
+        decide,
         MISSIONS,
         scenario.mission.steps,
         generator(scenario.mission.seed, "damage"),

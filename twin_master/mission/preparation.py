@@ -1,4 +1,4 @@
-"""What a twin knows before its flight: made of a scenario, a source and a seed, and kept in a run folder."""
+"""What a twin knows before its flight, made from a scenario, a source and a seed."""
 
 import io
 import json
@@ -21,18 +21,23 @@ from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.errors import RunFolderError, said
+from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
-from twin_master.mission.planning import discounts, expected_plan
+from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.steps import Plant, Truth
 from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.observation_classes import observation_classes
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy, evaluate_policy, value_iteration
+from twin_master.network.planner import (
+    BeliefPolicy,
+    PlannedPolicy,
+    evaluate_policy,
+    value_iteration,
+)
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
@@ -45,25 +50,30 @@ from twin_master.seeds import generator
 class Knowledge:
     """What the twin knows before it flies.
 
+    S is the number of states, U that of controls, G that of sensors, E that of draws of the
+    calibrated parameter.
+
     Attributes
     ----------
     scenario : Scenario
         What is to be flown.
     model : GraphicalModel
-        S states, U controls.
+        The states, controls and transitions.
     draws : ParameterDraws
         The calibrated parameter.
-    predicted : (E, S, U, G)
-        Observations that are expected for each of its E draws, SI.
-    policy : (S, U), BeliefPolicy or None
-        To fly instead of planning; p(U | D), row-stochastic.
-    true : (E, S, U, G) or None
-        What is there at the sensors, for limits and rewards, where that is not what they show, SI.
+    predicted : (E, S, U, G) array
+        The observation that each draw predicts in each state and control, SI.
+    policy : (S, U) array, BeliefPolicy or None
+        The policy p(U | D), row-stochastic, or a policy on the belief, that is flown instead of a
+        plan.
+    true_values : (E, S, U, G) array or None
+        The values of the structure itself at the sensors, SI, which limits and rewards refer to;
+        None if the sensors show them.
 
     Raises
     ------
     InvalidModelError, PlanningError
-        What follows is asked for, and shapes do not fit the scenario, or there is no plan.
+        When a property is used, if shapes do not fit the scenario, or if there is no plan.
     """
 
     scenario: Scenario
@@ -71,113 +81,163 @@ class Knowledge:
     draws: ParameterDraws
     predicted: Float
     policy: Float | BeliefPolicy | None = None
-    true: Float | None = None
+    true_values: Float | None = None
 
     def __repr__(self) -> str:
         return brief(
-            self, mission=self.scenario.mission.name, model=self.model, sensor_model=self.sensor_model
+            self,
+            mission=self.scenario.mission.name,
+            model=self.model,
+            sensor_model=self.sensor_model,
         )
 
     @cached_property
     def sensor_model(self) -> GaussianSensorModel:
-        """Predicted observations and the assumed noise."""
+        """The predicted observations and the assumed noise."""
         section = self.scenario.observation
-        kind: Callable[..., GaussianSensorModel] = GaussianSensorModel
+        make_sensor_model: Callable[..., GaussianSensorModel] = GaussianSensorModel
         if section.modes is not None:
-            kind = IdentifiedSensorModel
+            make_sensor_model = IdentifiedSensorModel
         elif self.scenario.readings:
-            kind = partial(InspectedSensorModel, **_readings(self.scenario, self.model))
-        within = self.model.states.change_within_interval
-        return kind(
+            make_sensor_model = _inspected_sensor_model(self.scenario, self.model)
+        interval = None
+        if section.between_levels:
+            interval = self.model.states.change_within_interval(self.predicted.mean(axis=0))
+        return make_sensor_model(
             self.predicted,
             section.standard_deviation,
             average=section.average_over_draws,
             model_error=section.model_error,
-            interval=within(self.predicted.mean(axis=0)) if section.between_levels else None,
+            interval=interval,
         )
 
     @cached_property
     def rewards(self) -> RewardModel:
-        """Rewards by state and control."""
-        section, scenario = self.scenario.rewards, self.scenario
-        norm, chosen = section.normalise_error_by, section.health_sensors
+        """The rewards by state and control."""
+        section = self.scenario.rewards
+        control_normaliser = None
+        if section.normalise_error_by is not None:
+            normalising_input = section.normalise_error_by
+            control_normaliser = tuple(
+                control.values[normalising_input] for control in self.scenario.control
+            )
+        health_sensors = None
+        if section.health_sensors != "all":
+            health_sensors = tuple(number - 1 for number in section.health_sensors)
         return RewardModel(
             self.sensor_model,
             limit=section.health_limit,
-            control_reward=tuple(section.control[name] for name in scenario.control_names),
+            control_reward=tuple(section.control[name] for name in self.scenario.control_names),
             error_scale=section.error_scale,
-            control_normaliser=None if norm is None else tuple(c.values[norm] for c in scenario.control),
-            health_sensors=None if chosen == "all" else tuple(number - 1 for number in chosen),
-            true_per_draw=self.true,
+            control_normaliser=control_normaliser,
+            health_sensors=health_sensors,
+            true_per_draw=self.true_values,
         )
 
     @cached_property
     def plan(self) -> PlannedPolicy:
-        """Value iteration, what the scenario asks for, or the policy that was given."""
-        scenario, policy = self.scenario, self.policy
-        basis = self.model.transition, self.planning_reward, discounts(scenario)
-        if policy is not None and not isinstance(policy, BeliefPolicy):
-            return evaluate_policy(*basis, self.model.policy(policy))
-        plan = value_iteration(*basis)
-        if policy is None and scenario.planner.policy == "qmdp":
-            policy = BeliefPolicy(plan.action_value.T, np.arange(len(scenario.control)))
-        elif policy is None and scenario.planner.policy == "belief":
-            policy = expected_plan(scenario, self.problem, self.rewards)[0].policy
-        return replace(plan, on_belief=policy)
+        """The plan of value iteration, with a policy on the belief if the scenario asks for one.
+
+        A policy that was given takes its place.
+        """
+        transition = self.model.transition
+        discount = discounts(self.scenario)
+        if self.policy is not None and not isinstance(self.policy, BeliefPolicy):
+            policy = self.model.policy(self.policy)
+            return evaluate_policy(transition, self.planning_reward, discount, policy)
+        plan = value_iteration(transition, self.planning_reward, discount)
+        return replace(plan, on_belief=self._belief_policy(plan))
+
+    def _belief_policy(self, plan: PlannedPolicy) -> BeliefPolicy | None:
+        """Return the policy on the belief; None if the plan by states decides."""
+        if isinstance(self.policy, BeliefPolicy):
+            return self.policy
+        if self.scenario.planner.policy == "qmdp":
+            return BeliefPolicy(plan.action_value.T, np.arange(len(self.scenario.control)))
+        if self.scenario.planner.policy == "belief":
+            priced_plan = plan_within_limit(self.scenario, self.problem, self.rewards)
+            return priced_plan.plan.policy
+        return None
 
     @cached_property
     def problem(self) -> DecisionProblem:
-        """What is decided on, its observations joined to classes under the seed of the scenario."""
-        seed = generator(self.scenario.mission.seed, "planning")
-        classes = observation_classes(self.sensor_model, seed)
-        basis = self.model.transition, self.planning_reward, discounts(self.scenario)
-        return DecisionProblem(*basis, classes, self.model.prior)
+        """The decision problem of the mission.
+
+        It needs finitely many observations: those that are sampled here are joined to classes.
+        """
+        random_numbers = generator(self.scenario.mission.seed, "planning")
+        return DecisionProblem(
+            self.model.transition,
+            self.planning_reward,
+            discounts(self.scenario),
+            likelihood=observation_classes(self.sensor_model, random_numbers),
+            prior=self.model.prior,
+        )
 
     @property
     def planning_reward(self) -> Float:
-        """Expected reward of each state and control (S, U) that is planned with, eqs. (9)-(11)."""
+        """The expected reward of each state and control (S, U), eqs. (9)-(11)."""
         weights = self.scenario.rewards
         return self.rewards.planning_reward(weights.health_weight, weights.control_weight)
 
     @cached_property
     def learning(self) -> LearningFilter | None:
-        """What learns, without notices; None where nothing is learnt.
+        """The filter that learns, without notices; None if nothing is learnt.
 
         Raises
         ------
         InvalidModelError
-            A transition factor makes a probability larger than one.
+            If a transition factor makes a probability larger than one.
         """
-        scenario, learning = self.scenario, self.scenario.learning
-        if learning is None:
+        scenario = self.scenario
+        section = scenario.learning
+        if section is None:
             return None
-        draws = (scenario.calibration.parameter, self.draws.values) if learning.parameter else None
-        factors = learning.transition_factors
-        moves = {factor: build_graphical_model(scenario, factor).transition for factor in factors}
+        draws = None
+        if section.parameter:
+            draws = (scenario.calibration.parameter, self.draws.values)
+        transitions = {}
+        for factor in section.transition_factors:
+            transitions[factor] = build_graphical_model(scenario, factor).transition
         return LearningFilter(
-            self.model, self.sensor_model, learning, draws, moves, scenario.mission.name,
+            self.model,
+            self.sensor_model,
+            section,
+            draws,
+            transitions,
+            scenario.mission.name,
             scenario.observation.sensor_units,
-        )  # fmt: skip
+        )
 
     @cached_property
     def estimator(self) -> Estimator:
-        """What holds the belief: the exact filter, or what learns and gives notice as the scenario says.
+        """The estimator of the belief.
+
+        It is the exact filter, or one that learns; either may also give notices, as the scenario
+        says.
 
         Raises
         ------
         InvalidModelError
-            There are too many states to watch, or as of `learning`.
+            If there are too many states to give notices, or for the reasons of `learning`.
         """
-        notice = self.scenario.notice
-        inner = self.learning or ExactFilter(self.model, self.sensor_model, self.scenario.mission.name)
-        if notice is None:
-            return inner
-        words = NoticeWording.of(self.scenario)
-        return WatchfulEstimator(inner, self.sensor_model, self.draws.values, notice, words)
+        scenario = self.scenario
+        filter_of_belief: Estimator = self.learning or ExactFilter(
+            self.model, self.sensor_model, scenario.mission.name
+        )
+        if scenario.notice is None:
+            return filter_of_belief
+        return WatchfulEstimator(
+            filter_of_belief,
+            self.sensor_model,
+            self.draws.values,
+            scenario.notice,
+            NoticeWording.of(scenario),
+        )
 
     @cached_property
     def expectation(self) -> LearntExpectation | None:
-        """What is expected of sensors and rewards by what is learnt; None where nothing is."""
+        """What is expected of sensors and rewards given what is learnt; None without learning."""
         if self.learning is None:
             return None
         return LearntExpectation(self.learning, self.rewards, self.plan.policy)
@@ -189,70 +249,113 @@ class Knowledge:
         lag: int | None = None,
         estimator: Estimator | None = None,
     ) -> Twin:
-        """Return a twin that has seen nothing yet.
+        """Return a twin before its first observation.
 
         Parameters
         ----------
-        policy : (S, U) or callable, optional
-            p(U | D), row-stochastic, or a planner; that of the plan if left out.
+        policy : (S, U) array or callable, optional
+            The policy p(U | D), row-stochastic, or a planner; the policy of the plan if left out.
         lag : int or None
-            How many steps back it smooths and may be revised; None keeps all, as a mission of a known length
-            wants.
+            The number of steps that it smooths back over and that late observations may revise;
+            None keeps all steps, as a mission of known length needs.
         estimator : Estimator, optional
-            What holds the belief in the place of the exact filter, or of what learns and gives notice where
-            the scenario says so.
+            An estimator in place of the one that the scenario asks for.
         """
+        if policy is None:
+            policy_of_states: ArrayLike | Planner = self.plan.policy
+            policy_on_belief = self.plan.on_belief
+        else:
+            policy_of_states = policy
+            policy_on_belief = None
         return Twin(
             self.scenario.mission.name,
             self.model,
             self.sensor_model,
-            self.plan.policy if policy is None else policy,
+            policy_of_states,
             prediction_steps=self.scenario.mission.prediction_steps,
             decide_on=self.scenario.planner.decide_on,
             lag=lag,
             first_control=self.scenario.mission.first_control,
             estimator=estimator or self.estimator,
-            safest=self.safest,
-            on_belief=self.plan.on_belief if policy is None else None,
+            safest=self.safest_control,
+            on_belief=policy_on_belief,
         )
 
     @property
-    def safest(self) -> int:
-        """Index of the control where no state is believed.
+    def safest_control(self) -> int:
+        """The index of the control that is flown if no state is believed.
 
-        That of the scenario, or the one with the least load: whose health reward is the best in the mean over
-        all states, the first of equals.
+        The scenario may name it. Otherwise it is the control with the least load: the one whose
+        health reward, averaged over all states, is the largest, and the first of equals.
         """
-        named = self.scenario.planner.safest
-        if named is not None:
-            return self.scenario.control_names.index(named)
-        return int(np.argmax(self.rewards.planning_reward(1.0, 0.0).mean(axis=0)))
+        name = self.scenario.planner.safest
+        if name is not None:
+            return self.scenario.control_names.index(name)
+        health_reward = self.rewards.planning_reward(1.0, 0.0)
+        return int(np.argmax(health_reward.mean(axis=0)))
 
-    def asked(self, unexplained: ArrayLike) -> Float:
-        """Return p(U | D) of steps to come (..., S, U), the safest so far as no state is believed (...)."""
-        share = np.asarray(unexplained, dtype=np.float64)[..., None, None]
-        safest = np.eye(len(self.model.controls))[self.safest]
-        return np.asarray((1.0 - share) * self.plan.policy + share * safest)
+    def policy_with_doubt(self, unexplained: ArrayLike) -> Float:
+        """Return the policy p(U | D) of future steps, if perhaps no state is believed then.
+
+        Parameters
+        ----------
+        unexplained : (...) array
+            The probability that no state explains the sensors; then the safest control is flown.
+
+        Returns
+        -------
+        (..., S, U) array
+            The policy.
+        """
+        doubt = np.asarray(unexplained, dtype=np.float64)[..., None, None]
+        safest_control = np.eye(len(self.model.controls))[self.safest_control]
+        return np.asarray((1.0 - doubt) * self.plan.policy + doubt * safest_control)
 
     @cached_property
     def true_model(self) -> GraphicalModel:
-        """States and transitions of what really happens, where it is random growth."""
-        true = self.scenario.truth.probability
-        if not true:
+        """The states and transitions that random growth of the true damage follows."""
+        probability = self.scenario.truth.probability
+        if not probability:
             return self.model
-        return build_graphical_model(self.scenario.with_changes("transition", probability=true))
+        return build_graphical_model(
+            self.scenario.with_changes("transition", probability=probability)
+        )
 
     def truth(self, seed: int) -> Truth:
-        """Return what really happens under a seed."""
+        """Return what really happens in a mission of a seed."""
         return Truth(self.scenario, self.true_model, seed)
 
     def plant(self, truth: Truth, asset: Asset) -> Plant:
-        """Return an asset, driven by a truth."""
+        """Return an asset that is driven by a truth."""
         return Plant(self.scenario, truth, asset)
 
 
+def _inspected_sensor_model(
+    scenario: Scenario, model: GraphicalModel
+) -> "partial[InspectedSensorModel]":
+    """Return the constructor of the sensor model, with its arguments of inspections filled in."""
+    controls = np.array([control for control, _state, _name, _deviation in scenario.readings])
+    factors = np.array([state for _control, state, _name, _deviation in scenario.readings])
+    deviations = np.array([deviation for _control, _state, _name, deviation in scenario.readings])
+    coordinates = model.states.coordinates  # (S, F)
+    within_level = np.zeros_like(coordinates)
+    if scenario.observation.between_levels:
+        # The standard deviation of each factor inside the interval that its level stands for: the
+        # last two axes of the changes are the factor that changes and the factor that is moved.
+        within_level = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
+    return partial(
+        InspectedSensorModel,
+        asked_by=controls,
+        reading=coordinates[:, factors],
+        reading_deviation=np.hypot(within_level[:, factors], deviations),
+    )
+
+
 def prepare_knowledge(
-    scenario: Scenario, source: AssetSource, seed: int, policy: Float | BeliefPolicy | None = None
+    scenario: Scenario,
+    source: AssetSource,
+    seed: int,
+    policy: Float | BeliefPolicy | None = None,
 ) -> Knowledge:
     """Calibrate, predict the observations of every state and control, and plan.
 
@@ -263,41 +366,28 @@ def prepare_knowledge(
     scenario : Scenario
         What is to be flown.
     source : AssetSource
-        Already prepared.
+        The source of the asset, already prepared.
     seed : int
-        Seed of the run.
-    policy : (S, U) or BeliefPolicy, optional
-        To fly instead of planning; p(U | D), row-stochastic.
+        The seed of the run.
+    policy : (S, U) array or BeliefPolicy, optional
+        The policy that is flown instead of a plan; p(U | D), row-stochastic.
 
     Raises
     ------
     InvalidModelError
-        It does not fit in memory, or a sensor's noise is larger than all that it can show.
+        If the tables do not fit in memory, or the noise of a sensor exceeds all that it can show.
     """
     model = build_graphical_model(scenario)
     draws = source.draws(seed)
-    predicted, section = source.observation_table(draws, model), scenario.observation
-    true = source.structural_table(draws, model)
-    for key, deviation in (
-        ("observation.standard_deviation", section.standard_deviation),
-        ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),
-    ):
-        check_noise(key, deviation, predicted, section.sensor_units)
-    return Knowledge(scenario, model, draws, predicted, policy, true)
-
-
-def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
-    """Return what inspections read in each state, and how well, for `InspectedSensorModel`."""
-    asked_by, places, _, deviations = (np.array(column) for column in zip(*scenario.readings, strict=True))
-    coordinates = model.states.coordinates
-    within = np.zeros_like(coordinates)
-    if scenario.observation.between_levels:
-        within = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
-    return {
-        "asked_by": asked_by,
-        "reading": coordinates[:, places],
-        "reading_deviation": np.hypot(within[:, places], deviations),
+    predicted = source.observation_table(draws, model)
+    true_values = source.structural_table(draws, model)
+    noise_settings = {
+        "observation.standard_deviation": scenario.observation.standard_deviation,
+        "truth.noise.standard_deviation": scenario.truth.noise.standard_deviation,
     }
+    for key, deviation in noise_settings.items():
+        check_noise(key, deviation, predicted, scenario.observation.sensor_units)
+    return Knowledge(scenario, model, draws, predicted, policy, true_values)
 
 
 def prepare_twin(
@@ -313,58 +403,76 @@ def prepare_twin(
     scenario : LoadedScenario, str or Path
         The scenario, its shipped name, or its file.
     overrides : Overrides or mapping, optional
-        What differs from the file, as `fly` takes it.
+        What differs from the file, as for `fly`.
     progress : Progress, optional
-        Where the modelling reports.
+        Shows the stages of the modelling.
 
     Returns
     -------
     Knowledge
-        Graphical model, sensors, rewards and plan; `.twin()` is a twin that has seen nothing yet.
+        The graphical model, sensors, rewards and plan; `.twin()` is a twin before its first
+        observation.
 
     Raises
     ------
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
-        With one clear sentence.
+        If the scenario cannot be modelled; the error is one clear sentence.
     """
     resolved = resolve_scenario(load_scenario(scenario), overrides)
-    return prepared_alone(resolved, asset_source(resolved), progress)
+    return prepare_without_folder(resolved, asset_source(resolved), progress)
 
 
-def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress | None = None) -> Knowledge:
-    """Return what a twin knows that flies in no folder."""
+def prepare_without_folder(
+    scenario: Scenario, source: AssetSource, progress: Progress | None = None
+) -> Knowledge:
+    """Return what a twin knows that needs no run folder; the source works in a temporary one."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
         return prepare_knowledge(scenario, source, scenario.mission.seed)
 
 
-KNOWLEDGE_NAME, CALIBRATION_NAME = "twin.npz", "calibration.json"
+KNOWLEDGE_NAME = "twin.npz"
+"""The file of a run folder with what the twin knew before its flight."""
 EARLIER_KNOWLEDGE = "twin_{}.npz"
-"""Of the models that a watch believed before its last one, by their numbers from 0."""
+"""The same for the models that a watch believed earlier, by their numbers from 0."""
+CALIBRATION_NAME = "calibration.json"
+"""The file of a run folder with the record of the calibration."""
 
 
-def keep_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
+def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
     """Write what a twin knows before its flight; the bytes depend on nothing else.
 
-    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where it is decided by the
-    belief also `belief_vectors` (N, S) and `belief_control` (N,); where what is there at
-    the sensors is not what they show also `true` (E, S, U, G), SI.
+    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); with a policy on
+    the belief also `belief_vectors` (N, S) and `belief_control` (N,); and `true` (E, S, U, G), SI,
+    if the sensors do not show the values of the structure itself.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder.
+    knowledge : Knowledge
+        What to write.
+    number : int, optional
+        The number of an earlier model of a watch, from 0; left out for the last or only one.
 
     Raises
     ------
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
-    content, true = io.BytesIO(), knowledge.true
     arrays: dict[str, Any] = {
         "predicted": knowledge.predicted,
         "draws": knowledge.draws.values,
         "policy": knowledge.plan.policy,
     }
     if knowledge.plan.on_belief is not None:
-        arrays |= {f"belief_{name}": array for name, array in vars(knowledge.plan.on_belief).items()}
-    np.savez(content, **arrays | ({} if true is None else {"true": true}))
+        for name, array in vars(knowledge.plan.on_belief).items():
+            arrays[f"belief_{name}"] = array
+    if knowledge.true_values is not None:
+        arrays["true"] = knowledge.true_values
+    content = io.BytesIO()
+    np.savez(content, **arrays)
     name = KNOWLEDGE_NAME if number is None else EARLIER_KNOWLEDGE.format(number)
     atomic_write_bytes(folder / name, content.getvalue())
     if knowledge.draws.record is not None:
@@ -372,17 +480,18 @@ def keep_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
         atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
 
 
-def share_knowledge(folder: Path, other: Path) -> None:
-    """Keep what a twin knows in another folder, too, on the same bytes of the disk where it has links."""
-    if (other / KNOWLEDGE_NAME).exists():
+def link_knowledge(folder: Path, other_folder: Path) -> None:
+    """Put the knowledge of one folder into another one, as a hard link if that is possible."""
+    if (other_folder / KNOWLEDGE_NAME).exists():
         return
     try:
-        os.link(folder / KNOWLEDGE_NAME, other / KNOWLEDGE_NAME)
+        os.link(folder / KNOWLEDGE_NAME, other_folder / KNOWLEDGE_NAME)
     except OSError:
-        atomic_write_bytes(other / KNOWLEDGE_NAME, (folder / KNOWLEDGE_NAME).read_bytes())
+        content = (folder / KNOWLEDGE_NAME).read_bytes()
+        atomic_write_bytes(other_folder / KNOWLEDGE_NAME, content)
 
 
-def kept_knowledge(folder: Path, scenario: Scenario, number: int | None = None) -> Knowledge:
+def load_knowledge(folder: Path, scenario: Scenario, number: int | None = None) -> Knowledge:
     """Return what the twin of a run knew before its flight.
 
     Parameters
@@ -390,31 +499,42 @@ def kept_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
     folder : Path
         The run folder.
     scenario : Scenario
-        Of its `config.json`.
+        The scenario in its `config.json`.
     number : int, optional
-        Of an earlier model of a watch, from 0; the last one where there is no such file.
+        The number of an earlier model of a watch, from 0; the last model if there is no such file.
 
     Raises
     ------
     RunFolderError
-        The file is missing or damaged, or belongs to another scenario.
+        If the file is missing or damaged, or belongs to another scenario.
     """
-    earlier = folder / EARLIER_KNOWLEDGE.format(number)
-    path = earlier if earlier.is_file() else folder / KNOWLEDGE_NAME
+    path = folder / EARLIER_KNOWLEDGE.format(number)
+    if not path.is_file():
+        path = folder / KNOWLEDGE_NAME
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            predicted, draws, policy = (
-                np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
-            )
-            true = np.asarray(kept["true"], dtype=np.float64) if "true" in kept else None
-            on_belief = BeliefPolicy.from_arrays(kept, "belief_") if "belief_control" in kept else None
+        with np.load(path, allow_pickle=False) as stored:
+            predicted = np.asarray(stored["predicted"], dtype=np.float64)
+            draws = np.asarray(stored["draws"], dtype=np.float64)
+            policy: Float | BeliefPolicy = np.asarray(stored["policy"], dtype=np.float64)
+            true_values = None
+            if "true" in stored:
+                true_values = np.asarray(stored["true"], dtype=np.float64)
+            if "belief_control" in stored:
+                policy = BeliefPolicy.from_arrays(stored, "belief_")
         calibration = scenario.calibration
         parameter = ParameterDraws(
-            calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source
+            calibration.parameter,
+            draws,
+            float(draws.mean()),
+            float(draws.std()),
+            calibration.source,
         )
         model = build_graphical_model(scenario)
-        found = Knowledge(scenario, model, parameter, predicted, on_belief or policy, true)
-        _ = found.plan  # what does not fit is said now
-        return found
+        knowledge = Knowledge(scenario, model, parameter, predicted, policy, true_values)
+        _ = knowledge.plan  # planned now, so that arrays of another shape are refused here
+        return knowledge
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RunFolderError(said("mission.knowledge", path=path, error=error)) from error
+        raise RunFolderError(
+            f"{path} is missing, damaged or of another scenario ({error}): "
+            "fly the run again with --replace."
+        ) from error

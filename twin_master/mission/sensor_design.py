@@ -1,9 +1,10 @@
-"""Which sensors tell most: the information that their readings are expected to give about the state.
+"""Which sensors to install: those whose readings are expected to tell most about the state.
 
-The information of a set of sensors is the mean, over readings that are drawn in states that are all alike
-probable, of the logarithm of the posterior probability of the true state over the prior one. What moves all
-sensors together (a place between levels, the calibrated parameter) is accounted for as that. A structure may
-have candidates beside the gauges that its file declares.
+The information of a set of sensors is the expected logarithm of the posterior probability of the
+true state over its prior probability. The expectation is over simulated readings, with all states
+equally probable. Effects that move all sensors together (a damage between two levels, the
+calibrated parameter) count as such, not as independent noise. A structure may have candidates
+beside the gauges of its file.
 """
 
 import itertools
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -26,77 +28,151 @@ from reporting.files import write_members
 from reporting.toml_file import read_toml, validate
 from twin_master.assets.asset_source import read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge
+from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 SAMPLES = 300
-"""Readings that are drawn for each control, about: as many in each state, or one in each of so many."""
-_GAIN = 1e-9
-"""Bits that an exchange of two sensors gains at least."""
+"""About how many readings are drawn for each control.
+
+Up to this number of states, each state has as many readings as fit; otherwise this number of states
+is drawn, and each has one reading.
+"""
+_LEAST_GAIN = 1e-9
+"""Least information that the exchange of two sensors must gain, in bits."""
 
 
-@dataclass(frozen=True)
-class Readings:
-    """Readings that were drawn under one control, as sums over sensors need them.
+class _LikelihoodTerms(NamedTuple):
+    """For each sensor, the terms of the likelihood that are summed over a set of sensors.
 
     Attributes
     ----------
-    state : (N,)
-        In which each was drawn.
-    residual : (N, S, G)
-        From what each state shows, in standard deviations.
-    moved : (S, G, F)
-        What moves all sensors together, likewise.
-    log_scale : (S, G)
-        Logarithm of the standard deviations.
+    squared_residual : (G, N, S) array
+        The squared residual of each reading and state.
+    loading_residual : (G, S, N, F) array
+        The product of loading and residual.
+    loading_product : (G, S, F, F) array
+        The product of the loadings of two common effects.
+    """
+
+    squared_residual: Float
+    loading_residual: Float
+    loading_product: Float
+
+
+@dataclass(frozen=True)
+class DrawnReadings:
+    """Readings of all G sensors that were drawn under one control, N times, in S possible states.
+
+    Attributes
+    ----------
+    state : (N,) array
+        The index of the state in which each reading was drawn.
+    residual : (N, S, G) array
+        The difference to the mean in each state, in standard deviations of the sensor.
+    loadings : (S, G, F) array
+        The change of each sensor if one of F common effects moves by its standard deviation, in
+        standard deviations of the sensor.
+    log_deviation : (S, G) array
+        The logarithm of the standard deviation of each sensor.
     """
 
     state: Index
     residual: Float
-    moved: Float
-    log_scale: Float
+    loadings: Float
+    log_deviation: Float
 
     @cached_property
-    def _of_each(self) -> tuple[Float, Float, Float]:
-        """Squares (G, N, S), shares along what moves all (G, S, N, F), and products of these (G, S, F, F)."""
-        residual, moved = self.residual.transpose(2, 0, 1), self.moved.transpose(1, 0, 2)
-        along = residual.swapaxes(1, 2)[..., None] * moved[:, :, None]
-        return residual**2, along, moved[..., None] * moved[..., None, :]
+    def _terms(self) -> _LikelihoodTerms:
+        """The terms of the likelihood, by sensor."""
+        residual = self.residual.transpose(2, 0, 1)  # (G, N, S)
+        loadings = self.loadings.transpose(1, 0, 2)  # (G, S, F)
+        return _LikelihoodTerms(
+            squared_residual=residual**2,
+            loading_residual=residual.swapaxes(1, 2)[..., None] * loadings[:, :, None],
+            loading_product=loadings[..., None] * loadings[..., None, :],
+        )
 
     def information(self, sensors: Sequence[int]) -> float:
-        """Return the expected information of a set of sensors about the state [bit]."""
+        """Return the expected information of a set of sensors about the state, in bits.
+
+        The standardised readings of the set have the covariance I + L Lᵀ in each state, where L
+        (sensors, F) are the loadings. Its inverse and determinant follow from the small matrix
+        C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma.
+        """
         chosen = list(sensors)
-        squared, along, together = (each[chosen].sum(axis=0) for each in self._of_each)
-        together = together + np.eye(along.shape[-1])
-        squared -= np.sum(np.matmul(along, np.linalg.inv(together)) * along, axis=-1).T
-        log_density = -0.5 * (squared + np.linalg.slogdet(together)[1])
-        log_density -= self.log_scale[:, chosen].sum(axis=1)
-        true = log_density[np.arange(len(self.state)), self.state]
-        mean = logsumexp(log_density, axis=1) - np.log(log_density.shape[1])
-        return float((true - mean).mean() / np.log(2.0))
+        terms = self._terms
+        squared_distance = terms.squared_residual[chosen].sum(axis=0)  # (N, S)
+        projection = terms.loading_residual[chosen].sum(axis=0)  # (S, N, F)
+        small_matrix = terms.loading_product[chosen].sum(axis=0)  # (S, F, F)
+        small_matrix = small_matrix + np.eye(projection.shape[-1])
+
+        # Log density of each reading in each state.
+        solution = np.matmul(projection, np.linalg.inv(small_matrix))
+        squared_distance -= np.sum(solution * projection, axis=-1).T
+        log_density = -0.5 * (squared_distance + np.linalg.slogdet(small_matrix)[1])
+        log_density -= self.log_deviation[:, chosen].sum(axis=1)
+
+        # Posterior over prior of the true state; the prior is uniform.
+        states = log_density.shape[1]
+        log_density_of_truth = log_density[np.arange(len(self.state)), self.state]
+        log_mean_density = logsumexp(log_density, axis=1) - np.log(states)
+        return float((log_density_of_truth - log_mean_density).mean() / np.log(2.0))
 
 
-def drawn_readings(knowledge: Knowledge) -> tuple[Readings, ...]:
-    """Return readings that are drawn under each control that is no action."""
-    sensors, states = knowledge.sensor_model, knowledge.model.states.size
-    draws = generator(knowledge.scenario.mission.seed, "planning")
-    spread = sensors.value_per_draw - sensors.mean
-    found = []
-    for control in range(len(knowledge.scenario.control) - len(knowledge.scenario.action)):
-        deviation = sensors.independent_standard_deviation[:, control]
-        some = np.arange(states) if states <= SAMPLES else draws.permutation(states)[:SAMPLES]
-        state = np.tile(some, round(SAMPLES / len(some)))
-        shown = sensors.draw_observations(state, control, draws)[:, : sensors.sensor_count]
-        # The draws move all sensors along one direction, as far as they depend on the parameter linearly.
-        root = np.sqrt(sensors.draw_weight)[:, None, None] * spread[:, :, control]
-        _, size, direction = np.linalg.svd(root.swapaxes(0, 1), full_matrices=False)
-        along = size[:, :1, None] * direction[:, :1]
-        moved = np.concatenate((sensors.interval[:, control], along.swapaxes(1, 2)), axis=-1)
-        residual = (shown[:, None] - sensors.mean[:, control]) / deviation
-        found.append(Readings(state, residual, moved / deviation[..., None], np.log(deviation)))
-    return tuple(found)
+def draw_readings(knowledge: Knowledge) -> tuple[DrawnReadings, ...]:
+    """Return drawn readings for each control that is not an action of the twin on its asset."""
+    random_numbers = generator(knowledge.scenario.mission.seed, "planning")
+    # The actions stand after the other controls.
+    controls = len(knowledge.scenario.control) - len(knowledge.scenario.action)
+    states = knowledge.model.states.size
+    readings = []
+    for control in range(controls):
+        readings.append(
+            _draw_under_control(knowledge.sensor_model, states, control, random_numbers)
+        )
+    return tuple(readings)
+
+
+def _draw_under_control(
+    sensors: GaussianSensorModel,
+    states: int,
+    control: int,
+    random_numbers: np.random.Generator,
+) -> DrawnReadings:
+    """Return readings under a control, drawn in all states, or in some if there are many."""
+    if states <= SAMPLES:
+        drawn_states = np.arange(states)
+    else:
+        drawn_states = random_numbers.permutation(states)[:SAMPLES]
+    state = np.tile(drawn_states, round(SAMPLES / len(drawn_states)))
+    values = sensors.draw_observations(state, control, random_numbers)[:, : sensors.sensor_count]
+    deviation = sensors.independent_standard_deviation[:, control]
+    loadings = np.concatenate(
+        (sensors.interval[:, control], _loading_of_parameter(sensors, control)), axis=-1
+    )
+    return DrawnReadings(
+        state,
+        residual=(values[:, None] - sensors.mean[:, control]) / deviation,
+        loadings=loadings / deviation[..., None],
+        log_deviation=np.log(deviation),
+    )
+
+
+def _loading_of_parameter(sensors: GaussianSensorModel, control: int) -> Float:
+    """Return the change of each sensor in each state by the calibrated parameter (S, G, 1), SI.
+
+    If the sensors depend on the parameter linearly, its draws move them along one direction. This
+    is the first singular vector of the deviations of the draws, times its singular value.
+    """
+    deviation_of_draws = sensors.value_per_draw - sensors.mean
+    weight = np.sqrt(sensors.draw_weight)[:, None, None]
+    weighted = weight * deviation_of_draws[:, :, control]  # (E, S, G)
+    _, singular_values, directions = np.linalg.svd(weighted.swapaxes(0, 1), full_matrices=False)
+    loading = singular_values[:, :1, None] * directions[:, :1]
+    return np.asarray(loading.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
@@ -106,11 +182,11 @@ class SensorDesign:
     Attributes
     ----------
     sensors : tuple of int
-        From 0, the one that tells most first.
+        The indices of the sensors; each tells most beside those before it.
     information : tuple of float
-        Of the first, the first two, ... of them [bit].
+        The information of the first sensor, of the first two, and so on, in bits.
     of_all : float
-        Of all candidates [bit].
+        The information of all candidates, in bits.
     """
 
     sensors: tuple[int, ...]
@@ -118,159 +194,275 @@ class SensorDesign:
     of_all: float
 
 
-def chosen_sensors(readings: Sequence[Readings], candidates: Sequence[int], count: int) -> SensorDesign:
-    """Choose the sensors that tell most: one after the other, then exchanged as long as that tells more.
+def choose_sensors(
+    readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
+) -> SensorDesign:
+    """Choose the sensors that tell most about the state.
+
+    They are added one after the other; then a chosen sensor is exchanged for another candidate as
+    long as that gains information.
 
     Parameters
     ----------
-    readings : sequence of Readings
-        Of each control; their information is averaged.
+    readings : sequence of DrawnReadings
+        The readings under each control; the information is averaged over the controls.
     candidates : sequence of int
-        Sensors to choose from, from 0.
+        The indices of the sensors to choose from.
     count : int
-        Of sensors to choose.
+        How many sensors to choose.
 
     Raises
     ------
     MissionInputError
-        There are fewer candidates.
+        If `count` is less than one or more than the number of candidates.
     """
     if not 1 <= count <= len(candidates):
-        raise MissionInputError(said("mission.sensors", most=len(candidates), count=count))
-
-    def information(sensors: Sequence[int]) -> float:
-        return float(np.mean([under.information(sensors) for under in readings]))
-
-    def best_of(sets: list[list[int]]) -> tuple[float, list[int]]:
-        return max(((information(some), some) for some in sets), key=lambda pair: pair[0])
-
-    def grown(pool: Sequence[int], size: int) -> list[int]:
-        found: list[int] = []
-        while len(found) < size:
-            found = best_of([[*found, other] for other in pool if other not in found])[1]
-        return found
-
-    chosen = grown(candidates, count)
-    told = information(chosen)
-    while len(candidates) > count:
-        others = [other for other in candidates if other not in chosen]
-        exchanged = [
-            [*chosen[:place], other, *chosen[place + 1 :]] for place in range(count) for other in others
-        ]
-        better, found = best_of(exchanged)
-        if better <= told + _GAIN:
-            break
-        told, chosen = better, found
-    ordered = grown(chosen, count)
+        raise MissionInputError(
+            f"--sensors is from 1 to {len(candidates)}, the candidates, and {count} came."
+        )
+    chosen = _add_greedily(readings, candidates, count)
+    chosen = _exchange(readings, candidates, chosen)
+    ordered = _add_greedily(readings, chosen, count)
+    information = []
+    for number in range(1, count + 1):
+        information.append(_mean_information(readings, ordered[:number]))
     return SensorDesign(
-        tuple(ordered),
-        tuple(information(ordered[: place + 1]) for place in range(count)),
-        information(list(candidates)),
+        tuple(ordered), tuple(information), _mean_information(readings, list(candidates))
     )
 
 
-def separations(
-    knowledge: Knowledge, readings: Sequence[Readings], sensors: Sequence[int]
+def _mean_information(readings: Sequence[DrawnReadings], sensors: Sequence[int]) -> float:
+    """Return the information of a set of sensors, averaged over the controls, in bits."""
+    return float(
+        np.mean([readings_of_control.information(sensors) for readings_of_control in readings])
+    )
+
+
+class _RatedSet(NamedTuple):
+    """A set of sensors and its information in bits."""
+
+    information: float
+    sensors: list[int]
+
+
+def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> _RatedSet:
+    """Return the set of sensors with the most information, the first of equals."""
+    rated = [_RatedSet(_mean_information(readings, sensors), sensors) for sensors in sets]
+    return max(rated, key=lambda rated_set: rated_set.information)
+
+
+def _add_greedily(
+    readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
+) -> list[int]:
+    """Return sensors, each chosen to tell most beside those before it."""
+    chosen: list[int] = []
+    while len(chosen) < count:
+        extended = [[*chosen, sensor] for sensor in candidates if sensor not in chosen]
+        chosen = _best_set(readings, extended).sensors
+    return chosen
+
+
+def _exchange(
+    readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen: list[int]
+) -> list[int]:
+    """Exchange chosen sensors, one at a time, for candidates that gain information."""
+    information = _mean_information(readings, chosen)
+    while len(candidates) > len(chosen):
+        other_sensors = [sensor for sensor in candidates if sensor not in chosen]
+        exchanged_sets = []
+        for position in range(len(chosen)):
+            for sensor in other_sensors:
+                exchanged_sets.append([*chosen[:position], sensor, *chosen[position + 1 :]])
+        best = _best_set(readings, exchanged_sets)
+        if best.information <= information + _LEAST_GAIN:
+            break
+        information = best.information
+        chosen = best.sensors
+    return chosen
+
+
+def level_separations(
+    knowledge: Knowledge, readings: Sequence[DrawnReadings], sensors: Sequence[int]
 ) -> dict[tuple[str, int], float]:
-    """Return how far each level of a state is from the next one, by a set of sensors.
+    """Return how far a set of sensors separates each level of a state factor from the next level.
 
-    In standard deviations of what they show, under the control that tells most, with the other states at
-    their lowest levels; by the name of the state and the number of the lower level, from 0.
+    The separation is in standard deviations of the readings, under the control that separates most,
+    with the other factors at their lowest levels.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        What the twin knows.
+    readings : sequence of DrawnReadings
+        The readings under each control.
+    sensors : sequence of int
+        The indices of the sensors.
+
+    Returns
+    -------
+    dict of (str, int) to float
+        By the name of the factor and the index of the lower level.
     """
-    states, mean, chosen = knowledge.model.states, knowledge.sensor_model.mean, list(sensors)
-    index = np.arange(states.size).reshape(states.shape)
-    found = {}
+    states = knowledge.model.states
+    state_indices = np.arange(states.size).reshape(states.shape)
+    separations = {}
     for axis, factor in enumerate(states.factors):
-        line = np.moveaxis(index, axis, 0).reshape(len(factor.levels), -1)[:, 0]
-        for level, (low, high) in enumerate(itertools.pairwise(line)):
-            apart = []
-            for control, under in enumerate(readings):
-                scale, moved = np.exp(-under.log_scale[low, chosen]), under.moved[low, chosen]
-                shift = (mean[high, control, chosen] - mean[low, control, chosen]) * scale
-                cover = np.eye(len(chosen)) + moved @ moved.T
-                apart.append(float(shift @ np.linalg.solve(cover, shift)))
-            found[factor.name, level] = max(apart) ** 0.5
-    return found
+        by_level = np.moveaxis(state_indices, axis, 0).reshape(len(factor.levels), -1)
+        others_at_lowest = by_level[:, 0]
+        for level, (low, high) in enumerate(itertools.pairwise(others_at_lowest)):
+            squared_distances = []
+            for control, readings_of_control in enumerate(readings):
+                mean = knowledge.sensor_model.mean[:, control]
+                difference = mean[high] - mean[low]
+                squared_distances.append(
+                    _squared_distance(readings_of_control, int(low), difference, list(sensors))
+                )
+            separations[factor.name, level] = max(squared_distances) ** 0.5
+    return separations
 
 
-def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
-    """Return a scenario whose structure has more gauges, which are sensors.
+def _squared_distance(
+    readings: DrawnReadings, state: int, difference: Float, sensors: list[int]
+) -> float:
+    """Return the squared Mahalanobis distance of a difference of means (G,), in a state."""
+    standardised = difference[sensors] * np.exp(-readings.log_deviation[state, sensors])
+    loadings = readings.loadings[state, sensors]
+    covariance = np.eye(len(sensors)) + loadings @ loadings.T
+    return float(standardised @ np.linalg.solve(covariance, standardised))
 
-    In their order they stand behind the gauges that the file had and before those of its rosettes.
+
+def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
+    """Return the scenario with more gauges on its structure, which are sensors.
+
+    The new gauges stand after the gauges of the structure file and before those of its rosettes.
 
     Parameters
     ----------
     scenario : Scenario
-        Its paths absolute.
+        The scenario; its paths are absolute.
     candidates : str
-        At most how many rosettes are spread over the surface, or a TOML file with tables `gauge` and
-        `rosette` as a structure file has them.
+        The largest number of rosettes to place evenly on the surface, or a TOML file with tables
+        `gauge` and `rosette`, as in a structure file.
     folder : Path
-        Where the structure file with the gauges is put.
+        Where the structure file with the new gauges is written.
 
     Raises
     ------
     MissionInputError
-        What is believed is no structure from a mesh, the sensors are no strain gauges that are all alike, no
-        place is asked for, or the structure file has its gauges in a list.
+        If the belief is not a structure from a mesh, the sensors are not strain gauges that are all
+        alike, no rosette is asked for, or the structure file has its gauges in a list.
     InvalidDesignError
-        The candidates are wrong; the sentence names the place.
+        If a candidate is wrong; the sentence names it.
     """
-    observation, belief = scenario.observation, scenario.belief
-    alike = (observation.standard_deviation, observation.model_error, scenario.rewards.error_scale)
-    if any(isinstance(one, tuple) for one in alike) or observation.role != "strain":
-        raise MissionInputError("--candidates needs strain gauges of one standard deviation and error scale.")
-    own = isinstance(belief, StructureBelief) and load_structure(belief.all_files()[MODEL_COPY])
-    if not isinstance(belief, StructureBelief) or not isinstance(own, MeshDesign):
-        raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
-    if candidates.isdecimal() and not int(candidates):
+    belief, design = _extensible_structure(scenario)
+    if candidates.isdecimal() and int(candidates) == 0:
         raise MissionInputError("--candidates needs at least one place.")
+    structure_file = Path(belief.all_files()[MODEL_COPY])
     write_members(folder, read_files(belief.all_files()))
-    file = folder / MODEL_COPY
-    source = Path(belief.all_files()[MODEL_COPY]).parent / own.mesh  # this one stays
-    mesh = read_mesh(source, own.unit, own.length_unit)
-    gauges = _gauges(candidates, mesh)
-    with file.open("a", encoding="utf-8") as text:
-        for gauge in gauges:
-            rows = (f"{key} = {json.dumps(value)}\n" for key, value in gauge.model_dump().items())
-            text.write("".join(("\n[[gauge]]\n", *rows)))
-    before, names = ([part.name for part in design.gauge] for design in (own, _joined(file, candidates)))
+    extended_file = folder / MODEL_COPY
+    mesh_file = structure_file.parent / design.mesh  # it is read where it is, and not copied
+    mesh = read_mesh(mesh_file, design.unit, design.length_unit)
+    gauges = _candidate_gauges(candidates, mesh)
+    _append_gauges(extended_file, gauges)
+    extended_design = _read_extended_structure(extended_file, candidates)
     try:
         gauge_rows(mesh, gauges)
     except InvalidDesignError as error:
         raise InvalidDesignError(f"--candidates {candidates}: {error}") from error
-    known = dict(zip(before, observation.titles or before, strict=True))
-    chosen, titles = scenario.rewards.health_sensors, tuple(known.get(name, name) for name in names)
-    limited = range(1, len(before) + 1) if chosen == "all" else chosen
-    health = tuple(names.index(before[number - 1]) + 1 for number in limited)
+    extended_belief = belief.model_copy(update={"structure": str(extended_file)})
+    return _with_sensors(
+        scenario.model_copy(update={"belief": extended_belief}),
+        declared_gauges=[gauge.name for gauge in design.gauge],
+        all_gauges=[gauge.name for gauge in extended_design.gauge],
+    )
+
+
+def _extensible_structure(scenario: Scenario) -> tuple[StructureBelief, MeshDesign]:
+    """Return the believed structure and its design, if the scenario can have candidates."""
+    observation = scenario.observation
+    belief = scenario.belief
+    settings = (
+        observation.standard_deviation,
+        observation.model_error,
+        scenario.rewards.error_scale,
+    )
+    differs_by_sensor = any(isinstance(setting, tuple) for setting in settings)
+    if differs_by_sensor or observation.role != "strain":
+        raise MissionInputError(
+            "--candidates needs strain gauges of one standard deviation and error scale."
+        )
+    if isinstance(belief, StructureBelief):
+        design = load_structure(belief.all_files()[MODEL_COPY])
+        if isinstance(design, MeshDesign):
+            return belief, design
+    raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
+
+
+def _append_gauges(structure_file: Path, gauges: Sequence[Gauge]) -> None:
+    """Append a table [[gauge]] for each gauge to a structure file."""
+    with structure_file.open("a", encoding="utf-8") as text:
+        for gauge in gauges:
+            text.write("\n[[gauge]]\n")
+            for key, value in gauge.model_dump().items():
+                text.write(f"{key} = {json.dumps(value)}\n")
+
+
+def _with_sensors(
+    scenario: Scenario, declared_gauges: Sequence[str], all_gauges: Sequence[str]
+) -> Scenario:
+    """Return the scenario with all gauges as sensors; the health reward counts the same as before.
+
+    Learning and notices are left out, because they are set for the declared gauges.
+    """
+    observation = scenario.observation
+    titles = dict(zip(declared_gauges, observation.titles or declared_gauges, strict=True))
+    health_sensors = scenario.rewards.health_sensors
+    if health_sensors == "all":
+        health_sensors = tuple(range(1, len(declared_gauges) + 1))
+    new_health_sensors = []
+    for number in health_sensors:
+        gauge = declared_gauges[number - 1]
+        new_health_sensors.append(all_gauges.index(gauge) + 1)
+    new_observation = {
+        "count": len(all_gauges),
+        "titles": tuple(titles.get(gauge, gauge) for gauge in all_gauges),
+    }
     return scenario.model_copy(
         update={
-            "belief": belief.model_copy(update={"structure": str(file)}),
-            "observation": observation.model_copy(update={"count": len(names), "titles": titles}),
-            "rewards": scenario.rewards.model_copy(update={"health_sensors": health}),
+            "observation": observation.model_copy(update=new_observation),
+            "rewards": scenario.rewards.model_copy(
+                update={"health_sensors": tuple(new_health_sensors)}
+            ),
             "learning": None,
             "notice": None,
         }
     )
 
 
-def _joined(file: Path, candidates: str) -> MeshDesign:
-    """Return the structure with the gauges; its file is a copy, so that what is wrong names the option."""
+def _read_extended_structure(file: Path, candidates: str) -> MeshDesign:
+    """Return the structure with the new gauges; errors name the option, not the copied file."""
     try:
         content = read_toml(file, InvalidDesignError)
-    except InvalidDesignError as error:  # it could be read before
-        raise MissionInputError(said("assets.candidates")) from error
+    except InvalidDesignError as error:
+        # The file could be read before the tables were appended: a key `gauge` is there already.
+        raise MissionInputError(
+            "--candidates needs the gauges of the structure file as tables [[gauge]], not in a "
+            "list."
+        ) from error
     design = parse_structure(content, f"--candidates {candidates}")
     assert isinstance(design, MeshDesign)
     return design
 
 
-def _gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
+def _candidate_gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
+    """Return the gauges of evenly placed rosettes, given their number, or those of a TOML file."""
     if candidates.isdecimal():
-        spread = evenly_placed_rosettes(mesh, int(candidates))
-        return tuple(gauge for one in spread for gauge in one.gauges())
+        rosettes = evenly_placed_rosettes(mesh, int(candidates))
+        return tuple(gauge for rosette in rosettes for gauge in rosette.gauges())
     content = read_toml(candidates, InvalidDesignError)
-    found = validate(Gauged, content, candidates, InvalidDesignError, what="a file of gauges").gauge
-    if not found:
+    gauges = validate(
+        Gauged, content, candidates, InvalidDesignError, what="a file of gauges"
+    ).gauge
+    if not gauges:
         raise InvalidDesignError(f"{candidates}: a table [[gauge]] or [[rosette]] is expected.")
-    return found
+    return gauges

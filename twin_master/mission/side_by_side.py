@@ -1,11 +1,12 @@
-"""Many twins of one scenario, flown side by side: each flies what `fly` flies, bit for bit.
+"""Many twins of one scenario, flown side by side; each flies the same as with `fly`, to the bit.
 
-What does not depend on the neighbours is the same for every size of a batch: sums run over the states, the
-sensors and the draws of one twin, never over twins.
+The results of a twin do not depend on the number of twins: sums run over the states, sensors and
+draws of one twin, never over twins.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,44 +17,46 @@ from fmu_asset.errors import FmuError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
-from twin_master.mission.loop import ended_sentence, fly
+from twin_master.mission.loop import early_end_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, Truth, checked_values, decided_to_end
+from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
 from twin_master.network.estimator import Notice
-from twin_master.network.inference import filter_many
+from twin_master.network.inference import Filtered, filter_many
 from twin_master.network.planner import decision_probability, ration_controls
 
-IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
-"""What may end the flight of one asset, and not that of the others."""
+FLIGHT_ERRORS = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
+"""Errors that end the flight of one asset, but not the flights of the others."""
 
 
 @dataclass
 class Flights:
-    """What is kept of B histories; a twin that failed or ended has NaN, and control -1, from there on.
+    """The histories of B twins.
+
+    After a twin has failed or ended, its values are NaN and its control is -1.
 
     Attributes
     ----------
-    row : (B, T, G + I)
-        What came, as in `History`, SI; NaN where nothing did.
-    control_index : (B, T)
-        Control in force in each step.
-    state : (B, T, F)
-        True state, SI; NaN of a real asset.
-    filtered : (B, T, S)
-        p(D_t | o_0..o_t).
-    log_evidence : (B, T)
+    observation_rows : (B, T, G + I) array
+        The observed values, as in `History`, SI; NaN where nothing was received.
+    control_index : (B, T) array
+        The control in force in each step.
+    state : (B, T, F) array
+        The true state, SI; NaN for a real asset.
+    filtered : (B, T, S) array
+        The belief p(D_t | o_0..o_t).
+    log_evidence : (B, T) array
         log p(o_t | o_0..o_{t-1}).
-    unexplained : (B, T)
-        Probability that no state explains the sensors, see `is_state_believed`; 0 of twins without notices.
+    unexplained : (B, T) array
+        The probability that no state explains the sensors; 0 for twins that give no notices.
     failure : list of str
-        What ended the flight of each twin; empty for one that flew to its end.
+        The error that ended the flight of each twin; empty if it flew to its end.
     ended : list of str
-        How the asset of each twin has ended its simulation before that, with what was flown; mostly empty.
-    notices : list of list
-        What each twin told its operator, each notice with its step.
+        How the asset of each twin ended its simulation early; empty if it did not.
+    notices : list of list of (int, Notice)
+        The notices of each twin to its operator, with their steps.
     """
 
-    row: Float
+    observation_rows: Float
     control_index: Index
     state: Float
     filtered: Float
@@ -66,13 +69,14 @@ class Flights:
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
         """Return B missions before their first step."""
-        steps, size = knowledge.scenario.mission.steps, knowledge.model.states.size
-        width, factors = knowledge.scenario.row_width, len(knowledge.scenario.state)
+        scenario = knowledge.scenario
+        steps = scenario.mission.steps
+        states = knowledge.model.states.size
         return cls(
-            row=np.full((count, steps, width), np.nan),
+            observation_rows=np.full((count, steps, scenario.row_width), np.nan),
             control_index=np.full((count, steps), -1, dtype=np.int64),
-            state=np.full((count, steps, factors), np.nan),
-            filtered=np.full((count, steps, size), np.nan),
+            state=np.full((count, steps, len(scenario.state)), np.nan),
+            filtered=np.full((count, steps, states), np.nan),
             log_evidence=np.full((count, steps), np.nan),
             unexplained=np.full((count, steps), np.nan),
             failure=[""] * count,
@@ -80,134 +84,263 @@ class Flights:
             notices=[[] for _ in range(count)],
         )
 
-    def put(self, twin: int, history: History) -> None:
-        """Take in the steps of a twin."""
+    def store_history(self, twin: int, history: History) -> None:
+        """Store the steps of one twin."""
         steps_flown = len(history.steps)
-        names = ["row", "control_index", "filtered", "log_evidence", "unexplained"] if steps_flown else []
-        for name in names + ["state"] * history.simulated:
-            getattr(self, name)[twin, :steps_flown] = getattr(history, name)
-        self.ended[twin], self.notices[twin] = history.ended, history.notices
+        if steps_flown > 0:
+            self.observation_rows[twin, :steps_flown] = history.observation_rows
+            self.control_index[twin, :steps_flown] = history.control_index
+            self.filtered[twin, :steps_flown] = history.filtered
+            self.log_evidence[twin, :steps_flown] = history.log_evidence
+            self.unexplained[twin, :steps_flown] = history.unexplained
+        if history.simulated:
+            self.state[twin, :steps_flown] = history.state
+        self.ended[twin] = history.ended
+        self.notices[twin] = history.notices
 
 
-class _Stateless:
-    """Assets without memory: what one shows under a control and a state is asked once."""
+class _TrueStates(NamedTuple):
+    """The true states of B assets.
 
-    def __init__(self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> None:
-        self._scenario, self._states = knowledge.scenario, knowledge.model.states
-        distinct = {id(asset): asset for asset in assets}
-        self._assets = list(distinct.values())
-        numbers = {key: number for number, key in enumerate(distinct)}
-        self._asset = np.array([numbers[id(asset)] for asset in assets])
-        self._truth = Truth.together(truths)
-        self._before: tuple[Index | None, Index | None] = None, None
-        self._seen: dict[tuple[int, int, bytes], Float | str] = {}
+    Attributes
+    ----------
+    state_index : (B,) array
+        Their indices; zeros if they are scripted.
+    state : (B, F) array
+        The value of each state factor, SI.
+    """
+
+    state_index: Index
+    state: Float
+
+
+class _StatelessAssets:
+    """Assets without memory; each is asked only once what it shows under a control in a state."""
+
+    def __init__(
+        self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
+    ) -> None:
+        self._scenario = knowledge.scenario
+        self._states = knowledge.model.states
+        distinct_assets = {id(asset): asset for asset in assets}
+        self._assets = list(distinct_assets.values())
+        numbers = {key: number for number, key in enumerate(distinct_assets)}
+        self._asset_of_twin = np.array([numbers[id(asset)] for asset in assets])
+        self._truth = Truth.stack(truths)
+        self._previous_control: Index | None = None
+        self._previous_state_index: Index | None = None
+        # What an asset shows under a control in a state, or the sentence why it shows nothing.
+        self._observations: dict[tuple[int, int, bytes], Float | str] = {}
 
     def fly_step(
-        self, step: int, control: Index, flying: NDArray[np.bool_], failure: list[str]
+        self, step: int, control: Index, is_flying: NDArray[np.bool_], failure: list[str]
     ) -> tuple[Float, Float]:
-        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,).
+        """Fly one step of all twins.
 
-        Why an asset shows nothing is put where the failures of the twins stand.
+        Parameters
+        ----------
+        step : int
+            The step, from 0.
+        control : (B,) array
+            The control in force for each twin.
+        is_flying : (B,) array of bool
+            Whether the twin is still flying.
+        failure : list of str
+            The error of each twin; that of a failing asset is put here.
+
+        Returns
+        -------
+        (B, G + I) array
+            The observed values, SI.
+        (B, F) array
+            The true states, SI.
         """
-        place, state = self._grown(step, control)
-        code = (self._asset * len(self._scenario.control) + control) * self._states.size + place
-        _, first, inverse = np.unique(np.where(flying, code, -1), return_index=True, return_inverse=True)
-        distinct = np.full((len(first), self._scenario.observation.count), np.nan)
-        for row, twin in enumerate(first.tolist()):
-            shown = self._shown(step, int(self._asset[twin]), int(control[twin]), state[twin])
-            if isinstance(shown, str):
-                for other in np.flatnonzero((inverse == row) & flying):
-                    failure[other] = shown
+        true_states = self._advance(step, control)
+        # Twins with the same asset, control and state share one observation.
+        code = self._asset_of_twin * len(self._scenario.control) + control
+        code = code * self._states.size + true_states.state_index
+        _, first_twins, group_of_twin = np.unique(
+            np.where(is_flying, code, -1), return_index=True, return_inverse=True
+        )
+        observations = np.full((len(first_twins), self._scenario.observation.count), np.nan)
+        for group, twin in enumerate(first_twins.tolist()):
+            asset = int(self._asset_of_twin[twin])
+            observation = self._observe(step, asset, int(control[twin]), true_states.state[twin])
+            if isinstance(observation, str):
+                for failing_twin in np.flatnonzero((group_of_twin == group) & is_flying):
+                    failure[failing_twin] = observation
             else:
-                distinct[row] = shown
-        sensed, read = self._truth.sense(step, distinct[inverse]), self._truth.inspected(step, state, control)
-        return np.hstack((sensed, read)), state
+                observations[group] = observation
+        sensed = self._truth.sense(step, observations[group_of_twin])
+        inspected = self._truth.inspect(step, true_states.state, control)
+        return np.hstack((sensed, inspected)), true_states.state
 
-    def _grown(self, step: int, control: Index) -> tuple[Index, Float]:
-        """Return the true states: their numbers (B,), zeros where they are scripted, and levels (B, F)."""
+    def _advance(self, step: int, control: Index) -> _TrueStates:
+        """Return the true states of a step: scripted, or drawn given those of the step before."""
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
-            return np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
-        place = self._truth.growth.following(*self._before, self._truth.uniform[step])
-        self._before = control, place
-        return place, self._states.coordinates[place]
+            return _TrueStates(
+                np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
+            )
+        state_index = self._truth.growth.next_states(
+            self._previous_control, self._previous_state_index, self._truth.uniform[step]
+        )
+        self._previous_control = control
+        self._previous_state_index = state_index
+        return _TrueStates(state_index, self._states.coordinates[state_index])
 
-    def _shown(self, step: int, asset: int, control: int, state: Float) -> Float | str:
-        """Return what an asset shows without noise (G,), or why it does not."""
-        key = asset, control, state.tobytes()
-        if key not in self._seen:
-            chosen = self._scenario.control[control]
+    def _observe(self, step: int, asset: int, control_index: int, state: Float) -> Float | str:
+        """Return what an asset shows without noise (G,), SI, or why it shows nothing."""
+        key = (asset, control_index, state.tobytes())
+        if key not in self._observations:
+            control = self._scenario.control[control_index]
             health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
             try:
-                reading = self._assets[asset].step(chosen.values, health)
-                self._seen[key] = checked_values(self._scenario, reading, step, chosen.name)
-            except IN_FLIGHT as error:
-                self._seen[key] = str(error)
-        return self._seen[key]
+                reading = self._assets[asset].step(control.values, health)
+                observation: Float | str = checked_observation(
+                    self._scenario, reading, step, control.name
+                )
+            except FLIGHT_ERRORS as error:
+                observation = str(error)
+            self._observations[key] = observation
+        return self._observations[key]
 
 
-def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> Flights:
-    """Fly B missions of one scenario: in lock-step, or one by one where assets have a memory.
+def fly_side_by_side(
+    knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
+) -> Flights:
+    """Fly B missions of one scenario, step by step together, or one by one if assets have a memory.
 
     Parameters
     ----------
     knowledge : Knowledge
-        What all twins know; the scenario neither learns nor gives notice.
+        What all twins know; the scenario neither learns nor gives notices.
     truths : sequence of Truth
-        One for each twin.
+        The truth of each twin.
     assets : sequence of Asset
-        One for each twin, at its start; one without memory may stand for several twins.
+        The asset of each twin, at its start; twins may share one without memory.
     """
     if not all(isinstance(asset, StatelessAsset) for asset in assets):
-        return fly_one_by_one(knowledge, truths, lambda twin, _sound: assets[twin])
-    scenario, model, count = knowledge.scenario, knowledge.model, len(truths)
-    flights, plants = Flights.empty(knowledge, count), _Stateless(knowledge, truths, assets)
-    control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
-    flying = np.ones(count, dtype=bool)
-    ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
-    budget, on_belief = scenario.planner.inspections_per_step, knowledge.plan.on_belief
-    inspecting = sorted({place for place, *_ in scenario.readings})
-    before: tuple[Float, Index] = model.log_prior, np.array(-1)
-    for step in range(scenario.mission.steps):
-        if step:
-            for twin in np.flatnonzero(flying & ending[before[1]]).tolist():
-                how = decided_to_end(scenario, before[1][twin])
-                flights.ended[twin] = ended_sentence(scenario, step, how)
-                flying[twin] = False
-        observed, state = plants.fly_step(step, control, flying, flights.failure)
-        flying &= np.array(flights.failure) == ""
-        observed[~flying] = np.nan
-        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
-        found, failed = filter_many(model.transition, control[:, None], likelihood[:, None], *before)
-        now, impossible = found[:, 0], failed >= 0
-        for twin in np.flatnonzero(impossible & flying).tolist():
-            worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))
-            flights.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
-        flying &= ~impossible
-        # Of a failed twin: anything that can be gone on with.
-        now.filtered[impossible], now.log_filtered[impossible] = model.prior, model.log_prior
-        for array, row in (
-            (flights.row, observed),
-            (flights.control_index, control),
-            (flights.state, state),
-            (flights.filtered, now.filtered),
-            (flights.log_evidence, now.log_evidence),
-            (flights.unexplained, np.zeros(count)),  # none of these gives notice
-        ):
-            array[flying, step] = row[flying]
-        before = now.log_filtered, control
-        asked = decision_probability(
-            model.transition, now.filtered, control, knowledge.plan.policy, on_belief,
-            ahead=scenario.planner.decide_on == "predicted",
-        )  # fmt: skip
-        control = np.argmax(asked, axis=1)
-        if budget is not None and on_belief is not None:
-            some = np.flatnonzero(flying)
-            control[some] = ration_controls(
-                model.transition, now.filtered[some], before[1][some], control[some], on_belief, inspecting,
-                budget,
-            )  # fmt: skip
-    return flights
+        return fly_one_by_one(knowledge, truths, lambda twin, _previous_ended_well: assets[twin])
+    formation = _Formation(knowledge, truths, assets)
+    for step in range(knowledge.scenario.mission.steps):
+        formation.fly_step(step)
+    return formation.flights
+
+
+class _Formation:
+    """B twins that fly the same step at the same time.
+
+    Attributes
+    ----------
+    flights : Flights
+        What they have flown.
+    """
+
+    def __init__(
+        self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
+    ) -> None:
+        scenario = knowledge.scenario
+        count = len(truths)
+        self.flights = Flights.empty(knowledge, count)
+        self._knowledge = knowledge
+        self._assets = _StatelessAssets(knowledge, truths, assets)
+        first_control = scenario.control_names.index(scenario.mission.first_control)
+        self._control = np.full(count, first_control)
+        self._previous_control: Index = np.array(-1)  # -1: there is no step before
+        self._log_belief: Float = knowledge.model.log_prior
+        self._is_flying = np.ones(count, dtype=bool)
+        self._ends_mission = np.array(
+            [scenario.ends(index) for index in range(len(scenario.control))]
+        )
+        inspecting_controls = {control for control, _state, _name, _deviation in scenario.readings}
+        self._inspecting_controls = sorted(inspecting_controls)
+
+    def fly_step(self, step: int) -> None:
+        """Fly one step of all twins, filter its observations, and decide on the next control."""
+        if step > 0:
+            self._end_missions(step)
+        observed, state = self._assets.fly_step(
+            step, self._control, self._is_flying, self.flights.failure
+        )
+        self._is_flying &= np.array(self.flights.failure) == ""
+        observed[~self._is_flying] = np.nan
+        filtered = self._filter(step, observed)
+        self._store(step, observed, state, filtered)
+        self._log_belief = filtered.log_filtered
+        self._previous_control = self._control
+        self._control = self._decide(filtered.filtered)
+
+    def _end_missions(self, step: int) -> None:
+        """End the missions whose last control was an action that ends them."""
+        ends_now = self._is_flying & self._ends_mission[self._previous_control]
+        for twin in np.flatnonzero(ends_now).tolist():
+            scenario = self._knowledge.scenario
+            reason = sentence_of_ending_action(scenario, self._previous_control[twin])
+            self.flights.ended[twin] = early_end_sentence(scenario, step, reason)
+            self._is_flying[twin] = False
+
+    def _filter(self, step: int, observed: Float) -> Filtered:
+        """Return the filtered beliefs; a twin whose observation is impossible fails."""
+        knowledge = self._knowledge
+        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, self._control)
+        # The filter takes sequences of steps; each twin has a sequence of one.
+        filtered, failed_row = filter_many(
+            knowledge.model.transition,
+            self._control[:, None],
+            likelihood[:, None],
+            self._log_belief,
+            self._previous_control,
+        )
+        only_step = filtered[:, 0]
+        is_impossible = failed_row >= 0
+        for twin in np.flatnonzero(is_impossible & self._is_flying).tolist():
+            worst = knowledge.sensor_model.worst_residuals(observed[twin], int(self._control[twin]))
+            name = knowledge.scenario.mission.name
+            self.flights.failure[twin] = str(ImpossibleObservation(name, step, worst))
+        self._is_flying &= ~is_impossible
+        # A failed twin goes on with the prior, which is never stored.
+        only_step.filtered[is_impossible] = knowledge.model.prior
+        only_step.log_filtered[is_impossible] = knowledge.model.log_prior
+        return only_step
+
+    def _store(self, step: int, observed: Float, state: Float, filtered: Filtered) -> None:
+        """Store a step of the twins that are still flying."""
+        is_flying = self._is_flying
+        flights = self.flights
+        flights.observation_rows[is_flying, step] = observed[is_flying]
+        flights.control_index[is_flying, step] = self._control[is_flying]
+        flights.state[is_flying, step] = state[is_flying]
+        flights.filtered[is_flying, step] = filtered.filtered[is_flying]
+        flights.log_evidence[is_flying, step] = filtered.log_evidence[is_flying]
+        flights.unexplained[is_flying, step] = 0.0  # none of these twins gives notices
+
+    def _decide(self, filtered: Float) -> Index:
+        """Return the next control of each twin (B,), within the budget of inspections."""
+        knowledge = self._knowledge
+        planner = knowledge.scenario.planner
+        policy_on_belief = knowledge.plan.on_belief
+        probability = decision_probability(
+            knowledge.model.transition,
+            filtered,
+            self._previous_control,
+            knowledge.plan.policy,
+            policy_on_belief,
+            ahead=planner.decide_on == "predicted",
+        )
+        control = np.argmax(probability, axis=1)
+        if planner.inspections_per_step is not None and policy_on_belief is not None:
+            flying = np.flatnonzero(self._is_flying)
+            control[flying] = ration_controls(
+                knowledge.model.transition,
+                filtered[flying],
+                self._previous_control[flying],
+                control[flying],
+                policy_on_belief,
+                self._inspecting_controls,
+                planner.inspections_per_step,
+            )
+        return np.asarray(control)
 
 
 def fly_one_by_one(
@@ -215,25 +348,28 @@ def fly_one_by_one(
 ) -> Flights:
     """Fly B missions one after the other with `fly`.
 
-    Assets with a memory need it, and twins that learn or give notice.
+    This is needed for assets with a memory, and for twins that learn or give notices.
 
     Parameters
     ----------
-    knowledge, truths
-        As of `fly_side_by_side`.
+    knowledge : Knowledge
+        What all twins know.
+    truths : sequence of Truth
+        The truth of each twin.
     asset_of : callable
-        Returns the asset of a twin at its start, once its flight begins; told whether the flight before it
-        went to its end.
+        Returns the asset of a twin at its start. It takes the number of the twin, and whether the
+        flight before it went to its end.
     """
-    flights, sound = Flights.empty(knowledge, len(truths)), True
+    flights = Flights.empty(knowledge, len(truths))
+    previous_ended_well = True
     for number, truth in enumerate(truths):
         twin = knowledge.twin()
         history = History(twin, knowledge.scenario.observation.count)
         try:
-            asset = asset_of(number, sound)
+            asset = asset_of(number, previous_ended_well)
             fly(knowledge.scenario, twin, knowledge.plant(truth, asset), history=history)
-        except IN_FLIGHT as error:
+        except FLIGHT_ERRORS as error:
             flights.failure[number] = str(error)
-        flights.put(number, history)
-        sound = not flights.failure[number] and not history.ended
+        flights.store_history(number, history)
+        previous_ended_well = not flights.failure[number] and not history.ended
     return flights

@@ -1,4 +1,4 @@
-"""A step, from its observation to its decision; and what really happens: damage, noise, faults, the asset."""
+"""The steps of a mission, and what really happens in them: damage, noise, faults, the asset."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
-from twin_master.errors import MissionInputError, TwinMasterError, said
+from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin, TwinStep
@@ -22,17 +22,17 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 
-class Happened(NamedTuple):
-    """What really happened in a step, for store and journal; never for the twin.
+class GroundTruth(NamedTuple):
+    """What really happened in a step: for store and journal, never for the twin.
 
     Attributes
     ----------
-    state : (F,)
-        True state, SI.
-    observation : (G,)
-        Noise-free observation, SI.
+    state : (F,) array
+        The true value of each state factor, SI.
+    observation : (G,) array
+        The observation without noise, SI.
     monitors : dict of str to float
-        Figures that the asset reported of itself.
+        The figures that the asset reports of itself, such as an error bound.
     """
 
     state: Float
@@ -42,83 +42,89 @@ class Happened(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """An observation that is to be assimilated.
+    """An observation that the twin is to assimilate.
 
     Attributes
     ----------
-    observed : (G + I,)
-        What the sensors said and inspections read, SI; NaN where nothing was received.
+    observed : (G + I,) array
+        The values of G sensors and I inspections, SI; NaN where nothing was received.
     control : int or None
-        Index of the control in force; None is the one that was proposed.
+        The index of the control in force; None is the one that the twin proposed.
     revises : int or None
-        The earlier step that it belongs to; None is the next step.
+        The earlier step that the observation belongs to; None is the next step.
     unreadable : dict of int to str
-        What came in the place of a reading, by the index of the sensor.
-    happened : Happened or None
-        Of a simulated asset.
+        What a sensor sent if it was not a number, by the index of the sensor.
+    ground_truth : GroundTruth or None
+        What really happened in the step; None for a real asset.
     """
 
     observed: Float
     control: int | None = None
     revises: int | None = None
     unreadable: Mapping[int, str] = field(default_factory=dict)
-    happened: Happened | None = None
+    ground_truth: GroundTruth | None = None
 
 
 @dataclass(frozen=True)
 class MissionStep:
-    """A step.
+    """A step of a mission or a watch.
 
     Attributes
     ----------
     reading : Reading
-        What came.
-    concluded : TwinStep
-        What the twin made of it.
+        The observation of the step.
+    twin_step : TwinStep
+        The estimate and the decision of the twin.
     seconds : tuple of float
-        On the clock: of the source, of the twin, and of those that kept it.
+        The wall-clock time of the source, of the twin, and of storing the step.
     """
 
     reading: Reading
-    concluded: TwinStep
+    twin_step: TwinStep
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class _Column:
-    """What the steps say under a name, as an array with a leading axis of the steps."""
+class _StackedAttribute:
+    """An attribute of all steps of a `History`, stacked along the first axis of an array."""
 
-    def __init__(self, name: str) -> None:
-        self._of = attrgetter(name)
+    def __init__(self, path: str) -> None:
+        self._attribute_of = attrgetter(path)
 
     def __get__(self, history: "History", _owner: type) -> NDArray[Any]:
-        return np.array([self._of(step) for step in history.steps])
+        return np.array([self._attribute_of(step) for step in history.steps])
 
 
 @dataclass
 class History:
-    """The steps of one twin, T of them, in their order.
+    """The steps of one twin in their order.
+
+    T is the number of steps, G that of sensors, I that of values after them in a row.
 
     Attributes
     ----------
     twin : Twin
-        It has kept all of them where they are to be smoothed.
+        The twin; it must keep all steps if they are to be smoothed.
     sensors : int
-        Values of a row that are observed; behind them stand readings of inspections, or a covariance.
+        The number of sensors G; after their values, a row holds the I readings of inspections, or
+        the covariance of identified modes.
     steps : list of MissionStep
+        The steps.
     notices : list of (int, Notice)
-        What the operator was told, and in which step.
+        The notices to the operator, each with the number of its step.
     resumed_at : int
-        Steps that an earlier process flew.
+        The number of steps that an earlier process flew.
     ended : str
-        How the asset ended the mission before its last step; empty where it did not.
-    row : (T, G + I)
-        All that came; `observed` and `readings` are its two parts, NaN where nothing was received.
+        How the asset ended the mission before its last step; empty if it did not.
+    observation_rows : (T, G + I) array
+        All observed values, NaN where nothing was received; `observed` and `readings` are its
+        parts.
     control_index, log_evidence, filtered, predicted, decision_probability, unexplained : (T, ...)
-        As in `TwinStep`.
-    state, observation : (T, ...)
-        As in `Happened`; of a simulated asset only.
-    seconds : (T, 3)
-        As in `MissionStep`.
+    array
+        The attributes of `TwinStep`.
+    state, observation : (T, ...) array
+        The attributes of `GroundTruth`; only for a simulated asset.
+    seconds : (T, 3) array
+        The times of `MissionStep`.
     """
 
     twin: Twin
@@ -128,73 +134,86 @@ class History:
     resumed_at: int = 0
     ended: str = ""
 
-    row = _Column("reading.observed")
-    control_index = _Column("concluded.control_index")
-    filtered = _Column("concluded.filtered")
-    log_evidence = _Column("concluded.log_evidence")
-    predicted = _Column("concluded.prediction.predicted")
-    decision_probability = _Column("concluded.decision_probability")
-    unexplained = _Column("concluded.unexplained")
-    state = _Column("reading.happened.state")
-    observation = _Column("reading.happened.observation")
-    seconds = _Column("seconds")
+    observation_rows = _StackedAttribute("reading.observed")
+    control_index = _StackedAttribute("twin_step.control_index")
+    filtered = _StackedAttribute("twin_step.filtered")
+    log_evidence = _StackedAttribute("twin_step.log_evidence")
+    predicted = _StackedAttribute("twin_step.prediction.predicted")
+    decision_probability = _StackedAttribute("twin_step.decision_probability")
+    unexplained = _StackedAttribute("twin_step.unexplained")
+    state = _StackedAttribute("reading.ground_truth.state")
+    observation = _StackedAttribute("reading.ground_truth.observation")
+    seconds = _StackedAttribute("seconds")
 
     def add(self, step: MissionStep) -> None:
-        """Take in a step, without what follows from the rest of it."""
-        prediction = replace(step.concluded.prediction, joint=np.empty(0))
-        self.steps.append(replace(step, concluded=replace(step.concluded, prediction=prediction)))
-        self.notices += [(step.concluded.step, notice) for notice in step.concluded.notices]
+        """Append a step and its notices.
 
-    def behind(self, skipped: int) -> "History":
-        """Return the steps behind the first `skipped`; the notices stay those of all."""
-        return replace(self, steps=self.steps[skipped:])
+        The joint prediction of states and controls is dropped: it is large, and it follows from the
+        rest of the step.
+        """
+        prediction = replace(step.twin_step.prediction, joint=np.empty(0))
+        twin_step = replace(step.twin_step, prediction=prediction)
+        self.steps.append(replace(step, twin_step=twin_step))
+        for notice in twin_step.notices:
+            self.notices.append((twin_step.step, notice))
+
+    def without_first(self, count: int) -> "History":
+        """Return a copy without the first `count` steps; it has the notices of all steps."""
+        return replace(self, steps=self.steps[count:])
 
     @property
     def first_step(self) -> int:
-        """Number of the first step."""
-        return self.steps[0].concluded.step if self.steps else 0
+        """The number of the first step."""
+        return self.steps[0].twin_step.step if self.steps else 0
 
     @property
     def observed(self) -> Float:
-        """What the sensors said (T, G)."""
-        return self.row[:, : self.sensors]
+        """The values of the sensors (T, G), NaN where nothing was received."""
+        return self.observation_rows[:, : self.sensors]
 
     @property
     def readings(self) -> Float:
-        """What came behind it (T, I)."""
-        return self.row[:, self.sensors :]
+        """The values after those of the sensors (T, I): of inspections, or a covariance."""
+        return self.observation_rows[:, self.sensors :]
 
     @property
     def simulated(self) -> bool:
         """Whether it is known what really happened."""
-        return bool(self.steps) and self.steps[0].reading.happened is not None
+        return bool(self.steps) and self.steps[0].reading.ground_truth is not None
 
     @property
     def monitors(self) -> dict[str, Float]:
-        """Figures that the asset reported of itself (T,)."""
-        told = [step.reading.happened.monitors for step in self.steps if step.reading.happened is not None]
-        return {name: np.array([monitors[name] for monitors in told]) for name in (told[-1] if told else ())}
+        """The figures that the asset reports of itself, each as an array (T,)."""
+        records = []
+        for step in self.steps:
+            if step.reading.ground_truth is not None:
+                records.append(step.reading.ground_truth.monitors)
+        if not records:
+            return {}
+        return {name: np.array([record[name] for record in records]) for name in records[-1]}
 
     @cached_property
     def smoothed(self) -> Float:
-        """p(D_k | all observations) (T, S)."""
+        """The belief p(D_k | all observations) in each step (T, S)."""
         return self.twin.smoothed()[-len(self.steps) :]
 
     @property
     def suspicion(self) -> tuple[Suspicion, ...]:
-        """How well the model explained the sensors, where that is watched."""
-        found = (step.concluded.suspicion for step in self.steps)
-        return tuple(suspicion for suspicion in found if suspicion is not None)
+        """How well the model explained the sensors in each step; empty if that is not watched."""
+        suspicions = (step.twin_step.suspicion for step in self.steps)
+        return tuple(suspicion for suspicion in suspicions if suspicion is not None)
 
     @property
     def learnt_names(self) -> tuple[str, ...]:
-        """What is learnt."""
-        return tuple(self.steps[-1].concluded.learnt) if self.steps else ()
+        """The names of the quantities that the twin learns."""
+        return tuple(self.steps[-1].twin_step.learnt) if self.steps else ()
 
     @property
     def learnt(self) -> Float:
-        """The figures of each posterior (T, N, 4)."""
-        figures = [[one.figures for one in step.concluded.learnt.values()] for step in self.steps]
+        """The posterior of N learnt quantities in each step (T, N, 4), see `Learnt.figures`."""
+        figures = []
+        for step in self.steps:
+            figures.append([posterior.figures for posterior in step.twin_step.learnt.values()])
         return np.array(figures).reshape(len(self.steps), len(self.learnt_names), 4)
 
 
@@ -209,239 +228,340 @@ class SensorStatus(IntEnum):
 class Truth:
     """Damage history, sensor noise and sensor faults of one mission.
 
-    All random numbers are drawn when it is made, so that a resumed mission meets the same ones.
+    All random numbers are drawn at construction, so that a resumed mission meets the same ones.
 
     Parameters
     ----------
     scenario : Scenario
         What happens.
     model : GraphicalModel
-        States and transitions; random growth follows them, as the twin believes.
+        The states, and the transitions that random growth of damage follows.
     seed : int
-        Seed of the run.
+        The seed of the mission.
 
     Attributes
     ----------
-    noise : (T, G)
-        Noise added to the raw observation, in its SI unit.
-    drift : (T, G)
-        Drift added to the raw observation, in its SI unit.
-    status : (T, G)
-        `SensorStatus` of each sensor.
-    reading_noise : (T, I)
-        Noise added to the readings of inspections, SI.
-    uniform : (T,)
-        What drives random growth; zeros where damage is scripted.
+    noise : (T, G) array
+        The noise added to the observation of each step and sensor, SI.
+    drift : (T, G) array
+        The drift added to it, SI.
+    status : (T, G) array
+        The `SensorStatus` of each sensor.
+    reading_noise : (T, I) array
+        The noise added to the readings of inspections, SI.
+    uniform : (T,) array
+        The uniform random numbers that drive random growth; zeros if damage is scripted.
     growth : DamageGrowth
-        How damage grows that does so at random.
+        How damage grows at random.
     in_asset : bool
-        Whether the asset carries damage, noise and faults; then all of the above is zero, and the asset
-        tells what happened.
+        Whether the asset itself carries damage, noise and faults. Then the arrays above are zero,
+        and the asset reports what happened.
     """
 
     def __init__(self, scenario: Scenario, model: GraphicalModel, seed: int) -> None:
-        steps, sensors = scenario.mission.steps, scenario.observation.count
-        deviation = np.asarray(scenario.truth.noise.standard_deviation)  # one, or one for each sensor
+        steps = scenario.mission.steps
+        sensors = scenario.observation.count
+        deviation = np.asarray(scenario.truth.noise.standard_deviation)  # () or (G,)
         self.noise: Float = generator(seed, "noise").standard_normal((steps, sensors)) * deviation
         self.drift: Float = np.zeros((steps, sensors))
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
         self._apply_faults(scenario)
-        self._readings = scenario.readings
-        drawn = generator(seed, "inspection").standard_normal((steps, len(self._readings)))
-        self.reading_noise: Float = drawn * [deviation for *_, deviation in self._readings]
+        self._inspections = scenario.readings
+        standard_noise = generator(seed, "inspection").standard_normal(
+            (steps, len(self._inspections))
+        )
+        deviations = [deviation for _control, _state, _name, deviation in self._inspections]
+        self.reading_noise: Float = standard_noise * deviations
         self.in_asset = scenario.truth.kind == "asset"
-        self._scripted = scenario.scripted_history() if scenario.truth.kind == "scripted" else None
-        grows = scenario.truth.kind == "random_growth"
-        self.uniform: Float = generator(seed, "damage").random(steps) if grows else np.zeros(steps)
-        self._states, self.growth = model.states, DamageGrowth(model)
+        is_scripted = scenario.truth.kind == "scripted"
+        self._scripted_states = scenario.scripted_history() if is_scripted else None
+        grows_at_random = scenario.truth.kind == "random_growth"
+        damage_generator = generator(seed, "damage")
+        self.uniform: Float = damage_generator.random(steps) if grows_at_random else np.zeros(steps)
+        self._states = model.states
+        self.growth = DamageGrowth(model)
 
     def _apply_faults(self, scenario: Scenario) -> None:
+        """Put the scenario's sensor faults into `status` and `drift`."""
         steps = np.arange(scenario.mission.steps)
         for fault in scenario.truth.sensor_faults:
-            last = fault.last_step if fault.last_step is not None else scenario.mission.steps
-            active = (steps >= fault.first_step) & (steps <= last)
-            cells = np.ix_(active, np.array(fault.sensor_indices(scenario.observation.count)))
+            last_step = fault.last_step if fault.last_step is not None else scenario.mission.steps
+            is_active = (steps >= fault.first_step) & (steps <= last_step)
+            sensors = np.array(fault.sensor_indices(scenario.observation.count))
+            cells = np.ix_(is_active, sensors)
             if fault.kind == "dropout":
                 self.status[cells] = SensorStatus.LOST
             else:
                 assert fault.rate is not None  # the schema asks for it
-                self.drift[cells] += (fault.rate * (steps[active] - fault.first_step + 1.0))[:, None]
-                lost = self.status[cells] == SensorStatus.LOST
-                self.status[cells] = np.where(lost, SensorStatus.LOST, SensorStatus.DRIFTING)
+                steps_of_drift = steps[is_active] - fault.first_step + 1.0
+                self.drift[cells] += (fault.rate * steps_of_drift)[:, None]
+                is_lost = self.status[cells] == SensorStatus.LOST
+                self.status[cells] = np.where(is_lost, SensorStatus.LOST, SensorStatus.DRIFTING)
 
     def state(self, step: int, previous_state: Float | None, previous_control: int | None) -> Float:
-        """Return the true state of a step: (F,), a value of each state factor in SI.
+        """Return the true state of a step.
 
         Parameters
         ----------
-        step
+        step : int
             The step, from 0.
-        previous_state, previous_control
-            State and control index of the step before; None at step 0.
+        previous_state : (F,) array or None
+            The state of the step before; None at step 0.
+        previous_control : int or None
+            The index of the control of the step before; None at step 0.
+
+        Returns
+        -------
+        (F,) array
+            The value of each state factor, SI.
         """
-        if self._scripted is not None:
-            return np.array(self._scripted[step])
-        before = None if previous_state is None else np.array([self._states.index(tuple(previous_state))])
-        control = None if previous_control is None else np.array([previous_control])
-        place = self.growth.following(control, before, self.uniform[[step]])
-        return np.asarray(self._states.coordinates[place][0])
+        if self._scripted_states is not None:
+            return np.array(self._scripted_states[step])
+        previous_indices = controls = None
+        if previous_state is not None:
+            previous_indices = np.array([self._states.index(tuple(previous_state))])
+        if previous_control is not None:
+            controls = np.array([previous_control])
+        state_index = self.growth.next_states(controls, previous_indices, self.uniform[[step]])
+        return np.asarray(self._states.coordinates[state_index][0])
 
     @classmethod
-    def together(cls, truths: Sequence["Truth"]) -> "Truth":
-        """Return the truths of B missions of one scenario as one, which senses and inspects for all."""
-        joint = copy(truths[0])  # script, drift and losses are the scenario's, the same for all
+    def stack(cls, truths: Sequence["Truth"]) -> "Truth":
+        """Return one truth for B missions of one scenario.
+
+        Its random numbers have the shape (T, B, ...). Script, drift and losses are those of the
+        scenario, the same in all missions.
+        """
+        stacked = copy(truths[0])  # its script, drift and losses are those of all
         for name in ("noise", "uniform", "reading_noise"):
-            setattr(joint, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
-        return joint
+            setattr(stacked, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
+        return stacked
 
     def sense(self, step: int, observation: Float) -> Float:
-        """Return what sensors say about an observation (..., G): noise and drift added, lost ones NaN."""
+        """Return an observation (..., G) with noise and drift, and NaN for lost sensors."""
         sensed: Float = observation + self.noise[step] + self.drift[step]
         sensed[..., self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
 
-    def inspected(self, step: int, state: Float, control: Index | int) -> Float:
-        """Return the readings of inspections (..., I), SI, NaN where the control asks for none."""
-        read = [np.where(control == at, state[..., place], np.nan) for at, place, *_ in self._readings]
-        shape = len(read), *state.shape[:-1]
-        return np.asarray(np.moveaxis(np.reshape(read, shape), 0, -1) + self.reading_noise[step])
+    def inspect(self, step: int, state: Float, control: Index | int) -> Float:
+        """Return the readings of inspections in a step.
+
+        Parameters
+        ----------
+        step : int
+            The step, from 0.
+        state : (..., F) array
+            The true states, SI.
+        control : int or (...) array of int
+            The indices of the controls in force.
+
+        Returns
+        -------
+        (..., I) array
+            The readings with noise, SI; NaN if the control does not ask for the inspection.
+        """
+        columns = []
+        for inspecting_control, factor, _name, _deviation in self._inspections:
+            is_asked_for = control == inspecting_control
+            columns.append(np.where(is_asked_for, state[..., factor], np.nan))
+        # The shape is given because there may be no inspections.
+        by_inspection = np.reshape(columns, (len(columns), *state.shape[:-1]))
+        return np.asarray(np.moveaxis(by_inspection, 0, -1) + self.reading_noise[step])
+
+
+class _NextStates(NamedTuple):
+    """The states that may follow a state under a control, and their cumulative probability."""
+
+    cumulative_probability: Float
+    state_indices: Index
 
 
 class DamageGrowth:
-    """Damage that follows the prior and the transitions of a model, driven by uniform numbers."""
+    """Damage that follows the prior and the transitions of a model."""
 
     def __init__(self, model: GraphicalModel) -> None:
         self._model = model
-        self._rows: dict[tuple[int, int] | None, tuple[Float, Index]] = {}
+        self._initial = _possible_states(model.prior)
+        self._next_states: dict[tuple[int, int], _NextStates] = {}
 
-    def following(self, control: Index | None, index: Index | None, uniform: Float) -> Index:
-        """Return the indices (B,) of the states that follow states (B,) under controls (B,).
+    def next_states(self, control: Index | None, state: Index | None, uniform: Float) -> Index:
+        """Return the indices (B,) of the states that follow states under controls.
 
-        Both are None at the first step.
+        Parameters
+        ----------
+        control : (B,) array or None
+            The indices of the controls; None at the first step, which is drawn from the prior.
+        state : (B,) array or None
+            The indices of the states; None at the first step.
+        uniform : (B,) array
+            The random numbers, uniform in [0, 1).
         """
-        if control is None or index is None:
-            return self._reached(None, uniform)
-        result, code = np.empty_like(index), control * self._model.states.size + index
+        if control is None or state is None:
+            return _draw(self._initial, uniform)
+        next_states = np.empty_like(state)
+        # Missions with the same control in the same state are drawn at once.
+        code = control * self._model.states.size + state
         for number in np.unique(code).tolist():
-            chosen = code == number
-            result[chosen] = self._reached(divmod(number, self._model.states.size), uniform[chosen])
-        return result
+            has_code = code == number
+            next_states[has_code] = _draw(self._states_after(number), uniform[has_code])
+        return next_states
 
-    def _reached(self, key: tuple[int, int] | None, uniform: Float) -> Index:
-        if key not in self._rows:
-            row = self._model.prior if key is None else self._model.transition.row(*key)
-            possible = np.flatnonzero(row > 0.0)
-            self._rows[key] = np.cumsum(row[possible]), possible
-        reached, possible = self._rows[key]
-        place = np.searchsorted(reached, uniform, side="right").clip(max=len(possible) - 1)
-        return np.asarray(possible[place])
+    def _states_after(self, code: int) -> _NextStates:
+        """Return what may follow a control and a state, given as control * S + state."""
+        control, state = divmod(code, self._model.states.size)
+        if (control, state) not in self._next_states:
+            probability = self._model.transition.row(control, state)
+            self._next_states[control, state] = _possible_states(probability)
+        return self._next_states[control, state]
 
 
-def checked_values(scenario: Scenario, reading: AssetReading, step: int, control: str) -> Float:
-    """Return the observation (G,) of a reading.
+def _possible_states(probability: Float) -> _NextStates:
+    """Return the states of positive probability (S,) with their cumulative probability."""
+    possible = np.flatnonzero(probability > 0.0)
+    return _NextStates(np.cumsum(probability[possible]), possible)
+
+
+def _draw(states: _NextStates, uniform: Float) -> Index:
+    """Return a state for each uniform random number, by inverse transform sampling."""
+    # Rounding may leave the last cumulative probability a little below one.
+    last = len(states.state_indices) - 1
+    position = np.searchsorted(states.cumulative_probability, uniform, side="right").clip(max=last)
+    return np.asarray(states.state_indices[position])
+
+
+def checked_observation(
+    scenario: Scenario, reading: AssetReading, step: int, control: str
+) -> Float:
+    """Return the observation (G,) that an asset gave in a step, SI.
 
     Raises
     ------
     MissionInputError
-        It has another number of values, or one that is not finite.
+        If the number of values is wrong, or a value is not finite.
     """
     values = np.asarray(reading.values, dtype=np.float64)
-    if values.shape != (scenario.observation.count,):
-        came, wanted = str(values.shape), scenario.observation
-        raise MissionInputError(said("mission.width", step=step, wanted=wanted, came=came))
+    expected = scenario.observation
+    if values.shape != (expected.count,):
+        raise MissionInputError(
+            f"step {step}: the scenario expects {expected.count} values of `{expected.role}` and "
+            f"the asset returned {values.shape}"
+        )
     if not np.all(np.isfinite(values)):
-        bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
-        what = f"`{scenario.observation.role}` {bad} under the control `{control}`"
-        raise MissionInputError(said("mission.no_number", step=step, what=what))
+        numbers = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
+        raise MissionInputError(
+            f"step {step}: the asset returned NaN or an infinity for `{expected.role}` {numbers} "
+            f"under the control `{control}`; the run stops here and can be resumed"
+        )
     return values
 
 
-def decided_to_end(scenario: Scenario, control_index: int) -> str:
-    """Return that an action has ended a mission."""
+def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
+    """Return the sentence that an action of the twin has ended the mission."""
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 
 class Plant:
-    """An asset, driven by its truth, and flown under the controls that a twin proposes.
+    """A simulated asset, driven by its truth and flown under the controls that the twin proposes.
 
     Parameters
     ----------
     scenario : Scenario
+        What is flown.
     truth : Truth
+        Damage, noise and faults.
     asset : Asset
-        At its start.
+        The asset at its start.
 
     Attributes
     ----------
     step : int
-        Steps flown.
+        The number of steps flown.
     ended : str
-        How the asset ended the mission before its last step; empty where it did not.
+        How the mission ended before its last step; empty if it did not.
     """
 
     def __init__(self, scenario: Scenario, truth: Truth, asset: Asset) -> None:
-        self._scenario, self._truth, self._asset = scenario, truth, asset
+        self._scenario = scenario
+        self._truth = truth
+        self._asset = asset
         self._state: Float | None = None
-        self.step, self.ended = 0, ""
+        self.step = 0
+        self.ended = ""
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return what comes of the next step, see `Source`; None at the end of the mission."""
+        """Fly the next step and return its observation; None at the end of the mission.
+
+        This is `Source.read` of a simulated asset.
+        """
         if twin.steps == self._scenario.mission.steps:
             return None
-        before = twin.control_of(twin.steps - 1) if twin.steps else None
-        if before is not None and self._scenario.ends(before):
-            self.ended = decided_to_end(self._scenario, before)
+        previous_control = twin.control_of(twin.steps - 1) if twin.steps else None
+        if previous_control is not None and self._scenario.ends(previous_control):
+            self.ended = sentence_of_ending_action(self._scenario, previous_control)
             return None
         try:
-            return self.fly_step(twin.proposed_control, before)
+            return self.fly_step(twin.proposed_control, previous_control)
         except FmuEndedError as error:
-            if not twin.steps:
+            if twin.steps == 0:
                 raise
             self.ended = error.sentence
             return None
 
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Refuse to go on: what is simulated was observed, whatever the twin believes."""
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Raise the error: a simulated asset showed the reading, whatever the twin believes."""
         raise error
 
     def fly_step(self, control_index: int, previous_control_index: int | None) -> Reading:
-        """Fly one step.
+        """Fly one step and return its observation.
 
         Parameters
         ----------
-        control_index
-            Control in force.
-        previous_control_index
-            Control of the step before; None in the first one.
+        control_index : int
+            The index of the control in force.
+        previous_control_index : int or None
+            That of the step before; None in the first step.
 
         Raises
         ------
         MissionInputError
-            The asset returned something that is no observation.
+            If the asset returns something that is not an observation.
         """
         control = self._scenario.control[control_index]
         if self._truth.in_asset:
             reading = self._asset.step(control.values, {})
-            if reading.state is None:
-                raise MissionInputError(said("mission.no_damage", step=self.step))
-            state = np.array([reading.state[name] for name in self._scenario.state_names])
+            state = self._state_in_asset(reading)
         else:
             state = self._truth.state(self.step, self._state, previous_control_index)
             health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
             reading = self._asset.step(control.values, health)
-        values = checked_values(self._scenario, reading, self.step, control.name)
-        sensed = self._truth.sense(self.step, values) if reading.sensed is None else reading.sensed
-        inspected = self._truth.inspected(self.step, state, control_index)
-        self._state, self.step = state, self.step + 1
+        observation = checked_observation(self._scenario, reading, self.step, control.name)
+        sensed = reading.sensed
+        if sensed is None:
+            sensed = self._truth.sense(self.step, observation)
+        inspected = self._truth.inspect(self.step, state, control_index)
+        self._state = state
+        self.step += 1
         monitors = {name: float(value) for name, value in reading.monitors.items()}
-        happened = Happened(state, values, monitors)
-        return Reading(np.concatenate((sensed, inspected)), control_index, happened=happened)
+        return Reading(
+            np.concatenate((sensed, inspected)),
+            control_index,
+            ground_truth=GroundTruth(state, observation, monitors),
+        )
+
+    def _state_in_asset(self, reading: AssetReading) -> Float:
+        """Return the true state (F,) that an asset with damage of its own reports."""
+        if reading.state is None:
+            raise MissionInputError(
+                f"step {self.step}: the asset does not tell its damage, which `truth` asks of it"
+            )
+        return np.array([reading.state[name] for name in self._scenario.state_names])
 
     def save_state(self) -> bytes:
         """Return the state of the asset as bytes."""
         return self._asset.save_state()
 
     def restore(self, flown: History, asset_state: bytes) -> None:
-        """Continue behind steps that were flown, and from a saved state of the asset."""
-        self.step, self._state = len(flown.steps), flown.state[-1]
+        """Continue after the steps of a history, from the state that the asset had then."""
+        self.step = len(flown.steps)
+        self._state = flown.state[-1]
         self._asset.restore_state(asset_state)

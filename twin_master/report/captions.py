@@ -121,7 +121,7 @@ def caption_learnt(run: Run, figure: Figure) -> ReportFigure:
         "and as a blue band their prior."
     )
     truth_sentence = "The truth is that of the simulated asset; the twin does not know it."
-    has_sensors = any(quantity.of_sensors for quantity in run.learnt_quantities)
+    has_sensors = any(quantity.is_per_sensor for quantity in run.learnt_quantities)
     has_truth = any(quantity.truth is not None for quantity in run.learnt_quantities)
     return WORDS.figure(
         "learnt",

@@ -54,12 +54,12 @@ def learnt_figure(run: Run) -> Figure:
 
 def quantities_of_asset(run: Run) -> list[LearntQuantity]:
     """Return the learnt quantities of the whole asset."""
-    return [quantity for quantity in run.learnt_quantities if not quantity.of_sensors]
+    return [quantity for quantity in run.learnt_quantities if not quantity.is_per_sensor]
 
 
 def quantities_of_sensors(run: Run) -> list[LearntQuantity]:
     """Return the learnt quantities of which each sensor has its own."""
-    return [quantity for quantity in run.learnt_quantities if quantity.of_sensors]
+    return [quantity for quantity in run.learnt_quantities if quantity.is_per_sensor]
 
 
 def _draw_asset_quantities(
@@ -68,7 +68,7 @@ def _draw_asset_quantities(
     """Draw quantities of the whole asset, two in a row; the last of an odd number fills its row."""
     panels = [axes for row in grid for axes in row]
     for axes, quantity in zip(panels, quantities, strict=False):
-        course = moments_of(quantity.course)
+        course = moments_of(quantity.posterior)
         _draw_course(axes, run, course, moments_of(quantity.prior), quantity.truth)
         style.panel_label(axes, next(labels), quantity.label)
     if len(quantities) % 2:
@@ -82,14 +82,14 @@ def _draw_asset_quantities(
 
 def _most_departed_sensor(quantity: LearntQuantity) -> int:
     """Return the sensor whose last mean departs most from its prior, in standard deviations."""
-    last = moments_of(quantity.course[-1])
+    last = moments_of(quantity.posterior[-1])
     prior = moments_of(quantity.prior)
     return int(np.nanargmax(np.abs(last.mean - prior.mean) / last.standard_deviation))
 
 
 def _draw_sensors_over_steps(axes: Axes, run: Run, quantity: LearntQuantity, sensor: int) -> None:
     """Draw a quantity of one sensor with its band, and the means of the other sensors in grey."""
-    means = moments_of(quantity.course).mean  # (T, G)
+    means = moments_of(quantity.posterior).mean  # (T, G)
     axes.plot(
         run.step_numbers,
         np.delete(means, sensor, axis=1),
@@ -98,7 +98,7 @@ def _draw_sensors_over_steps(axes: Axes, run: Run, quantity: LearntQuantity, sen
         alpha=0.8,
         label=f"other {run.sensors.word}s",
     )
-    course = moments_of(quantity.course[:, sensor])
+    course = moments_of(quantity.posterior[:, sensor])
     prior = moments_of(quantity.prior[sensor])
     truth = None if quantity.truth is None else quantity.truth[sensor]
     _draw_course(axes, run, course, prior, truth)
@@ -169,7 +169,7 @@ def _draw_last_step(
         alpha=0.12,
         linewidth=0,
     )
-    last = moments_of(quantity.course[-1])
+    last = moments_of(quantity.posterior[-1])
     for sensor, number in enumerate(sensor_numbers):
         style.interval(
             axes,
@@ -221,6 +221,6 @@ def sensor_rows(run: Run) -> list[list[str]]:
         return []
     rows = []
     for sensor, title in enumerate(run.sensors.titles):
-        values = [mean_and_interval(quantity.course[-1, sensor]) for quantity in quantities]
+        values = [mean_and_interval(quantity.posterior[-1, sensor]) for quantity in quantities]
         rows.append([title, *values])
     return rows

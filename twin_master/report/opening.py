@@ -211,7 +211,7 @@ def _state_estimate(run: Run, index: int) -> str:
 
 def _parameter_clause(quantity: LearntQuantity) -> str:
     """Return what was learnt of the calibrated parameter: mean, two deviations, and the truth."""
-    last = moments_of(quantity.course[-1])
+    last = moments_of(quantity.posterior[-1])
     mean = float(last.mean)
     two_deviations = 2 * float(last.standard_deviation)
     values = f"{mean:.3f} ({mean - two_deviations:.3f} to {mean + two_deviations:.3f}"

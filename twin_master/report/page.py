@@ -24,7 +24,7 @@ from twin_master.report.mission import default_now, mission_figure
 from twin_master.report.opening import opening_sentences
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
-from twin_master.store.summary import another_truth
+from twin_master.store.summary import truth_mismatch
 from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
@@ -284,7 +284,7 @@ def _true_parameter_sentence(run: Run) -> str:
     if truth is None or is_learnt:
         return ""
     mean, deviation = calibrated_moments(run)
-    return another_truth(parameter, truth, mean, deviation) or ""
+    return truth_mismatch(parameter, truth, mean, deviation) or ""
 
 
 def _add_calibration(page: Page, run: Run) -> None:

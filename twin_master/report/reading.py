@@ -22,9 +22,9 @@ from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
     MOMENTS,
     LearntQuantity,
-    paths_of,
-    printed_learnt,
-    titles_of,
+    printed_unit_of_quantity,
+    quantity_titles,
+    variable_paths,
 )
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
@@ -309,15 +309,15 @@ class Run:
 
     def _learnt_quantity(self, name: str, stored_unit: str) -> LearntQuantity:
         """Return a learnt quantity by its name in the store, in printed units."""
-        scale, unit = printed_learnt(name, stored_unit, self.scenario)
+        scale, unit = printed_unit_of_quantity(name, stored_unit, self.scenario)
         course = [self[f"learnt/{name}_{moment}"] for moment in MOMENTS]
         prior = [self[f"learnt/{name}_prior_{moment}"] for moment in MOMENTS]
         truth = self.get(f"truth/{name}")
         return LearntQuantity(
             name=name,
-            title=titles_of(name)[1],
+            title=quantity_titles(name)[1],
             unit=_short_unit(unit),
-            course=scale * np.stack(course, axis=-1),
+            posterior=scale * np.stack(course, axis=-1),
             prior=scale * np.stack(prior, axis=-1),
             truth=None if truth is None else scale * truth,
         )
@@ -356,7 +356,7 @@ def read_run(folder: Path) -> Run:
     ):
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
     run = Run(tree, scenario, config, summary, calibration)
-    for path in paths_of(scenario.observation.role):
+    for path in variable_paths(scenario.observation.role):
         if run.get(path) is None:
             raise RunFolderError(
                 f"{RUN_NAME} does not have the layout of a run of this version "

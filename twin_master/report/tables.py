@@ -106,7 +106,7 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
 def _learnt_row(quantity: LearntQuantity) -> list[str]:
     """Return title, prior and last posterior of a learnt quantity as cells."""
     prior = moments_of(quantity.prior)
-    last = moments_of(quantity.course[-1])
+    last = moments_of(quantity.posterior[-1])
     return [
         quantity.label,
         number(float(prior.mean)),

@@ -1,191 +1,315 @@
-"""Everything that a mission made, before it is stored, and what its twin has learnt."""
+"""Everything that a mission yields, before it is stored, and what its twin has learnt."""
 
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import plain
 from reporting.words import capital, parameter_title
-from twin_master.mission.loop import BelievedModel, spans_of
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.replay import BelievedModel, spans_of_models
 from twin_master.mission.steps import History, Truth
 from twin_master.network.estimator import Learnt
+from twin_master.run_folder import JsonObject
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
-"""What is kept of each posterior; the last two bound the central 90 % interval."""
+"""The stored moments of each posterior; the last two bound the central 90 % interval."""
 
-_OF_A_SENSOR = re.compile(r"(\w+)\[(\d+)\]")
+_NAME_WITH_SENSOR = re.compile(r"(?P<quantity>\w+)\[(?P<sensor>\d+)\]")
+"""The name of a quantity of one sensor, such as `noise_scale[3]`."""
 SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
     Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
 )
-"""Axes, unit and meaning of every variable of `run.nc`, by its group; and what is learnt, see `titles_of`."""
+"""Axes, unit and meaning of every variable of `run.nc`, by its group.
+
+The table `quantities` holds the titles of learnt quantities, see `quantity_titles`.
+"""
+SEVERAL_UNITS = "see sensor_unit"
+"""The unit of a variable over sensors of different units."""
 
 
-def paths_of(role: str) -> list[str]:
-    """Return the variables that every run has, such as "filtered/mean"."""
-    found = [f"observed/{role}"]
+def variable_paths(role: str) -> list[str]:
+    """Return the variables that every run has, such as "filtered/mean".
+
+    Parameters
+    ----------
+    role : str
+        The role of the observation, such as "strain".
+    """
+    paths = [f"observed/{role}"]
     for group in ("observed", "filtered", "smoothed", "predicted", "policy", "calibration"):
-        belief = SCHEMA["belief"] if group in ("filtered", "smoothed", "predicted") else {}
-        found += [f"{group}/{name}" for name in belief | SCHEMA[group] if "{" not in name]
-    return found
+        variables = SCHEMA[group]
+        if group in ("filtered", "smoothed", "predicted"):
+            variables = SCHEMA["belief"] | variables
+        # A name with braces is that of the run; not every run has these variables.
+        paths += [f"{group}/{name}" for name in variables if "{" not in name]
+    return paths
 
 
-def titles_of(name: str) -> list[str]:
-    """Return what a learnt quantity is called: in `run.nc`, as a heading, and in short."""
+class QuantityTitles(NamedTuple):
+    """What a learnt quantity is called.
+
+    Attributes
+    ----------
+    stored : str
+        Its title in `run.nc`.
+    heading : str
+        The heading of its table in the report.
+    short : str
+        The title of its figures in the summary.
+    """
+
+    stored: str
+    heading: str
+    short: str
+
+
+def quantity_titles(name: str) -> QuantityTitles:
+    """Return what a learnt quantity is called."""
+    if name in SCHEMA["quantities"]:
+        stored, heading, short = SCHEMA["quantities"][name]
+        return QuantityTitles(stored, heading, short)
     title = parameter_title(name)
-    return SCHEMA["quantities"].get(name, [title, capital(title), title])
+    return QuantityTitles(title, capital(title), title)
 
 
 @dataclass(frozen=True)
 class LearntQuantity:
-    """A quantity that is learnt, of the whole asset or of each of its G sensors.
+    """The posterior of a learnt quantity, of the whole asset or of each of its G sensors.
 
     Attributes
     ----------
-    name, title, unit : str
-        In `run.nc`, for people, and of all numbers.
-    course : (T, 4) or (T, G, 4)
-        The figures of `MOMENTS` after each step; NaN for sensors of which it is not learnt.
-    prior : (4,) or (G, 4)
-        Before the first step.
-    truth : () or (G,), or None
-        Of a simulated asset, as far as the scenario tells it; NaN for sensors of which it does not.
+    name : str
+        Its name in `run.nc`.
+    title : str
+        Its title.
+    unit : str
+        The unit of all its numbers.
+    posterior : (T, 4) or (T, G, 4) array
+        The `MOMENTS` after each step; NaN for a sensor whose quantity is not learnt.
+    prior : (4,) or (G, 4) array
+        The moments before the first step.
+    truth : () or (G,) array, or None
+        The true value, as far as the scenario gives one; NaN for a sensor without one.
     """
 
     name: str
     title: str
     unit: str
-    course: Float
+    posterior: Float
     prior: Float
     truth: Float | None
 
     @property
-    def of_sensors(self) -> bool:
-        """Whether each sensor has its own."""
-        return self.course.ndim == 3
+    def is_per_sensor(self) -> bool:
+        """Whether each sensor has a value of its own."""
+        return self.posterior.ndim == 3
 
     @property
     def label(self) -> str:
-        """Title and unit."""
+        """The title with the unit."""
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
     @property
-    def words(self) -> dict[str, str]:
-        """What names it in the schema of `run.nc`."""
-        of = "sensor" if self.of_sensors else ""
-        return {"quantity": self.name, "title": self.title, "unit": self.unit, "of": of}
+    def schema_fields(self) -> dict[str, str]:
+        """The values of the fields in the schema of `run.nc`."""
+        axis = "sensor" if self.is_per_sensor else ""
+        return {"quantity": self.name, "title": self.title, "unit": self.unit, "of": axis}
 
 
-def _learnt(result: "MissionResult", prior: Mapping[str, Learnt]) -> tuple[LearntQuantity, ...]:
-    """Return what was learnt; names are as the estimator gives them, such as `noise_scale[3]` of sensor 3."""
-    scenario, names, values = result.scenario, result.flight.learnt_names, result.flight.learnt
-    units = {scenario.calibration.parameter: result.parameter_unit, "gauge_offset": result.observation_unit}
-    parts: dict[str, Float] = {}  # the prior and then the course of each: (1 + T, 4), or (1 + T, G, 4)
-    for name, course in zip(names, values.swapaxes(0, 1), strict=True):
-        figures, match = np.vstack((prior[name].figures, course)), _OF_A_SENSOR.fullmatch(name)
+def _learnt_quantities(
+    result: "MissionResult", prior: Mapping[str, Learnt]
+) -> tuple[LearntQuantity, ...]:
+    """Return the learnt quantities of a mission, given the prior of each by the estimator's names.
+
+    The estimator names the quantity of each sensor by itself, such as `noise_scale[3]`; these are
+    joined to one quantity.
+    """
+    scenario = result.scenario
+    units = {
+        scenario.calibration.parameter: result.parameter_unit,
+        "gauge_offset": result.observation_unit,
+    }
+    # The moments of each quantity, the prior first: (1 + T, 4), or (1 + T, G, 4) by sensor.
+    moments_of: dict[str, Float] = {}
+    posteriors = result.flight.learnt.swapaxes(0, 1)  # (N, T, 4)
+    for full_name, posterior in zip(result.flight.learnt_names, posteriors, strict=True):
+        moments = np.vstack((prior[full_name].figures, posterior))
+        match = _NAME_WITH_SENSOR.fullmatch(full_name)
         if match is None:
-            parts[name] = figures
+            moments_of[full_name] = moments
             continue
-        if match[1] not in parts:
-            parts[match[1]] = np.full((len(figures), scenario.observation.count, 4), np.nan)
-        parts[match[1]][:, int(match[2]) - 1] = figures
-    found = []
-    for name, figures in parts.items():
-        truth, unit = None if result.truth is None else _truth(scenario, name), units.get(name, "1")
-        found.append(LearntQuantity(name, titles_of(name)[0], unit, figures[1:], figures[0], truth))
-    return tuple(found)
+        name = match["quantity"]
+        if name not in moments_of:
+            moments_of[name] = np.full((len(moments), scenario.observation.count, 4), np.nan)
+        sensor = int(match["sensor"]) - 1
+        moments_of[name][:, sensor] = moments
+    quantities = []
+    for name, moments in moments_of.items():
+        quantities.append(
+            LearntQuantity(
+                name,
+                title=quantity_titles(name).stored,
+                unit=units.get(name, "1"),
+                posterior=moments[1:],
+                prior=moments[0],
+                truth=None if result.truth is None else _true_value(scenario, name),
+            )
+        )
+    return tuple(quantities)
 
 
-def _truth(scenario: Scenario, name: str) -> Float | None:
-    """Return what the scenario tells of a quantity that the twin learns."""
-    truth, observation, known = scenario.truth, scenario.observation, scenario.asset.true_parameters.get(name)
-    if known is not None:
-        return np.asarray(known, dtype=np.float64)
-    if name == "transition_factor" and truth.kind == "random_growth":
-        return _true_factor(scenario)
-    if truth.kind == "asset" or name not in ("noise_scale", "gauge_gain", "gauge_offset"):
+def _true_value(scenario: Scenario, name: str) -> Float | None:
+    """Return the true value of a learnt quantity, () or (G,); None if it is not given."""
+    parameter = scenario.asset.true_parameters.get(name)
+    if parameter is not None:
+        return np.asarray(parameter, dtype=np.float64)
+    if name == "transition_factor" and scenario.truth.kind == "random_growth":
+        return _true_transition_factor(scenario)
+    if scenario.truth.kind == "asset":  # noise and faults are those of the asset itself
         return None
     if name == "noise_scale":
-        if np.any(np.asarray(observation.model_error) > 0.0):
-            return None  # noise and model error have one scale, and the error is no noise
-        scale = np.asarray(truth.noise.standard_deviation) / np.asarray(observation.standard_deviation)
-        return np.broadcast_to(scale, (observation.count,)).copy()
-    if scenario.models_differ:
+        return _true_noise_scale(scenario)
+    if name in ("gauge_gain", "gauge_offset") and not scenario.models_differ:
+        return _true_gauge_error(scenario)
+    return None
+
+
+def _true_noise_scale(scenario: Scenario) -> Float | None:
+    """Return the true over the assumed standard deviation of the noise of each sensor (G,).
+
+    Noise and model error are learnt as one scale. With a model error there is no true value of it.
+    """
+    observation = scenario.observation
+    if np.any(np.asarray(observation.model_error) > 0.0):
         return None
-    healthy = np.zeros(observation.count)
-    for fault in truth.sensor_faults:
+    true_deviation = np.asarray(scenario.truth.noise.standard_deviation)
+    scale = true_deviation / np.asarray(observation.standard_deviation)
+    return np.broadcast_to(scale, (observation.count,)).copy()
+
+
+def _true_gauge_error(scenario: Scenario) -> Float:
+    """Return the true gain error or offset of each sensor (G,): zero, or NaN if it drifts."""
+    sensors = scenario.observation.count
+    error = np.zeros(sensors)
+    for fault in scenario.truth.sensor_faults:
         if fault.kind == "drift":
-            healthy[fault.sensor_indices(observation.count)] = np.nan
-    return healthy
+            error[fault.sensor_indices(sensors)] = np.nan
+    return error
 
 
-def _true_factor(scenario: Scenario) -> Float | None:
-    """Return the one factor between the true and the assumed probabilities to worsen; None without one."""
+def _true_transition_factor(scenario: Scenario) -> Float | None:
+    """Return the factor between the true and the assumed probabilities to worsen.
+
+    None is returned if the two tables do not differ by one factor.
+    """
     if not scenario.truth.probability:
         return np.asarray(1.0)
-    names = [*product(scenario.control_names, scenario.state_names)]
-    tables = scenario.truth.probability, scenario.transition.probability
-    true, assumed = (np.array([probability_of(table, *name) for name in names]) for table in tables)
+    true = _worsening_probabilities(scenario, scenario.truth.probability)
+    assumed = _worsening_probabilities(scenario, scenario.transition.probability)
     factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
-    return np.asarray(factor) if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0) else None
+    if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0):
+        return np.asarray(factor)
+    return None
 
 
-def printed_learnt(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
-    """Return the factor from the stored unit of a learnt quantity to the printed one, and its name."""
-    factor, units = scenario.observation.printed if name == "gauge_offset" else (1.0, (unit,))
+def _worsening_probabilities(
+    scenario: Scenario, table: Mapping[str, float | Mapping[str, float]]
+) -> Float:
+    """Return the probability to worsen of each control and state factor, in one array (U F,)."""
+    probabilities = []
+    for control in scenario.control_names:
+        for state in scenario.state_names:
+            probabilities.append(probability_of(table, control, state))
+    return np.array(probabilities)
+
+
+def printed_unit_of_quantity(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
+    """Return how a learnt quantity is printed.
+
+    Parameters
+    ----------
+    name : str
+        The name of the quantity.
+    unit : str
+        Its stored unit.
+    scenario : Scenario
+        The scenario, which says how sensors are printed.
+
+    Returns
+    -------
+    float
+        The factor from the stored to the printed unit.
+    str
+        The printed unit; empty for a number without one.
+    """
     if name == "gauge_gain":
         return 100.0, "%"
-    unit = units[0] if len({*units}) == 1 else "unit of each sensor"
+    factor = 1.0
+    if name == "gauge_offset":
+        factor, units = scenario.observation.printed
+        unit = units[0] if len({*units}) == 1 else "unit of each sensor"
     return factor, "" if unit == "1" else unit
 
 
-def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[str]) -> dict[str, Any]:
-    """Return what was learnt for the summary, a list where each sensor has its own; nothing without any."""
-    told = {
-        quantity.name: {
+def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[str]) -> JsonObject:
+    """Return the entry `learnt` of the summary; an empty record if nothing was learnt.
+
+    Parameters
+    ----------
+    quantities : sequence of LearntQuantity
+        The learnt quantities. One with a value for each sensor is written as lists.
+    sensor_units : sequence of str
+        The unit of each sensor.
+    """
+    if not quantities:
+        return {}
+    record = {}
+    for quantity in quantities:
+        record[quantity.name] = {
             "title": quantity.title,
             "unit": sensor_units if quantity.unit == SEVERAL_UNITS else quantity.unit,
-            "prior": {name: quantity.prior[..., k] for k, name in enumerate(MOMENTS)},
-            "posterior": {name: quantity.course[-1, ..., k] for k, name in enumerate(MOMENTS)},
+            "prior": _by_moment(quantity.prior),
+            "posterior": _by_moment(quantity.posterior[-1]),
             "truth": quantity.truth,
         }
-        for quantity in quantities
-    }
-    return {"learnt": plain(told)} if told else {}
+    return {"learnt": plain(record)}
 
 
-SEVERAL_UNITS = "see sensor_unit"
-"""Unit of a variable over sensors of different units."""
+def _by_moment(moments: Float) -> dict[str, Float]:
+    """Return moments (..., 4) by their names."""
+    return {name: moments[..., index] for index, name in enumerate(MOMENTS)}
 
 
 @dataclass(frozen=True)
 class MissionResult:
-    """Everything that a mission made, before it is stored.
+    """Everything that a mission yields, before it is stored.
 
     Attributes
     ----------
     scenario : Scenario
         What was flown.
     knowledge : Knowledge
-        What the twin knew before.
+        What the twin knew before its flight.
     flight : History
         The steps.
     truth : Truth or None
-        What the sensors really did; None where nobody knows.
-    units : dict of str to str
-        Units of control inputs, monitors and parameters; those that are missing are dimensionless.
+        What the sensors really did; None for a real asset.
+    units : mapping of str to str
+        The units of control inputs, monitors and parameters; those that are not named are
+        dimensionless.
     models : sequence of BelievedModel
-        What the twin believed one after the other, where it was taught; the last is that of `knowledge`.
+        The models that the twin believed one after the other, if it was taught; the last one is
+        that of `knowledge`.
     """
 
     scenario: Scenario
@@ -197,27 +321,30 @@ class MissionResult:
 
     @property
     def spans(self) -> list[tuple[Knowledge, slice]]:
-        """What the twin knew, and in which of the steps."""
-        return spans_of(self.flight, self.models or [BelievedModel(0, self.knowledge)])
+        """What the twin knew, each with the steps in which it did."""
+        models = self.models or [BelievedModel(0, self.knowledge)]
+        return spans_of_models(self.flight, models)
 
     @property
     def state_unit(self) -> str:
-        """Unit of the state factors; a list where they have several."""
+        """The unit of the state factors; if they have several, all of them with commas."""
         return ", ".join(dict.fromkeys(factor.unit for factor in self.scenario.state))
 
     @property
     def observation_unit(self) -> str:
-        """Unit of the observed values; where they have several, each sensor has its own, `sensor_unit`."""
+        """The unit of the sensors; `SEVERAL_UNITS` if they have different ones."""
         units = dict.fromkeys(self.scenario.observation.sensor_units)
         return next(iter(units)) if len(units) == 1 else SEVERAL_UNITS
 
     @property
     def parameter_unit(self) -> str:
-        """Unit of the uncertain parameter."""
+        """The unit of the calibrated parameter."""
         return self.units.get(self.scenario.calibration.parameter, "1")
 
     @cached_property
     def learnt(self) -> tuple[LearntQuantity, ...]:
-        """What was learnt; empty where nothing is."""
+        """The learnt quantities; empty if nothing was learnt."""
         learning = self.knowledge.learning
-        return () if learning is None or not self.flight.steps else _learnt(self, learning.prior)
+        if learning is None or not self.flight.steps:
+            return ()
+        return _learnt_quantities(self, learning.prior)

@@ -1,27 +1,46 @@
-"""A flown mission as labelled arrays, and as tables for people."""
+"""A flown mission as labelled arrays for `run.nc`, and as tables in CSV."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from reporting.arrays import Float
 from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
-from twin_master.learning.expectation import concatenate_expectations
-from twin_master.mission.loop import expected_in
+from twin_master.learning.expectation import Expectation, concatenate_expectations
+from twin_master.mission.residuals import expected_ahead, expected_in_steps
 from twin_master.mission.steps import SensorStatus, Truth
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
-Words = Mapping[str, str]
-_NONE: Words = MappingProxyType({})
-Entry = tuple[str, NDArray[Any], Words]
-"""A name in the schema, the values, and the words that stand in its braces."""
+SchemaFields = Mapping[str, str]
+"""The values of the fields in braces of the schema."""
+_NO_FIELDS: SchemaFields = MappingProxyType({})
+
+
+class Entry(NamedTuple):
+    """A variable to store.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the schema, perhaps with fields in braces.
+    values : array
+        Its values.
+    fields : mapping of str to str
+        The values of its fields.
+    """
+
+    name: str
+    values: NDArray[Any]
+    fields: SchemaFields = _NO_FIELDS
+
 
 _DECIDED_ON = {
     "filtered": "the filtered belief of the step",
@@ -30,227 +49,374 @@ _DECIDED_ON = {
 _MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 
-def groups_of(result: MissionResult) -> dict[str, NetcdfGroup]:
-    """Return the groups of `run.nc` for a mission; every variable carries its unit and a description."""
-    made, plan = _Groups(result), result.knowledge.plan
-    policy = {"control_index": plan.control_index, "action_value": plan.action_value, "value": plan.value}
-    groups = {
-        "observed": made.group("observed", _observed(result)),
-        **dict(_beliefs(result, made)),
-        "policy": made.group("policy", _plain(policy)),
-        "calibration": made.group(
-            "calibration",
-            _plain({"draw_value": result.knowledge.draws.values}),
-            attrs={"parameter": result.scenario.calibration.parameter},
-        ),
+def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
+    """Return the groups of `run.nc` of a mission; every variable has its unit and a description."""
+    builder = _GroupBuilder(result)
+    plan = result.knowledge.plan
+    groups = {"observed": builder.group("observed", _observed_entries(result))}
+    groups["filtered"] = _filtered_group(result, builder)
+    groups["smoothed"] = _smoothed_group(result, builder)
+    groups["predicted"] = _predicted_group(result, builder)
+    policy = {
+        "control_index": plan.control_index,
+        "action_value": plan.action_value,
+        "value": plan.value,
     }
+    groups["policy"] = builder.group("policy", _entries_of(policy))
+    groups["calibration"] = builder.group(
+        "calibration",
+        _entries_of({"draw_value": result.knowledge.draws.values}),
+        attributes={"parameter": result.scenario.calibration.parameter},
+    )
     if result.learnt:
-        groups["learnt"] = made.group("learnt", _learnt(result))
-    if steps := result.flight.suspicion:
-        told = {name: np.array([getattr(step, name) for step in steps]) for name in SCHEMA["notice"]}
-        told["left_out"] = told["left_out"].astype(np.int8)
-        groups["notice"] = made.group("notice", _plain(told))
+        groups["learnt"] = builder.group("learnt", _learnt_entries(result))
+    if result.flight.suspicion:
+        groups["notice"] = builder.group("notice", _notice_entries(result))
     if result.truth is not None:
-        groups["truth"] = made.group("truth", _truth(result, result.truth))
+        groups["truth"] = builder.group("truth", _truth_entries(result, result.truth))
     return groups
 
 
-def _plain(values: Mapping[str, Any]) -> list[Entry]:
-    return [(name, np.asarray(array), {}) for name, array in values.items()]
+def _entries_of(values: Mapping[str, ArrayLike]) -> list[Entry]:
+    """Return the entries of variables whose names have no fields."""
+    return [Entry(name, np.asarray(array)) for name, array in values.items()]
 
 
-class _Groups:
-    """Makes groups by the schema, each with the coordinates of its axes."""
+class _GroupBuilder:
+    """Builds groups by the schema, each with the coordinates of its axes."""
 
     def __init__(self, result: MissionResult) -> None:
-        scenario, flight = result.scenario, result.flight
-        observation = scenario.observation
-        self._words = {
-            "role": observation.role,
+        self._fields = {
+            "role": result.scenario.observation.role,
             "sensor_unit": result.observation_unit,
             "state_unit": result.state_unit,
             "parameter_unit": result.parameter_unit,
         }
-        labels: dict[str, Any] = {
-            "step": flight.first_step + np.arange(len(flight.steps)),
-            "sensor": np.arange(1, observation.count + 1),
-            "region": scenario.state_names,
-            "control": scenario.control_names,
-            "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
-            "reward": REWARD_NAMES,
-            "draw": np.arange(len(result.knowledge.draws.values)),
-        }
-        if result.observation_unit == SEVERAL_UNITS:
-            labels["sensor_unit"] = observation.sensor_units
-        if observation.titles:
-            labels["sensor_title"] = observation.titles
-        entries = _plain(labels)
-        for values, factor in zip(result.knowledge.model.states.coordinates.T, scenario.state, strict=True):
-            entries.append(("{factor}", values, {"factor": factor.name, "factor_unit": factor.unit}))
-        self._coordinates = dict(self._variables("coordinates", entries, {}))
+        coordinates = self._variables("coordinates", _coordinate_entries(result), _NO_FIELDS)
+        self._coordinates = dict(coordinates)
 
     def _variables(
-        self, group: str, entries: Iterable[Entry], words: Mapping[str, str]
+        self, group: str, entries: Iterable[Entry], fields: SchemaFields
     ) -> Iterator[tuple[str, Variable]]:
-        known = SCHEMA["belief"] | SCHEMA["noise"] | SCHEMA[group] if "given" in words else SCHEMA[group]
-        for name, values, own in entries:
-            told = {**self._words, **words, **own}
-            axes, unit, text = (part.format(**told) for part in known[name])
-            attrs = {"units": unit, "long_name": text} if unit else {"long_name": text}
-            yield name.format(**told), Variable(tuple(axes.split()), values, attrs)
+        """Yield each variable with its name, once the fields of its schema are filled in."""
+        schema = SCHEMA[group]
+        if "given" in fields:  # a group of a belief
+            schema = SCHEMA["belief"] | SCHEMA["noise"] | schema
+        for entry in entries:
+            all_fields = {**self._fields, **fields, **entry.fields}
+            axes, unit, description = (text.format(**all_fields) for text in schema[entry.name])
+            attributes = {"units": unit} if unit else {}
+            attributes["long_name"] = description
+            variable = Variable(tuple(axes.split()), entry.values, attributes)
+            yield entry.name.format(**all_fields), variable
 
     def group(
-        self, name: str, entries: Iterable[Entry], words: Words = _NONE, attrs: Words = _NONE
+        self,
+        name: str,
+        entries: Iterable[Entry],
+        fields: SchemaFields = _NO_FIELDS,
+        attributes: SchemaFields = _NO_FIELDS,
     ) -> NetcdfGroup:
-        """Return a group of the schema; `words` stand in braces of all its entries."""
-        variables = dict(self._variables(name, entries, words))
-        axes = {axis for variable in variables.values() for axis in variable.dims}
-        coordinates = {
-            name: label for name, label in self._coordinates.items() if axes.issuperset(label.dims)
-        }
-        return NetcdfGroup(variables, coordinates, attrs)
+        """Return a group of the schema.
+
+        Parameters
+        ----------
+        name : str
+            The name of the group.
+        entries : iterable of Entry
+            Its variables.
+        fields : mapping of str to str
+            The values of fields that all entries share.
+        attributes : mapping of str to str
+            The attributes of the group.
+        """
+        variables = dict(self._variables(name, entries, fields))
+        axes: set[str] = set()
+        for variable in variables.values():
+            axes.update(variable.dims)
+        coordinates = {}
+        for coordinate_name, coordinate in self._coordinates.items():
+            if axes.issuperset(coordinate.dims):
+                coordinates[coordinate_name] = coordinate
+        return NetcdfGroup(variables, coordinates, attributes)
 
 
-def _observed(result: MissionResult) -> Iterator[Entry]:
-    flight, scenario = result.flight, result.scenario
-    yield "{role}", flight.observed, {}
-    yield "control_index", flight.control_index, {}
+def _coordinate_entries(result: MissionResult) -> list[Entry]:
+    """Return the labels of all axes."""
+    scenario = result.scenario
+    flight = result.flight
+    labels: dict[str, ArrayLike] = {
+        "step": flight.first_step + np.arange(len(flight.steps)),
+        "sensor": np.arange(1, scenario.observation.count + 1),
+        "region": scenario.state_names,
+        "control": scenario.control_names,
+        "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
+        "reward": REWARD_NAMES,
+        "draw": np.arange(len(result.knowledge.draws.values)),
+    }
+    if result.observation_unit == SEVERAL_UNITS:
+        labels["sensor_unit"] = scenario.observation.sensor_units
+    if scenario.observation.titles:
+        labels["sensor_title"] = scenario.observation.titles
+    entries = _entries_of(labels)
+    levels_of_states = result.knowledge.model.states.coordinates.T  # (F, S)
+    for levels, factor in zip(levels_of_states, scenario.state, strict=True):
+        fields = {"factor": factor.name, "factor_unit": factor.unit}
+        entries.append(Entry("{factor}", levels, fields))
+    return entries
+
+
+def _observed_entries(result: MissionResult) -> Iterator[Entry]:
+    """Yield the variables of the group `observed`."""
+    flight = result.flight
+    scenario = result.scenario
+    yield Entry("{role}", flight.observed)
+    yield Entry("control_index", flight.control_index)
     if scenario.observation.modes is not None:
-        yield "{role}_covariance", flight.readings, {}
-    for place, (_, state, name, _) in enumerate(scenario.readings):
-        words = {"reading": name, "unit": scenario.state[state].unit}
-        yield "{reading}", flight.readings[:, place], words
-    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
-        values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
-        yield "{input}", values, {"input": name, "unit": result.units.get(name, "1")}
+        yield Entry("{role}_covariance", flight.readings)
+    for index, (_control, state, name, _deviation) in enumerate(scenario.readings):
+        fields = {"reading": name, "unit": scenario.state[state].unit}
+        yield Entry("{reading}", flight.readings[:, index], fields)
+    for name in sorted(scenario.control[0].values):  # config.json does not preserve their order
+        value_of_control = np.array([control.values[name] for control in scenario.control])
+        fields = {"input": name, "unit": result.units.get(name, "1")}
+        yield Entry("{input}", value_of_control[flight.control_index], fields)
 
 
-def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, NetcdfGroup]]:
-    """Yield the groups of the beliefs filtered, smoothed and predicted."""
-    flight, known = result.flight, result.knowledge
-    states, observed, so_far = known.model.states, flight.observed, "observations up to the step"
-    for name, belief, given in (
-        ("filtered", flight.filtered, so_far),
-        ("smoothed", flight.smoothed, "all observations"),
-        ("predicted", flight.predicted, f"{so_far}, through the policy"),
-    ):
-        flown = name != "predicted"
-        parts = [
-            expected_in(replace(flight, steps=flight.steps[part]), own, name, belief[part])
-            for own, part in result.spans
-        ]
-        expected = concatenate_expectations([part for part, _ in parts])
-        values = {
-            "probability": belief,
-            "mean": states.mean(belief),
-            "standard_deviation": states.standard_deviation(belief),
-            "quantity_mean": expected.mean,
-            "quantity_standard_deviation": expected.standard_deviation,
-            "quantity_lower": expected.lower,
-            "quantity_upper": expected.upper,
-            "reward_mean": expected.reward_mean,
-            "reward_standard_deviation": expected.reward_standard_deviation,
-        }
-        words = {"lead": "step" if flown else "step horizon", "given": given}
-        if name == "filtered":
-            values |= {
-                "noise_standard_deviation": expected.noise,
-                "decision_probability": flight.decision_probability,
-                "log_evidence": flight.log_evidence,
-                "residual": (observed - expected.mean) / expected.noise,
-                "sensors_received": np.isfinite(observed).sum(axis=1),
-            }
-            told = "predicted" if known.plan.on_belief is not None else result.scenario.planner.decide_on
-            words["decided_on"] = _DECIDED_ON[told]
-            words["how"] = "that the twin assumes" if known.learning is None else "that the twin has learnt"
-        elif name == "predicted":
-            values["control_probability"] = np.concatenate([asked for _, asked in parts])
-        yield name, made.group(name, _plain(values), words)
+def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
+    """Return the group of the filtered belief."""
+    flight = result.flight
+    expected = _expected_in_flight(result, flight.filtered, smoothed=False)
+    values = _belief_variables(result, flight.filtered, expected)
+    values["noise_standard_deviation"] = expected.noise
+    values["decision_probability"] = flight.decision_probability
+    values["log_evidence"] = flight.log_evidence
+    values["residual"] = (flight.observed - expected.mean) / expected.noise
+    values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
+    decided_on = result.scenario.planner.decide_on
+    if result.knowledge.plan.on_belief is not None:
+        decided_on = "predicted"
+    is_assumed = result.knowledge.learning is None
+    fields = {
+        "lead": "step",
+        "given": "observations up to the step",
+        "decided_on": _DECIDED_ON[decided_on],
+        "how": "that the twin assumes" if is_assumed else "that the twin has learnt",
+    }
+    return builder.group("filtered", _entries_of(values), fields)
 
 
-def _learnt(result: MissionResult) -> Iterator[Entry]:
+def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
+    """Return the group of the smoothed belief."""
+    smoothed = result.flight.smoothed
+    expected = _expected_in_flight(result, smoothed, smoothed=True)
+    values = _belief_variables(result, smoothed, expected)
+    fields = {"lead": "step", "given": "all observations"}
+    return builder.group("smoothed", _entries_of(values), fields)
+
+
+def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
+    """Return the group of the predicted belief, whose leading axes are step and horizon."""
+    flight = result.flight
+    predicted = flight.predicted
+    expected_parts = []
+    control_probabilities = []
+    for knowledge, span in result.spans:
+        part = replace(flight, steps=flight.steps[span])
+        expected_of_part, control_probability = expected_ahead(part, knowledge, predicted[span])
+        expected_parts.append(expected_of_part)
+        control_probabilities.append(control_probability)
+    values = _belief_variables(result, predicted, concatenate_expectations(expected_parts))
+    values["control_probability"] = np.concatenate(control_probabilities)
+    fields = {
+        "lead": "step horizon",
+        "given": "observations up to the step, through the policy",
+    }
+    return builder.group("predicted", _entries_of(values), fields)
+
+
+def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool) -> Expectation:
+    """Return what is expected in all steps under a belief (T, S), by the believed models."""
+    flight = result.flight
+    expected_parts = []
+    for knowledge, span in result.spans:
+        part = replace(flight, steps=flight.steps[span])
+        expected_parts.append(expected_in_steps(part, knowledge, belief[span], smoothed=smoothed))
+    return concatenate_expectations(expected_parts)
+
+
+def _belief_variables(
+    result: MissionResult, belief: Float, expected: Expectation
+) -> dict[str, ArrayLike]:
+    """Return the variables that all groups of a belief share."""
+    states = result.knowledge.model.states
+    return {
+        "probability": belief,
+        "mean": states.mean(belief),
+        "standard_deviation": states.standard_deviation(belief),
+        "quantity_mean": expected.mean,
+        "quantity_standard_deviation": expected.standard_deviation,
+        "quantity_lower": expected.lower,
+        "quantity_upper": expected.upper,
+        "reward_mean": expected.reward_mean,
+        "reward_standard_deviation": expected.reward_standard_deviation,
+    }
+
+
+def _learnt_entries(result: MissionResult) -> Iterator[Entry]:
+    """Yield the variables of the group `learnt`."""
     for quantity in result.learnt:
         for index, (moment, title) in enumerate(zip(MOMENTS, _MOMENT_TITLES, strict=True)):
-            words = {**quantity.words, "moment": moment, "moment_title": title}
-            yield "{quantity}_{moment}", quantity.course[..., index], words
-            yield "{quantity}_prior_{moment}", quantity.prior[..., index], words
+            fields = {**quantity.schema_fields, "moment": moment, "moment_title": title}
+            yield Entry("{quantity}_{moment}", quantity.posterior[..., index], fields)
+            yield Entry("{quantity}_prior_{moment}", quantity.prior[..., index], fields)
 
 
-def _truth(result: MissionResult, truth: Truth) -> Iterator[Entry]:
+def _notice_entries(result: MissionResult) -> list[Entry]:
+    """Return the variables of the group `notice`: the suspicion of each step."""
+    suspicions = result.flight.suspicion
+    values = {}
+    for name in SCHEMA["notice"]:
+        values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
+    values["left_out"] = values["left_out"].astype(np.int8)
+    return _entries_of(values)
+
+
+def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:
+    """Yield the variables of the group `truth`."""
     flight = result.flight
-    status = truth.status[: len(flight.steps)]  # the asset may have ended the mission
+    status = truth.status[: len(flight.steps)]  # the asset may have ended the mission early
     if truth.in_asset:
-        status = np.where(np.isnan(flight.observed), SensorStatus.LOST, status).astype(status.dtype)
-    yield "state", flight.state, {}
-    yield "{role}", flight.observation, {}
-    yield "sensor_status", status, {}
+        is_lost = np.isnan(flight.observed)
+        status = np.where(is_lost, SensorStatus.LOST, status).astype(status.dtype)
+    yield Entry("state", flight.state)
+    yield Entry("{role}", flight.observation)
+    yield Entry("sensor_status", status)
     for quantity in result.learnt:
         if quantity.truth is not None:
-            yield "{quantity}", quantity.truth, quantity.words
-    for name, values in sorted(flight.monitors.items()):  # a journal does not keep their order
-        yield "{monitor}", values, {"monitor": name, "unit": result.units.get(name, "1")}
+            yield Entry("{quantity}", quantity.truth, quantity.schema_fields)
+    for name, values in sorted(flight.monitors.items()):  # a journal does not preserve their order
+        fields = {"monitor": name, "unit": result.units.get(name, "1")}
+        yield Entry("{monitor}", values, fields)
 
 
-Columns = dict[str, Any]
-"""Numbers or texts of each column, by its heading."""
+Columns = dict[str, NDArray[Any]]
+"""The numbers or texts of each column of a table, by its heading."""
 
 
-def tables_of(groups: Mapping[str, NetcdfGroup], observation: ObservationSection) -> dict[str, str]:
+@dataclass(frozen=True)
+class _TableMaker:
+    """Makes the tables of a run.
+
+    Attributes
+    ----------
+    groups : mapping of str to NetcdfGroup
+        The groups of `run.nc`.
+    observation : ObservationSection
+        How sensors are printed.
+    """
+
+    groups: Mapping[str, NetcdfGroup]
+    observation: ObservationSection
+
+    @property
+    def steps(self) -> Columns:
+        """The column of the step, with which most tables begin."""
+        return {"step": np.array([str(step) for step in self.groups["observed"]["step"].values])}
+
+    @property
+    def controls(self) -> NDArray[Any]:
+        """The names of the controls."""
+        return self.groups["policy"]["control"].values
+
+    def sensors(self, group: str, variable: str) -> Columns:
+        """Return a table of the values of each sensor, in printed units."""
+        factor, units = self.observation.printed
+        values_by_sensor = factor * self.groups[group][variable].values.T
+        columns = dict(self.steps)
+        for number, (unit, values) in enumerate(zip(units, values_by_sensor, strict=True), start=1):
+            columns[f"{self.observation.role}_{number}_{unit}"] = values
+        return columns
+
+    def health(self) -> Columns:
+        """Return the table of the state factors: true values, and moments of the beliefs."""
+        variables = {}
+        if "truth" in self.groups:
+            variables["true"] = self.groups["truth"]["state"]
+        for belief in ("filtered", "smoothed"):
+            for moment in ("mean", "standard_deviation"):
+                variables[f"{belief}_{moment}"] = self.groups[belief][moment]
+        columns = dict(self.steps)
+        for index, region in enumerate(self.groups["filtered"]["region"].values):
+            factor, unit = self._printed_state(region)
+            for name, variable in variables.items():
+                columns[f"{region}_{name}_{unit}"] = factor * variable.values[:, index]
+        return columns
+
+    def _printed_state(self, region: str) -> tuple[float, str]:
+        """Return the factor from the stored to the printed unit of a state, and that unit."""
+        return printed_state(self.groups["policy"][region].attrs["units"], "percent")
+
+    def decisions(self) -> Columns:
+        """Return the table of controls, rewards and decisions."""
+        observed = self.groups["observed"]
+        filtered = self.groups["filtered"]
+        probability = filtered["decision_probability"].values
+        columns = dict(self.steps)
+        columns["control"] = self.controls[observed["control_index"].values]
+        columns |= _columns("{}_reward", filtered["reward"].values, filtered["reward_mean"].values)
+        columns |= _columns("decision_probability_{}", self.controls, probability)
+        columns["next_control"] = self.controls[probability.argmax(axis=1)]
+        return columns
+
+    def policy(self) -> Columns:
+        """Return the table of the policy: the control in each state, and the action values."""
+        policy = self.groups["policy"]
+        columns: Columns = {}
+        for region in self.groups["filtered"]["region"].values:
+            factor, unit = self._printed_state(region)
+            columns[f"{region}_{unit}"] = factor * policy[region].values
+        columns["control"] = self.controls[policy["control_index"].values]
+        columns |= _columns("action_value_{}", self.controls, policy["action_value"].values)
+        return columns
+
+
+def csv_tables(
+    groups: Mapping[str, NetcdfGroup], observation: ObservationSection
+) -> dict[str, str]:
     """Return the text of each CSV file by its name.
 
     Parameters
     ----------
-    groups
-        As `groups_of` returns them.
-    observation
+    groups : mapping of str to NetcdfGroup
+        The groups of `run.nc`, as `run_groups` returns them.
+    observation : ObservationSection
         How sensors are printed.
     """
-    observed, filtered, policy = (groups[name] for name in ("observed", "filtered", "policy"))
-    controls, asked = policy["control"].values, filtered["decision_probability"].values
-    role = observation.role
-    steps: Columns = {"step": [str(step) for step in observed["step"].values]}
-    known = {"true": groups["truth"]["state"]} if "truth" in groups else {}
-    for kind in ("filtered", "smoothed"):
-        known |= {f"{kind}_{name}": groups[kind][name] for name in ("mean", "standard_deviation")}
-    health, states = dict(steps), Columns()
-    for place, region in enumerate(filtered["region"].values):
-        factor, unit = printed_state(policy[region].attrs["units"], "percent")
-        states[f"{region}_{unit}"] = factor * policy[region].values
-        for name, variable in known.items():
-            health[f"{region}_{name}_{unit}"] = factor * variable.values[:, place]
+    maker = _TableMaker(groups, observation)
     tables = {
-        "observed": steps | _observations(observed, role, observation),
-        "estimated": steps | _observations(filtered, "quantity_mean", observation),
-        **({"true": steps | _observations(groups["truth"], role, observation)} if "truth" in groups else {}),
-        "health": health,
-        "decisions": steps
-        | {"control": controls[observed["control_index"].values]}
-        | _each("{}_reward", filtered["reward"].values, filtered["reward_mean"].values)
-        | _each("decision_probability_{}", controls, asked)
-        | {"next_control": controls[asked.argmax(axis=1)]},
-        "policy": states
-        | {"control": controls[policy["control_index"].values]}
-        | _each("action_value_{}", controls, policy["action_value"].values),
+        "observed": maker.sensors("observed", observation.role),
+        "estimated": maker.sensors("filtered", "quantity_mean"),
     }
-    return {
-        name: table_text({title: _cells(values) for title, values in columns.items()})
-        for name, columns in tables.items()
-    }
+    if "truth" in groups:
+        tables["true"] = maker.sensors("truth", observation.role)
+    tables["health"] = maker.health()
+    tables["decisions"] = maker.decisions()
+    tables["policy"] = maker.policy()
+    texts = {}
+    for name, columns in tables.items():
+        cells = {heading: _cells(values) for heading, values in columns.items()}
+        texts[name] = table_text(cells)
+    return texts
 
 
-def _observations(group: NetcdfGroup, variable: str, observation: ObservationSection) -> Columns:
-    factor, units = observation.printed
-    names = (f"{observation.role}_{number}_{unit}" for number, unit in enumerate(units, start=1))
-    return dict(zip(names, factor * group[variable].values.T, strict=True))
+def _columns(heading: str, names: Iterable[str], values: NDArray[Any]) -> Columns:
+    """Return the columns of values (T, N), each with the name in the braces of its heading."""
+    return {heading.format(name): column for name, column in zip(names, values.T, strict=True)}
 
 
-def _each(title: str, names: Iterable[str], values: NDArray[Any]) -> Columns:
-    """Return a column for each of some names, of values (T, N)."""
-    return {title.format(name): column for name, column in zip(names, values.T, strict=True)}
-
-
-def _cells(values: Any) -> list[str]:
-    """Return the cells of a column, for people; empty where nothing was received."""
+def _cells(values: NDArray[Any]) -> list[str]:
+    """Return the cells of a column, with six digits; empty if the value is NaN."""
     if isinstance(values[0], str):
         return [str(value) for value in values]
     return ["" if np.isnan(value) else f"{value:.6g}" for value in values]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,44 @@ from reporting.arrays import Float, Index
 from reporting.words import counted, parameter_title
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
+from twin_master.run_folder import JsonObject
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import SEVERAL_UNITS, MissionResult, printed_learnt, titles_of
+from twin_master.store.mission_result import (
+    MOMENTS,
+    SEVERAL_UNITS,
+    LearntQuantity,
+    MissionResult,
+    printed_unit_of_quantity,
+    quantity_titles,
+)
 
-_CHANGES_SAID = 3
-
-Words = Mapping[str, object]
-Told = tuple[str, Words, Sequence[float | int | str | None]]
-"""A group of figures, what stands in its braces, and the values."""
+_MOST_CHANGES = 3
+"""The number of changes of the control that the summary names."""
 TRUTH_IS_OFF = 3.0
-"""Standard deviations beyond which the asset flown is not the one that was calibrated."""
+"""Standard deviations beyond which the flown asset is not the one that was calibrated."""
+_MEAN = MOMENTS.index("mean")
+_STANDARD_DEVIATION = MOMENTS.index("standard_deviation")
+
+FigureValue = float | int | str | None
+
+
+class FigureGroup(NamedTuple):
+    """Figures of the summary that belong together.
+
+    Attributes
+    ----------
+    name : str
+        The name of the group in `FIGURES`, which holds keys, titles and units.
+    fields : mapping of str to object
+        The values of the fields in braces there.
+    values : sequence
+        The values of the figures, in the order of the group.
+    """
+
+    name: str
+    fields: Mapping[str, object]
+    values: Sequence[FigureValue]
 
 
 @dataclass(frozen=True)
@@ -31,22 +58,22 @@ class Figure:
     Attributes
     ----------
     key : str
-        Name for programs.
+        Its name for programs.
     title : str
-        Name for people.
+        Its name for people.
     value : float, int, str or None
-        The figure; None where the mission gave none.
+        The figure; None if the mission gave none.
     unit : str
-        Unit of `value` and `reference`, as printed.
+        The unit of `value` and `reference`, as printed.
     reference : float, str or None
-        What the scenario gives to compare it with.
+        The value that the scenario gives to compare with.
     reference_source : str
-        Where that comes from.
+        Where the reference comes from.
     """
 
     key: str
     title: str
-    value: float | int | str | None
+    value: FigureValue
     unit: str = ""
     reference: float | str | None = None
     reference_source: str = ""
@@ -59,15 +86,15 @@ class Fallback:
     Attributes
     ----------
     switch_state : str or None
-        The state factor on which the policy alone depends; None if it depends on several or on none.
+        The one state factor that the policy depends on; None if it depends on several or on none.
     switch_level : float or None
-        Its level, SI, from which on the policy leaves the first control.
+        The level of this factor, SI, from which on the policy leaves the first control.
     called_for_step : int or None
-        First step in which the true state reaches that level.
+        The first step in which the true state reaches that level.
     fallback_step : int or None
-        First step from then on that is flown with another control.
+        The first step from then on that is flown with another control.
     early_step : int or None
-        First step before that, if any, that is flown with another control.
+        The first step before then that is flown with another control.
     """
 
     switch_state: str | None = None
@@ -78,228 +105,410 @@ class Fallback:
 
     @property
     def delay(self) -> int | None:
-        """Steps from the damage that calls for it to the fallback."""
+        """The number of steps from the damage that calls for the fallback to the fallback."""
         if self.fallback_step is None or self.called_for_step is None:
             return None
         return self.fallback_step - self.called_for_step
 
 
 def find_fallback(
-    states: StateSpace, policy_index: Index, first_control: int, control_index: Index, true_state: Float
+    states: StateSpace,
+    policy_index: Index,
+    first_control: int,
+    control_index: Index,
+    true_state: Float,
 ) -> Fallback:
     """Return how the control fell back.
 
     Parameters
     ----------
-    states
+    states : StateSpace
         The state space.
-    policy_index : (S,)
-        Control of the policy in each state.
-    first_control
-        Index of the control of the first step.
-    control_index : (T,)
-        Controls flown.
-    true_state : (T, F)
-        True state, SI.
+    policy_index : (S,) array
+        The index of the control that the policy takes in each state.
+    first_control : int
+        The index of the control of the first step.
+    control_index : (T,) array
+        The index of the control flown in each step.
+    true_state : (T, F) array
+        The true state, SI.
     """
-    switch = policy_switch(states, policy_index, first_control)
+    switch = find_policy_switch(states, policy_index, first_control)
     if switch is None:
         return Fallback()
-    axis, level = switch
-    called = _first(true_state[:, axis] >= level - states.factors[axis].slack)
-    left = control_index != first_control
-    before = np.arange(len(left)) < (len(left) if called is None else called)
-    return Fallback(states.factors[axis].name, level, called, _first(left & ~before), _first(left & before))
+    factor = states.factors[switch.factor_index]
+    is_called_for = true_state[:, switch.factor_index] >= switch.level - factor.slack
+    called_for_step = _first_true(is_called_for)
+    has_left = control_index != first_control
+    steps = len(control_index)
+    is_before_call = np.arange(steps) < (steps if called_for_step is None else called_for_step)
+    return Fallback(
+        factor.name,
+        switch.level,
+        called_for_step,
+        fallback_step=_first_true(has_left & ~is_before_call),
+        early_step=_first_true(has_left & is_before_call),
+    )
 
 
-def _first(where: NDArray[np.bool_]) -> int | None:
-    return int(np.argmax(where)) if where.any() else None
+def _first_true(condition: NDArray[np.bool_]) -> int | None:
+    """Return the first index at which a condition holds; None if it never does."""
+    return int(np.argmax(condition)) if condition.any() else None
 
 
-def policy_switch(states: StateSpace, policy_index: Index, first_control: int) -> tuple[int, float] | None:
-    """Return the factor on which alone a policy depends, and the level from which on it leaves a control.
+class PolicySwitch(NamedTuple):
+    """Where a policy leaves a control.
 
-    None where it depends on several factors or on none, or comes back to that control at a higher level.
+    Attributes
+    ----------
+    factor_index : int
+        The index of the one state factor that the policy depends on.
+    level : float
+        The level of this factor, SI, from which on the policy takes another control.
     """
-    table = (policy_index != first_control).reshape(states.shape)
+
+    factor_index: int
+    level: float
+
+
+def find_policy_switch(
+    states: StateSpace, policy_index: Index, first_control: int
+) -> PolicySwitch | None:
+    """Return where a policy leaves its first control.
+
+    None is returned if the policy depends on several factors or on none, or if it returns to that
+    control at a higher level.
+
+    Parameters
+    ----------
+    states : StateSpace
+        The state space.
+    policy_index : (S,) array
+        The index of the control that the policy takes in each state.
+    first_control : int
+        The index of the control.
+    """
+    leaves = (policy_index != first_control).reshape(states.shape)
     for axis, factor in enumerate(states.factors):
-        others = tuple(index for index in range(table.ndim) if index != axis)
-        any_of, all_of = table.any(axis=others), table.all(axis=others)
-        first = _first(all_of)
-        if np.array_equal(any_of, all_of) and first is not None and all_of[first:].all():
-            return axis, float(factor.levels[first])
+        other_axes = tuple(index for index in range(leaves.ndim) if index != axis)
+        leaves_somewhere = leaves.any(axis=other_axes)
+        leaves_everywhere = leaves.all(axis=other_axes)
+        depends_on_factor_alone = np.array_equal(leaves_somewhere, leaves_everywhere)
+        level = _first_true(leaves_everywhere)
+        if depends_on_factor_alone and level is not None and leaves_everywhere[level:].all():
+            return PolicySwitch(axis, float(factor.levels[level]))
     return None
 
 
 def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
-    """Return the root mean square error of the filtered mean of each factor over the steps: (F,), SI."""
+    """Return the root mean square error of the filtered mean of each factor (F,), SI."""
     error = model.states.mean(filtered) - true_state
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
 def summarise(
-    result: MissionResult, reward_mean: Float, misfit: Float | None = None, before: Iterable[Told] = ()
+    result: MissionResult,
+    reward_mean: Float,
+    misfit: Float | None = None,
+    first_groups: Iterable[FigureGroup] = (),
 ) -> Iterator[Figure]:
-    """Yield the figures of a mission; all of them are the same for the same seed.
+    """Yield the figures of a mission; the same seed gives the same figures.
 
     Parameters
     ----------
-    result
+    result : MissionResult
         The mission.
-    reward_mean : (T, R)
-        Mean rewards under the filtered belief.
-    misfit
-        Of the twin's model, (S, U, G), a share of what the asset shows, NaN where it shows nothing; where the
-        asset is known to be another one.
-    before
-        What is told before them.
+    reward_mean : (T, 3) array
+        The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
+    misfit : (S, U, G) array, optional
+        The difference of the twin's model to the asset, relative to what the asset shows; NaN if it
+        shows nothing. Given if asset and model are known to differ.
+    first_groups : iterable of FigureGroup
+        Figures that come before all others.
     """
-    flight, step_word = result.flight, {"step": result.scenario.mission.step_name}
-    told = [*before, *(_scored(result) if flight.simulated else _watched(result))]
+    groups = [*first_groups]
+    groups += _truth_figures(result) if result.flight.simulated else _watched_figures(result)
+    groups += _reward_figures(reward_mean)
+    groups += _parameter_figures(result)
+    groups.append(FigureGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
+    groups += _learnt_figures(result)
+    groups += _observation_figures(result)
+    if misfit is not None:
+        groups += _misfit_figures(misfit)
+    groups += _error_bound_figures(result)
+    groups += _suspicion_figures(result)
+    references = {reference.figure: reference for reference in result.scenario.reference}
+    for group in groups:
+        for (key, title, unit), value in zip(_schema_of(group), group.values, strict=True):
+            reference = references.get(key)
+            if reference is None:
+                yield Figure(key, title, value, unit)
+            else:
+                yield Figure(key, title, value, unit, reference.value, reference.source)
+
+
+class _FigureSchema(NamedTuple):
+    """Key, title and unit of a figure."""
+
+    key: str
+    title: str
+    unit: str
+
+
+def _schema_of(group: FigureGroup) -> Iterator[_FigureSchema]:
+    """Yield the schema of each figure of a group, with its fields filled in."""
+    for key, (title, unit) in FIGURES[group.name].items():
+        yield _FigureSchema(
+            key.format(**group.fields), title.format(**group.fields), unit.format(**group.fields)
+        )
+
+
+def _reward_figures(reward_mean: Float) -> Iterator[FigureGroup]:
+    """Yield the mean of each reward over the steps; None if no step has one."""
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
-        known = rewards[np.isfinite(rewards)]
-        told.append(("reward", {"reward": name}, [float(known.mean()) if len(known) else None]))
-    told += _of_the_parameter(result)
-    told.append(("evidence", {}, [float(flight.log_evidence.sum())]))
-    told += _learnt(result)
-    received = np.isfinite(flight.observed)
-    if not received.all():
-        told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
-        if blind := (flight.first_step + np.flatnonzero(~received.any(axis=1))).tolist():
-            told.append(("blind", step_word, [", ".join(map(str, blind))]))
-    if misfit is not None and (known := np.isfinite(misfit)).any():
-        worst = np.max(np.abs(misfit), axis=(0, 1), where=known, initial=0.0)
-        sensor, rms = int(np.argmax(worst)), float(np.sqrt(np.mean(misfit[known] ** 2)))
-        told.append(("misfit", {"sensor": sensor + 1}, [100.0 * rms, 100.0 * float(worst[sensor])]))
-    bound = flight.monitors.get("strain_error_bound")
-    if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
-        told.append(("bound", {}, [1e6 * float(bound.max())]))
-    if flight.suspicion:
-        last = flight.suspicion[-1]
-        first = next((step for step, notice in flight.notices if notice.kind == "alarm"), None)
-        told.append(("notice", step_word, [first, last.none_of_these, last.gauge_off, last.decided_by]))
-    references = {entry.figure: (entry.value, entry.source) for entry in result.scenario.reference}
-    for group, words, values in told:
-        for (key, (title, unit)), value in zip(FIGURES[group].items(), values, strict=True):
-            name = key.format(**words)
-            reference = references.get(name, ())
-            yield Figure(name, title.format(**words), value, unit.format(**words), *reference)
+        finite = rewards[np.isfinite(rewards)]
+        mean = float(finite.mean()) if len(finite) else None
+        yield FigureGroup("reward", {"reward": name}, [mean])
 
 
-def _of_the_parameter(result: MissionResult) -> Iterator[Told]:
-    """Yield what is known of the calibrated parameter before the flight, and after it where it is learnt."""
-    draws = result.knowledge.draws
-    label, before = parameter_title(draws.name), [draws.mean, draws.standard_deviation]
-    words = {"parameter": draws.name, "label": label}
-    own = next((quantity for quantity in result.learnt if quantity.name == draws.name), None)
-    if own is None:
-        measured = result.scenario.calibration.source in ("static_test", "file")
-        words |= {"whose": "posterior " * measured, "of": f"the {label}" if " " in label else label}
-        yield "parameter", words, before
+def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the share of lost observations, and the steps without any, if some were lost."""
+    flight = result.flight
+    is_received = np.isfinite(flight.observed)
+    if is_received.all():
         return
-    yield "parameter_learnt", words, [*own.course[-1, :2].tolist(), *before]
-    if own.truth is not None:
-        yield "parameter_true", words, [float(own.truth)]
+    yield FigureGroup("lost", {}, [100.0 * float(1.0 - is_received.mean())])
+    blind_steps = (flight.first_step + np.flatnonzero(~is_received.any(axis=1))).tolist()
+    if blind_steps:
+        fields = {"step": result.scenario.mission.step_name}
+        yield FigureGroup("blind", fields, [", ".join(str(step) for step in blind_steps)])
 
 
-def _learnt(result: MissionResult) -> Iterator[Told]:
-    """Yield what was learnt beside the parameter; the sensor that departs most stands for all of them."""
-    observation = result.scenario.observation
+def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
+    """Yield the root mean square of a misfit (S, U, G) and the largest one."""
+    is_known = np.isfinite(misfit)
+    if not is_known.any():
+        return
+    largest_of_sensor = np.max(np.abs(misfit), axis=(0, 1), where=is_known, initial=0.0)
+    sensor = int(np.argmax(largest_of_sensor))
+    rms = float(np.sqrt(np.mean(misfit[is_known] ** 2)))
+    percent = [100.0 * rms, 100.0 * float(largest_of_sensor[sensor])]
+    yield FigureGroup("misfit", {"sensor": sensor + 1}, percent)
+
+
+def _error_bound_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the largest certified strain error, if the asset reports it."""
+    bound = result.flight.monitors.get("strain_error_bound")
+    if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
+        yield FigureGroup("bound", {}, [1e6 * float(bound.max())])
+
+
+def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the first alarm and the last suspicion, if the twin watches its model."""
+    flight = result.flight
+    if not flight.suspicion:
+        return
+    last = flight.suspicion[-1]
+    alarm_steps = [step for step, notice in flight.notices if notice.kind == "alarm"]
+    values = [
+        alarm_steps[0] if alarm_steps else None,
+        last.none_of_these,
+        last.gauge_off,
+        last.decided_by,
+    ]
+    yield FigureGroup("notice", {"step": result.scenario.mission.step_name}, values)
+
+
+def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the calibrated parameter before the flight, and after it if it is learnt."""
+    draws = result.knowledge.draws
+    title = parameter_title(draws.name)
+    prior = [draws.mean, draws.standard_deviation]
+    learnt = [quantity for quantity in result.learnt if quantity.name == draws.name]
+    if not learnt:
+        is_measured = result.scenario.calibration.source in ("static_test", "file")
+        fields = {
+            "parameter": draws.name,
+            "whose": "posterior " if is_measured else "",
+            "of": f"the {title}" if " " in title else title,
+        }
+        yield FigureGroup("parameter", fields, prior)
+        return
+    parameter = learnt[0]
+    fields = {"parameter": draws.name, "label": title}
+    last = parameter.posterior[-1]
+    moments = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+    yield FigureGroup("parameter_learnt", fields, [*moments, *prior])
+    if parameter.truth is not None:
+        yield FigureGroup("parameter_true", fields, [float(parameter.truth)])
+
+
+def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the learnt quantities beside the calibrated parameter."""
     for quantity in result.learnt:
-        factor, unit = printed_learnt(quantity.name, quantity.unit, result.scenario)
-        last, title = factor * quantity.course[-1], titles_of(quantity.name)[2]
-        words = {"quantity": quantity.name, "title": title, "unit": unit, "sensor": observation.word}
-        if quantity.of_sensors:
-            departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
-            most = int(np.nanargmax(departure))
-            values = [float(np.nanmean(last[:, 0])), *last[most, :2].tolist()]
-            if quantity.unit == SEVERAL_UNITS:  # they have no mean
-                words["unit"], values[0] = observation.sensor_units[most], None
-            yield "learnt_of_sensors", words | {"most": f"{most + 1}"}, values
+        if quantity.is_per_sensor:
+            yield _figures_of_sensors(result, quantity)
         elif quantity.name != result.scenario.calibration.parameter:
-            yield "learnt", words, last[:2].tolist()
+            factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
+            fields = {
+                "quantity": quantity.name,
+                "title": quantity_titles(quantity.name).short,
+                "unit": unit,
+            }
+            last = factor * quantity.posterior[-1]
+            values = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+            yield FigureGroup("learnt", fields, values)
 
 
-def noticed(result: MissionResult) -> dict[str, Any]:
-    """Return what the operator was told, `notices`, for the summary; nothing where nothing is watched."""
+def _figures_of_sensors(result: MissionResult, quantity: LearntQuantity) -> FigureGroup:
+    """Return the figures of a quantity that each sensor has.
+
+    They are the mean over the sensors, and the sensor that departs most from its prior, relative to
+    the standard deviation.
+    """
+    observation = result.scenario.observation
+    factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
+    last = factor * quantity.posterior[-1]  # (G, 4)
+    last_mean = last[:, _MEAN]
+    last_deviation = last[:, _STANDARD_DEVIATION]
+    departure = np.abs(last_mean - factor * quantity.prior[:, _MEAN]) / last_deviation
+    sensor = int(np.nanargmax(departure))
+    mean_of_sensors: float | None = float(np.nanmean(last_mean))
+    if quantity.unit == SEVERAL_UNITS:  # sensors of different units have no mean
+        mean_of_sensors = None
+        unit = observation.sensor_units[sensor]
+    fields = {
+        "quantity": quantity.name,
+        "title": quantity_titles(quantity.name).short,
+        "unit": unit,
+        "sensor": observation.word,
+        "most": f"{sensor + 1}",
+    }
+    values = [mean_of_sensors, float(last_mean[sensor]), float(last_deviation[sensor])]
+    return FigureGroup("learnt_of_sensors", fields, values)
+
+
+def notice_record(result: MissionResult) -> JsonObject:
+    """Return the entry `notices` of the summary; empty if the twin gives no notices."""
     if result.scenario.notice is None and not result.flight.notices:
         return {}
-    return {"notices": [{"step": step} | notice.as_record() for step, notice in result.flight.notices]}
+    notices = []
+    for step, notice in result.flight.notices:
+        notices.append({"step": step, **notice.as_record()})
+    return {"notices": notices}
 
 
-def _scored(result: MissionResult) -> Iterator[Told]:
-    """Yield the figures that need the truth: how the control fell back, and errors of the estimate."""
-    scenario, flight, known = result.scenario, result.flight, result.knowledge
-    first, policy = scenario.control_names.index(scenario.mission.first_control), known.plan.control_index
-    yield of_fallback(
-        find_fallback(known.model.states, policy, first, flight.control_index, flight.state), scenario
+def _truth_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the figures that need the truth: the fallback, and errors of the estimate."""
+    scenario = result.scenario
+    flight = result.flight
+    knowledge = result.knowledge
+    fallback = find_fallback(
+        knowledge.model.states,
+        knowledge.plan.control_index,
+        scenario.control_names.index(scenario.mission.first_control),
+        flight.control_index,
+        flight.state,
     )
-    errors = filtered_rms_error(known.model, flight.filtered, flight.state)
+    yield fallback_figures(fallback, scenario)
+    errors = filtered_rms_error(knowledge.model, flight.filtered, flight.state)
     for factor, error in zip(scenario.state, errors.tolist(), strict=True):
         scale, unit = printed_state(factor.unit, "points")
-        yield "error", {"state": factor.name, "unit": unit}, [scale * error]
+        yield FigureGroup("error", {"state": factor.name, "unit": unit}, [scale * error])
 
 
-def _watched(result: MissionResult) -> Iterator[Told]:
-    """Yield the figures of a watched asset: what is believed of it now; None where no state is."""
-    states, belief = result.knowledge.model.states, result.flight.filtered[-1]
-    moments = np.transpose((states.mean(belief), states.standard_deviation(belief)))
-    for factor, values in zip(result.scenario.state, moments, strict=True):
+def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
+    """Yield the last estimate of a watched asset; its values are None if no state is believed."""
+    states = result.knowledge.model.states
+    belief = result.flight.filtered[-1]
+    is_believed = is_state_believed(float(result.flight.unexplained[-1]))
+    means = states.mean(belief)
+    deviations = states.standard_deviation(belief)
+    for factor, mean, deviation in zip(result.scenario.state, means, deviations, strict=True):
         scale, unit = printed_state(factor.unit)
-        believed = is_state_believed(float(result.flight.unexplained[-1]))
-        figures: list[Any] = (scale * values).tolist() if believed else [None, None]
-        yield "last", {"state": factor.name, "unit": unit}, figures
+        values: list[FigureValue] = [None, None]
+        if is_believed:
+            values = [float(scale * mean), float(scale * deviation)]
+        yield FigureGroup("last", {"state": factor.name, "unit": unit}, values)
 
 
 def control_changes(
     controls: Sequence[str], control_index: Index, step_name: str, first_step: int = 0
 ) -> str:
-    """Return in words when which control was left for which: ``left 3g for 2g at step 31``.
+    """Return in words when the control changed, such as "left 3g for 2g at step 31".
 
     Parameters
     ----------
-    controls : (U,)
-        Names of the controls.
-    control_index : (T,)
-        Controls flown.
+    controls : sequence of str
+        The names of the controls.
+    control_index : (T,) array
+        The index of the control flown in each step.
     step_name : str
         What a step is called.
     first_step : int
-        Number of the first one.
+        The number of the first step.
     """
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
-    changes = [
-        f"left {controls[int(control_index[step - 1])]} for {controls[int(control_index[step])]} "
-        f"at {step_name} {first_step + step}"
-        for step in steps[:_CHANGES_SAID]
-    ]
-    more = len(steps) - len(changes)
-    return ", ".join(changes) + (f", and {counted(more, 'more change')}" if more else "")
+    changes = []
+    for step in steps[:_MOST_CHANGES]:
+        previous = controls[int(control_index[step - 1])]
+        control = controls[int(control_index[step])]
+        changes.append(f"left {previous} for {control} at {step_name} {first_step + step}")
+    sentence = ", ".join(changes)
+    unnamed = len(steps) - len(changes)
+    if unnamed > 0:
+        sentence += f", and {counted(unnamed, 'more change')}"
+    return sentence
 
 
-def of_fallback(fallback: Fallback, scenario: Scenario) -> Told:
+def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     """Return the figures that say how the control fell back."""
-    name, level, delay = fallback.switch_state, fallback.switch_level, fallback.delay
-    if name is None or level is None:
-        return "nowhere", {}, ["nowhere, or by several states"]
-    scale, unit = printed_state(scenario.state[scenario.state_names.index(name)].unit)
-    fell = fallback.fallback_step
-    if fallback.early_step is not None and delay == 0:  # in force since before the damage
-        fell = delay = None
+    state = fallback.switch_state
+    level = fallback.switch_level
+    if state is None or level is None:
+        return FigureGroup("nowhere", {}, ["nowhere, or by several states"])
+    scale, unit = printed_state(scenario.state[scenario.state_names.index(state)].unit)
+    fallback_step = fallback.fallback_step
+    delay = fallback.delay
+    if fallback.early_step is not None and delay == 0:
+        # The other control was in force before the damage: this is no fallback from it.
+        fallback_step = None
+        delay = None
     step = scenario.mission.step_name
-    words = {"state": name, "unit": unit, "step": step, "steps": step if delay == 1 else f"{step}s"}
-    return "fallback", words, [scale * level, fallback.called_for_step, fell, delay, fallback.early_step]
+    steps = step if delay == 1 else f"{step}s"
+    fields = {"state": state, "unit": unit, "step": step, "steps": steps}
+    values = [
+        scale * level,
+        fallback.called_for_step,
+        fallback_step,
+        delay,
+        fallback.early_step,
+    ]
+    return FigureGroup("fallback", fields, values)
 
 
-def another_truth(parameter: str, truth: float, mean: float, deviation: float) -> str | None:
-    """Return what to say of an asset whose truth is far off what its twin was calibrated with, or None."""
-    off = abs(truth - mean)
-    if off <= TRUTH_IS_OFF * deviation or deviation <= 0.0:
+def truth_mismatch(
+    parameter: str, truth: float, mean: float, standard_deviation: float
+) -> str | None:
+    """Return the sentence that the flown asset is not the calibrated one; None if it may be.
+
+    Parameters
+    ----------
+    parameter : str
+        The name of the calibrated parameter.
+    truth : float
+        Its true value in the flown asset.
+    mean, standard_deviation : float
+        The moments of its calibration.
+    """
+    difference = abs(truth - mean)
+    if difference <= TRUTH_IS_OFF * standard_deviation or standard_deviation <= 0.0:
         return None
     return (
-        f"The true {parameter_title(parameter)} of the asset flown is {truth:.5g}, {off / deviation:.1f} "
-        f"standard deviations from the {mean:.5g} ± {deviation:.2g} that the twin was calibrated with: it "
-        "flies with the model of another asset."
+        f"The true {parameter_title(parameter)} of the asset flown is {truth:.5g}, "
+        f"{difference / standard_deviation:.1f} standard deviations from the {mean:.5g} ± "
+        f"{standard_deviation:.2g} that the twin was calibrated with: it flies with the model of "
+        "another asset."
     )

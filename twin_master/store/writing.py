@@ -1,11 +1,11 @@
-"""The run store: NetCDF for programs, CSV for people, a summary; every file whole or not there."""
+"""The files of a run: NetCDF for programs, CSV for people, a summary; each complete or absent."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
@@ -14,11 +14,11 @@ from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from twin_master.assets.asset_source import FlownAndBelieved
-from twin_master.errors import NotResumableError, RunFolderError, said
-from twin_master.run_folder import FIELD_NAME, read_config, to_json
+from twin_master.errors import NotResumableError, RunFolderError
+from twin_master.run_folder import FIELD_NAME, JsonObject, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
-from twin_master.store.results import groups_of, tables_of
-from twin_master.store.summary import Figure, Told, control_changes, noticed, summarise
+from twin_master.store.results import csv_tables, run_groups
+from twin_master.store.summary import Figure, FigureGroup, control_changes, notice_record, summarise
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -27,25 +27,33 @@ if TYPE_CHECKING:
 RUN_NAME = "run.nc"
 SUMMARY_NAME = "summary.json"
 TIMING_NAME = "timing.json"
+REPORT_NAME = "report.html"
 CSV_FOLDER = "csv"
 
 
-def write_run(folder: Path, groups: Mapping[str, NetcdfGroup], attributes: Mapping[str, Any]) -> Path:
-    """Write `run.nc`; the bytes depend on nothing but what is given.
+def write_run(
+    folder: Path, groups: Mapping[str, NetcdfGroup], attributes: Mapping[str, object]
+) -> Path:
+    """Write `run.nc`; its bytes depend on nothing but the arguments.
 
     Parameters
     ----------
-    folder
+    folder : Path
         The run folder.
-    groups
-        By name.
-    attributes
-        Of the root: seed, versions, hashes.
+    groups : mapping of str to NetcdfGroup
+        The groups by name.
+    attributes : mapping of str to object
+        The attributes of the root: seed, versions, hashes.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
     with atomic_file(folder / RUN_NAME) as temporary:
         write_groups(temporary, groups, attributes)
@@ -53,60 +61,81 @@ def write_run(folder: Path, groups: Mapping[str, NetcdfGroup], attributes: Mappi
 
 
 def open_run(folder: Path | str) -> "DataTree":
-    """Return everything that a run has stored, `run.nc`, loaded into memory.
+    """Return everything that a run has stored in `run.nc`, loaded into memory.
 
     Raises
     ------
     RunFolderError
-        There is no ``run.nc``, or it is damaged.
+        If there is no ``run.nc``, or it is damaged.
     """
     restore_folder(Path(folder))
     path = Path(folder) / RUN_NAME
     if not path.is_file():
-        raise RunFolderError(said("run_folder.no_run", folder=folder))
-    after = ": it is not a whole run, resume the run or fly it again."
-    with RunFolderError.instead_of(DamagedFileError, after=after):
+        raise RunFolderError(
+            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
+        )
+    advice = ": it is not a whole run, resume the run or fly it again."
+    with RunFolderError.instead_of(DamagedFileError, after=advice):
         return read_groups(path)
 
 
 def store_flight(
     folder: Path,
-    config: Mapping[str, Any],
+    config: JsonObject,
     result: MissionResult,
     origin: FlownAndBelieved,
     *,
     steps: int,
-    figures: Sequence[Told] = (),
-    attributes: Mapping[str, Any] | None = None,
+    figures: Sequence[FigureGroup] = (),
+    attributes: Mapping[str, object] | None = None,
     misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
 ) -> None:
-    """Write all that a run or a watch leaves beside its report.
+    """Write all files that a run or a watch leaves, except its report.
 
     Parameters
     ----------
-    folder
+    folder : Path
         The run folder.
-    result
+    config : dict
+        The content of `config.json`.
+    result : MissionResult
         The mission.
-    config
-        Content of `config.json`.
-    origin
-        What was flown, and what the twin believed.
-    steps
-        Steps flown in all, or planned.
-    figures
-        Of the summary, before those of every mission.
-    attributes
-        Further ones of the root of `run.nc`.
-    misfit
-        Of the twin's model, where the asset is known to be another one.
-    write_field
-        Writes the VTU file to the path that it is given.
+    origin : FlownAndBelieved
+        What was flown, and what the twin believed, in words.
+    steps : int
+        The number of steps that were flown or planned.
+    figures : sequence of FigureGroup
+        Figures of the summary that come before those of every mission.
+    attributes : mapping of str to object, optional
+        Further attributes of the root of `run.nc`.
+    misfit : (S, U, G) array, optional
+        The relative difference of the twin's model to the asset, see `summarise`.
+    write_field : callable, optional
+        Writes the VTU file of the last estimated field to a path.
     """
-    provenance, mission, draws = config["provenance"], result.scenario.mission, result.knowledge.draws
-    flown = {"asset": origin.asset, "twin_model": origin.model}
-    told = {
+    groups = run_groups(result)
+    root_attributes = _root_attributes(config, result, origin)
+    root_attributes |= attributes or {}
+    write_run(folder, groups, root_attributes)
+    for name, text in csv_tables(groups, result.scenario.observation).items():
+        atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
+    if write_field is not None:
+        write_field(folder / FIELD_NAME)
+    rewards = groups["filtered"]["reward_mean"].values
+    summary = _summary_heading(result, origin, steps)
+    summary["figures"] = [asdict(figure) for figure in summarise(result, rewards, misfit, figures)]
+    atomic_write_text(folder / SUMMARY_NAME, to_json(summary))
+
+
+def _root_attributes(
+    config: JsonObject, result: MissionResult, origin: FlownAndBelieved
+) -> dict[str, object]:
+    """Return the attributes of the root of `run.nc`."""
+    provenance = config["provenance"]
+    mission = result.scenario.mission
+    draws = result.knowledge.draws
+    return {
         "title": mission.title or mission.name,
         "scenario": mission.name,
         "seed": mission.seed,
@@ -117,34 +146,30 @@ def store_flight(
         "observed_quantity": result.scenario.observation.role,
         "parameter": draws.name,
         "parameter_source": draws.source,
-        **flown,
-        **(attributes or {}),
+        "asset": origin.asset,
+        "twin_model": origin.model,
     }
-    groups = groups_of(result)
-    write_run(folder, groups, told)
-    for name, text in tables_of(groups, result.scenario.observation).items():
-        atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
-    if write_field is not None:
-        write_field(folder / FIELD_NAME)
-    flight, controls = result.flight, result.scenario.control_names
-    heading = {
+
+
+def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int) -> JsonObject:
+    """Return the summary without its figures."""
+    scenario = result.scenario
+    mission = scenario.mission
+    flight = result.flight
+    return {
         "scenario": mission.name,
         "title": mission.title,
         "seed": mission.seed,
         "steps": steps,
-        "control": control_changes(controls, flight.control_index, mission.step_name, flight.first_step),
-        **flown,
+        "control": control_changes(
+            scenario.control_names, flight.control_index, mission.step_name, flight.first_step
+        ),
+        "asset": origin.asset,
+        "twin_model": origin.model,
         "asset_and_model_differ": origin.differ,
-        **learnt_record(result.learnt, result.scenario.observation.sensor_units),
-        **noticed(result),
+        **learnt_record(result.learnt, scenario.observation.sensor_units),
+        **notice_record(result),
     }
-    rewards = groups["filtered"]["reward_mean"].values
-    shown = [asdict(figure) for figure in summarise(result, rewards, misfit, figures)]
-    atomic_write_text(folder / SUMMARY_NAME, to_json({**heading, "figures": shown}))
-
-
-REPORT_NAME = "report.html"
-"""In the run folder: the report."""
 
 
 @dataclass(frozen=True)
@@ -156,25 +181,25 @@ class RunOutcome:
     folder : Path
         The run folder.
     report : Path or None
-        The report in it; None where none was asked for.
+        The report in it; None if there is none.
     figures : tuple of Figure
         The summary.
     timing : dict
-        Content of `timing.json`.
+        The content of `timing.json`.
     origin : FlownAndBelieved
         What was flown and what the twin believed, in words.
     step_name : str
         What a step is called.
     control : str
-        When which control was left for which, in words.
+        When the control changed, in words.
     notices : tuple of str
-        What the operator should know, a sentence each.
+        What the operator should know, one sentence each.
     """
 
     folder: Path
     report: Path | None
     figures: tuple[Figure, ...]
-    timing: Mapping[str, Any]
+    timing: JsonObject
     origin: FlownAndBelieved
     step_name: str
     control: str
@@ -182,36 +207,39 @@ class RunOutcome:
 
     @cached_property
     def tree(self) -> "DataTree":
-        """All that the run has stored, as of `open_run`."""
+        """Everything that the run has stored, see `open_run`."""
         return open_run(self.folder)
 
 
 def read_outcome(folder: Path) -> RunOutcome:
-    """Return what came of the run in a folder.
+    """Return the outcome of the run in a folder.
 
     Raises
     ------
     KeyError, TypeError, DamagedFileError, NotResumableError
-        A result is missing or damaged.
+        If a result is missing or damaged.
     """
+    timing = read_json(folder / TIMING_NAME, DamagedFileError)
+    summary = read_json(folder / SUMMARY_NAME, DamagedFileError)
     report = folder / REPORT_NAME
-    timing, summary = (read_json(folder / name, DamagedFileError) for name in (TIMING_NAME, SUMMARY_NAME))
     return RunOutcome(
         folder,
-        report if report.is_file() else None,
-        tuple(Figure(**figure) for figure in summary["figures"]),
-        timing,
-        FlownAndBelieved(
-            str(summary["asset"]), str(summary["twin_model"]), bool(summary["asset_and_model_differ"])
+        report=report if report.is_file() else None,
+        figures=tuple(Figure(**figure) for figure in summary["figures"]),
+        timing=timing,
+        origin=FlownAndBelieved(
+            str(summary["asset"]),
+            str(summary["twin_model"]),
+            bool(summary["asset_and_model_differ"]),
         ),
-        str(read_config(folder)["scenario"]["mission"]["step_name"]),
-        str(summary["control"]),
-        tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
+        step_name=str(read_config(folder)["scenario"]["mission"]["step_name"]),
+        control=str(summary["control"]),
+        notices=tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
     )
 
 
 def finished_run(folder: Path) -> RunOutcome | None:
-    """Return the outcome of a run that is finished; None where its results are missing or damaged."""
+    """Return the outcome of a run; None if it is not finished, or its results are damaged."""
     try:
         open_run(folder)
         return read_outcome(folder)

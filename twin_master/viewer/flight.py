@@ -25,11 +25,11 @@ from twin_master.learning.expectation import (
     concatenate_expectations,
     expectation_of_draws,
 )
-from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
-from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
+from twin_master.mission.journal import JOURNAL_NAME, array_from_json, records_in_file
+from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, load_knowledge
 from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict
-from twin_master.run_folder import kept_scenario
+from twin_master.run_folder import read_scenario
 from twin_master.viewer.force_drawing import ForceDrawing, find_force_drawing
 
 MOST_NEW_LINES = 200
@@ -122,7 +122,7 @@ class Flight:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._path = folder / JOURNAL_NAME
-        self.scenario = kept_scenario(folder)
+        self.scenario = read_scenario(folder)
         self.number = 0
         self._start_with_file(0)
 
@@ -140,7 +140,7 @@ class Flight:
 
     def _add_model(self, begin: int) -> None:
         """Add the next model of the twin, which it believes from a byte of the journal on."""
-        knowledge = kept_knowledge(self.folder, self.scenario, len(self._models))
+        knowledge = load_knowledge(self.folder, self.scenario, len(self._models))
         self._models.append(_JournalledKnowledge(begin, knowledge))
 
     @property
@@ -180,7 +180,7 @@ class Flight:
             status = os.fstat(file.fileno())
             if self._has_other_file(status):
                 self._start_with_file(status.st_ino)
-            new_lines = islice(records_of(file, self._path, self._end), MOST_NEW_LINES)
+            new_lines = islice(records_in_file(file, self._path, self._end), MOST_NEW_LINES)
             for record, begin, end in new_lines:
                 self._take_line(record, begin)
                 self._end = end
@@ -260,18 +260,18 @@ class Flight:
 
     def _record_at(self, file: BinaryIO, begin: int) -> StepRecord:
         """Return the record of the line that begins at a byte of the journal."""
-        record, _, _ = next(records_of(file, self._path, begin))
+        record, _, _ = next(records_in_file(file, self._path, begin))
         return record
 
     def observations_in(self, records: Sequence[StepRecord]) -> Float:
         """Return the readings of the sensors in n steps: (n, G), SI; NaN if lost."""
         count = self.scenario.observation.count
-        return np.array([array_of(record["observed"][:count]) for record in records])
+        return np.array([array_from_json(record["observed"][:count]) for record in records])
 
     def true_states_in(self, records: Sequence[StepRecord]) -> Float:
         """Return the true state in n steps: (n, K), SI; NaN if nobody knows it."""
         unknown = [None] * len(self.scenario.state)
-        return np.array([array_of(record.get("state", unknown)) for record in records])
+        return np.array([array_from_json(record.get("state", unknown)) for record in records])
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
         """Return what the twin believed in each of n steps when the step was flown."""
@@ -293,7 +293,7 @@ class Flight:
         controls = [record["control_index"] for record in records]
         joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
         if knowledge.expectation is None:
-            rows = np.array([array_of(record["observed"]) for record in records])
+            rows = np.array([array_from_json(record["observed"]) for record in records])
             expected = _expectation_without_learning(knowledge, joint, rows)
         else:
             expected = self._expectation_with_learning(knowledge.expectation, joint, records)
@@ -333,14 +333,14 @@ class Flight:
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
         """Return what the twin expected after a step in each of the n steps to come."""
         knowledge = self._knowledge_in(record)
-        filtered = array_of(record["filtered"])
+        filtered = array_from_json(record["filtered"])
         control = record["control_index"]
         horizon = self.scenario.mission.prediction_steps
         predicted = predict(
             knowledge.model, filtered, control, knowledge.plan.policy, horizon
         ).predicted
         unexplained = _unexplained_probability(record)
-        joint = predicted[..., None] * knowledge.asked(unexplained)  # (n, S, U)
+        joint = predicted[..., None] * knowledge.policy_with_doubt(unexplained)  # (n, S, U)
         if knowledge.expectation is None:
             expected = _expectation_without_learning(knowledge, joint, None)
         else:

@@ -15,18 +15,26 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
+from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     check_header,
     records_backwards,
 )
-from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
-from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import link_knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
+from twin_master.run_folder import (
+    PICTURE,
+    TEACHING,
+    VERDICT,
+    record_inputs,
+    remove_half_written_files,
+)
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feed import Feed
 from twin_master.watch.intake import Counts, Intake
@@ -131,14 +139,14 @@ class Watch:
         self.folder = folder
         self.scenario = scenario
         self.progress = progress
-        tidy(folder)
+        remove_half_written_files(folder)
         if sibling is None:
             self.source: AssetSource = believed_source(scenario)
             self._inputs: Mapping[str, str] = self.source.prepare(folder, progress)
         else:
             self.source = sibling.source
             self._inputs = sibling._inputs
-        self.config = with_inputs(folder, config, self._inputs)
+        self.config = record_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = []
         self.models.append(self._prepare_model() if sibling is None else sibling.models[0])
         self.journal_path = folder / JOURNAL_NAME
@@ -163,11 +171,11 @@ class Watch:
         # Without adopted patches both have the knowledge of the beginning
         has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
         if sibling is not None and has_same_knowledge:
-            share_knowledge(sibling.folder, self.folder)
+            link_knowledge(sibling.folder, self.folder)
         else:
-            keep_knowledge(self.folder, self.models[-1].knowledge)
+            save_knowledge(self.folder, self.models[-1].knowledge)
         for number, model in enumerate(self.models[:-1]):
-            keep_knowledge(self.folder, model.knowledge, number)
+            save_knowledge(self.folder, model.knowledge, number)
 
     def update_from_journal(self) -> None:
         """Read the state of teaching from the journal, and load the models adopted there."""
@@ -288,7 +296,7 @@ class Watch:
 
     def decision_of(self, line: JournalLine) -> JsonObject:
         """Return the decision in a line of the journal; empty if the line has none."""
-        return journalled_decision(line, self.scenario, self.models[-1].knowledge.model)
+        return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
     def _write_step(self, step: MissionStep) -> JsonObject:
         """Write a step into the journal; return its line."""
@@ -302,7 +310,7 @@ class Watch:
         if notices:
             line["notices"] = line.get("notices", []) + notices
         self._append_line(line)
-        self.filtered = step.concluded.filtered
+        self.filtered = step.twin_step.filtered
         self.is_quiet = False
         self._time_of_last_step = time.monotonic()
         return line
@@ -471,8 +479,8 @@ class Watch:
 
         # Before viewers read the line of the model: they show earlier steps with the old knowledge
         former_number = len(self.models) - 2
-        keep_knowledge(self.folder, self.models[former_number].knowledge, former_number)
-        keep_knowledge(self.folder, outcome.model.knowledge)
+        save_knowledge(self.folder, self.models[former_number].knowledge, former_number)
+        save_knowledge(self.folder, outcome.model.knowledge)
         self.write_event(model=record)
         self._show_adoption(record)
 

@@ -13,7 +13,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError
-from twin_master.mission.journal import state_text, step_record
+from twin_master.mission.journal import encode_state, step_record
 from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
@@ -195,7 +195,7 @@ class Intake:
         twin : Twin
             The twin after this step.
         """
-        concluded = step.concluded
+        concluded = step.twin_step
         record = step_record(step) | {
             "observation_step": self.observation_step,
             "control_index": twin.control_of(self.observation_step),
@@ -207,7 +207,7 @@ class Intake:
             settled = twin.settled()
             if settled:
                 settled_step, settled_state = settled
-                record["settled"] = {"step": settled_step, "state": state_text(settled_state)}
+                record["settled"] = {"step": settled_step, "state": encode_state(settled_state)}
         given_by_twin = {(notice.kind, notice.sensors) for notice in concluded.notices}
         new_notices = []
         for notice in self.notices:
@@ -397,7 +397,7 @@ class Intake:
         self._unreadable = (self._unreadable | unreadable.keys()) - readable_again
         return notices
 
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that has probability zero in every state.
 
         Parameters

@@ -77,7 +77,7 @@ def begin_watch(
     source = believed_source(resolved)
     source.check()
     files = source.files() | _client_files_to_discard(folder)
-    opened = run_folder.begun_folder(
+    opened = run_folder.new_run_folder(
         resolved, file, folder, files, replace=replace_run, watched=True
     )
     with opened as (config, located_scenario):
@@ -123,7 +123,7 @@ def resume_watch(
         raise NotResumableError(
             f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
         )
-    with run_folder.resumed_folder(folder, loaded) as (config, scenario):
+    with run_folder.hold_run_folder(folder, loaded) as (config, scenario):
         try:
             run_folder.check_versions(folder, config, scenario.mission.seed)
             resumed = Watch(folder, config, scenario, progress, sibling)
@@ -177,7 +177,7 @@ def copy_of_run_until(
         shutil.copytree(folder / "asset", copy / "asset")
         with journal.open("rb") as file:
             (copy / JOURNAL_NAME).write_bytes(file.read(journal_end))
-        scenario = run_folder.kept_scenario(folder).with_paths_from(copy)
+        scenario = run_folder.read_scenario(folder).with_paths_from(copy)
         store_watch(Watch(copy, config, scenario, progress), Counts(), report=False)
         yield copy
 
@@ -225,7 +225,7 @@ def is_stored(folder: Path) -> bool:
 
 def _watch_config(folder: Path) -> JsonObject | None:
     """Return the configuration of a watch; None if the folder holds something else."""
-    config = run_folder.folder_config(folder)
+    config = run_folder.find_config(folder)
     return config if config is not None and config.get("watched") else None
 
 
@@ -383,7 +383,7 @@ def _scenario_for_reading(
 ) -> Scenario:
     """Return the scenario by which observations are read, with its paths located."""
     if loaded is None:
-        scenario = run_folder.kept_scenario(folder).with_paths_from(folder)
+        scenario = run_folder.read_scenario(folder).with_paths_from(folder)
     else:
         scenario = loaded.scenario.with_paths_from(loaded.path.parent)
     if allow_unknown:

@@ -18,8 +18,9 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.loop import BelievedModel, gap_of, replay
-from twin_master.mission.preparation import Knowledge, prepared_alone
+from twin_master.mission.preparation import Knowledge, prepare_without_folder
+from twin_master.mission.replay import BelievedModel, replay
+from twin_master.mission.residuals import residual_summary
 from twin_master.mission.steps import History
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
@@ -63,7 +64,7 @@ class PatchOutcome:
         The log evidence of the compared steps with the patch minus that without it [nats].
     record : dict
         The keys `before` and `after`, with the residual and the log evidence of the steps from the
-        patch on (`gap_of`), and `policy_change`, a sentence, for the journal.
+        patch on (`residual_summary`), and `policy_change`, a sentence, for the journal.
     """
 
     patch: bytes
@@ -99,7 +100,7 @@ def patched_model(
         )
     scenario = scenario.with_changes("belief", patch=str(patch))
     source: AssetSource = scenario.belief.source(scenario, None)
-    return BelievedModel(from_step, prepared_alone(scenario, source, progress), patch)
+    return BelievedModel(from_step, prepare_without_folder(scenario, source, progress), patch)
 
 
 def outcome_of_patch(
@@ -148,8 +149,8 @@ def outcome_of_patch(
     evidence_before = _log_evidence(before, compared)
     evidence_after = _log_evidence(after, compared)
     record = {
-        "before": gap_of(before, from_step, models),
-        "after": gap_of(after, from_step, [*models, model]),
+        "before": residual_summary(before, from_step, models),
+        "after": residual_summary(after, from_step, [*models, model]),
         "policy_change": describe_policy_change(models[-1].knowledge, model.knowledge),
     }
     return PatchOutcome(patch, model, float(evidence_after - evidence_before), record)
@@ -159,7 +160,7 @@ def _log_evidence(history: History, compared: ComparedSteps) -> float:
     """Return the log evidence of the compared steps in a history [nats]."""
     begin = compared.first - history.first_step
     steps = history.steps[begin:][: compared.count]
-    return sum(step.concluded.log_evidence for step in steps)
+    return sum(step.twin_step.log_evidence for step in steps)
 
 
 def merge_patches(believed: Path | None, new: Path) -> bytes:

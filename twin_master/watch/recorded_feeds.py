@@ -14,7 +14,7 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
+from twin_master.mission.journal import JOURNAL_NAME, array_from_json, record_of_line
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feed import Feed
 from twin_master.watch.lines import GrowingFile, Position, contains, find_file
@@ -206,7 +206,7 @@ class FolderFeed(RecordedFeed):
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
         """Return the observation in a line; None if it has none, or was cut off by a kill."""
-        record = whole_record(line, self.path)
+        record = record_of_line(line, self.path)
         if record is None and line.endswith(b"\n"):
             number = self.path.read_bytes()[:begin].count(b"\n") + 1
             return Refused(f"line {number} of {self.path.name} was changed or is damaged")
@@ -219,7 +219,7 @@ class FolderFeed(RecordedFeed):
 
     def _message_of(self, line: JournalLine) -> Message | Refused | None:
         """Return the observation in a line of the journal; None for a step without a message."""
-        observed = array_of(line["observed"])
+        observed = array_from_json(line["observed"])
         control = int(line["control_index"])
         line_step = int(line["step"])
         step = int(line.get("observation_step", line_step))

@@ -6,10 +6,10 @@ from itertools import takewhile
 
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.mission.journal import last_step, records_backwards
-from twin_master.mission.loop import replay
+from twin_master.mission.replay import replay
 from twin_master.network.estimator import Notice
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import Told
+from twin_master.store.summary import FigureGroup
 from twin_master.store.writing import store_flight
 from twin_master.watch.folder import WATCHED_ASSET, Watch
 from twin_master.watch.intake import Counts
@@ -68,7 +68,7 @@ def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
     """Return the last of the steps of a watch, smoothed, as the result of a mission."""
     first = max(0, step_count - last)
     history, _ = replay(watch.journal_path, watch.models, None, first_step=first)
-    history = history.behind(first - history.first_step)
+    history = history.without_first(first - history.first_step)
     history = replace(history, notices=notices_since(watch, first))
     knowledge = watch.models[-1].knowledge
     return MissionResult(watch.scenario, knowledge, history, models=watch.models)
@@ -113,7 +113,7 @@ def _step_of(line: JournalLine) -> int:
     return max(int(line.get("step", 0)), 0)
 
 
-def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Told]:
+def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[FigureGroup]:
     """Return the figures for the summary: numbers of messages, and the gap of each patch."""
     words = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
     message_counts = [
@@ -123,8 +123,9 @@ def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Told
         counts.duplicates,
         counts.rejected,
     ]
-    figures: list[Told] = [("watch", words, message_counts)]
+    figures = [FigureGroup("watch", words, message_counts)]
     for model in watch.teaching.adopted_models:
         residuals = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-        figures.append(("patch", words | {"first": model["from_step"]}, residuals))
+        fields = words | {"first": model["from_step"]}
+        figures.append(FigureGroup("patch", fields, residuals))
     return figures

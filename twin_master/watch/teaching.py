@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import damaged, records_backwards
+from twin_master.mission.journal import damaged_line_error, records_backwards
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.records import JournalLine, JsonObject, ModelRecord, VerdictRecord
 
@@ -135,7 +135,7 @@ class Teaching:
             journal_size = journal_size or end
             is_header = begin == 0
             if not is_header and line["standing"]["begin"] != begin:
-                raise damaged(path, begin, "lines before it are missing, or not its own")
+                raise damaged_line_error(path, begin, "lines before it are missing, or not its own")
             if journal_size - begin > CHECKED_BYTES:
                 break
         if "standing" in last_line:

@@ -39,7 +39,7 @@ from twin_master.assets.resolution import Overrides, believed_source, resolve_sc
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
-from twin_master.mission.sensor_design import with_candidates
+from twin_master.mission.sensor_design import add_candidate_gauges
 from twin_master.mission.steps import Plant, Truth
 from twin_master.network.identified import packed_row
 from twin_master.network.twin import build_graphical_model
@@ -139,10 +139,10 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
         previous = controls[step - 1] if step else None
         ours, theirs = (plant.fly_step(control, previous) for plant in (split, single))
         np.testing.assert_array_equal(ours.observed, theirs.observed, err_msg=str(step))
-        np.testing.assert_array_equal(ours.happened.state, theirs.happened.state)
-        np.testing.assert_array_equal(ours.happened.observation, theirs.happened.observation)
-        assert theirs.happened.monitors.items() <= ours.happened.monitors.items()
-    assert theirs.happened.state.max() == 0.6
+        np.testing.assert_array_equal(ours.ground_truth.state, theirs.ground_truth.state)
+        np.testing.assert_array_equal(ours.ground_truth.observation, theirs.ground_truth.observation)
+        assert theirs.ground_truth.monitors.items() <= ours.ground_truth.monitors.items()
+    assert theirs.ground_truth.state.max() == 0.6
 
 
 def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
@@ -387,18 +387,18 @@ def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     """What is wrong names the option."""
     panel = resolve_scenario(load_scenario("stiffened_panel"), Overrides())
     whole = panel.model_copy(update={"rewards": panel.rewards.model_copy(update={"health_sensors": "all"})})
-    found, folder = with_candidates(whole, "2", tmp_path / "2"), tmp_path / "0"
+    found, folder = add_candidate_gauges(whole, "2", tmp_path / "2"), tmp_path / "0"
     limited = [found.observation.titles[number - 1] for number in found.rewards.health_sensors]
     assert limited == [*panel.observation.titles]  # health stays that of the gauges of the file
     with pytest.raises(MissionInputError, match="--candidates needs at least one place"):
-        with_candidates(panel, "0", folder)
+        add_candidate_gauges(panel, "0", folder)
     for name, point, words in (
         ("end_1", "[150, 100, 2]", "end_1"), ("far", "[150, 100, 90]", r"gauge\[1\] \(far\): the point")
     ):  # fmt: skip
         one = f'[[gauge]]\nname = "{name}"\npoint = {point}\ndirection = [1, 0, 0]\n'
         listed, folder = written(tmp_path, one, name="more.toml"), tmp_path / name
         with pytest.raises(InvalidDesignError, match=f"^--candidates .*more.toml: .*{words}") as caught:
-            with_candidates(panel, str(listed), folder)
+            add_candidate_gauges(panel, str(listed), folder)
         assert str(folder) not in str(caught.value)
     source = structure_files()["stiffened_panel"]
     shutil.copy(source.with_suffix(".msh"), tmp_path)
@@ -408,4 +408,4 @@ def test_gauges_that_cannot_stand_beside_those_of_the_file(tmp_path):
     inline = written(tmp_path, rows + edited(text, (gauges, "")), name="panel.toml")
     believed = panel.belief.model_copy(update={"structure": str(inline)})
     with pytest.raises(MissionInputError, match=r"as tables \[\[gauge\]\], not in a list"):
-        with_candidates(panel.model_copy(update={"belief": believed}), "3", tmp_path / "3")
+        add_candidate_gauges(panel.model_copy(update={"belief": believed}), "3", tmp_path / "3")

@@ -37,7 +37,7 @@ from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import result_of_unflown
 from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
-from twin_master.fleet_command import engine_of
+from twin_master.fleet_command import choose_engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
@@ -268,8 +268,8 @@ def test_the_command_line(library_file, tmp_path):
 
 def test_all_processors_fly_unless_the_user_says_how_many():
     cores = len(os.sched_getaffinity(0))
-    assert [engine_of(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
-    assert engine_of(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
+    assert [choose_engine(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
+    assert choose_engine(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
 
 
 def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:
@@ -283,7 +283,7 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
 
 
 def same(first: Flights, second: Flights) -> bool:
-    names = ("row", "control_index", "state", "filtered", "log_evidence")
+    names = ("observation_rows", "control_index", "state", "filtered", "log_evidence")
     pairs = ((getattr(first, name), getattr(second, name)) for name in names)
     told = (first.failure, first.ended) == (second.failure, second.ended)
     return told and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)

@@ -42,7 +42,7 @@ from twin_master.fleet.reading import (
 )
 from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.view import ATTENTION_ROWS
-from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
@@ -229,7 +229,7 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     folder = fly_fleet(fleet, tmp_path / "fleet").folder
     (stored,) = open_fleet(folder).values()
     (group,) = fleet.groups
-    known = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+    known = load_knowledge(group_folder(folder, group, 0), group.scenarios[0])
     rows, control = stored["observed"].values, stored["control_index"].values.astype(int)
     assert np.isfinite(rows[:, 0, 24:]).all()
     family = TransitionFamily.learnable(known.scenario)
@@ -324,11 +324,11 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
     fleet, folder = grown
     (group,), (name,) = open_fleet(folder).values(), open_fleet(folder)
     scenario, home = fleet.groups[0].scenarios[0], tmp_path / "groups" / name
-    knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    knowledge = load_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
     for place, control in enumerate((1, 0)):
         (home / str(place)).mkdir(parents=True)
         always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
-        keep_knowledge(home / str(place), replace(knowledge, policy=always))
+        save_knowledge(home / str(place), replace(knowledge, policy=always))
     table = scenario.portable().to_dict()
     record = {"name": name, "members": [["a", 3, 0], ["b", 4, 1]], "scenarios": [table, table]}
     two = group.isel(twin=slice(2))
@@ -392,7 +392,7 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
         assert words in text
 
     scenario = fleet.groups[0].scenarios[0]
-    knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    knowledge = load_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
     model, policy = knowledge.model, knowledge.plan.control_index
     belief = np.eye(model.states.size)
     always = replace(knowledge, policy=BeliefPolicy(np.ones((1, len(belief))), np.array([1])))

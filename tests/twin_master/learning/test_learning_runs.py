@@ -15,14 +15,14 @@ from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
-from twin_master.command import _shown
+from twin_master.command import printed_value
 from twin_master.errors import TwinMasterError
 from twin_master.report.learnt import sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
-from twin_master.store.mission_result import MissionResult, printed_learnt
+from twin_master.store.mission_result import MissionResult, printed_unit_of_quantity
 from twin_master.viewer.flight import Flight
 from uav_twin import fly, load_scenario, open_run, prepare_twin, report_figures
 
@@ -194,7 +194,7 @@ def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
     given: dict[str, Any] = {"mission": {"steps": 2}, "calibration": {"draws": 4}}
     given |= {"learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
     plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is no strain
-    assert printed_learnt("gauge_offset", "1", plain.scenario) == (1.0, "")
+    assert printed_unit_of_quantity("gauge_offset", "1", plain.scenario) == (1.0, "")
     fly(changed_scenario("pump_wear", given), tmp_path, report=False)
     summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]
     told = {figure["key"]: figure for figure in summary["figures"]}
@@ -241,7 +241,7 @@ def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_re
     faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
     spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
     console = said("run", spoilt, "--out", noticed, "--no-report")
-    assert _shown(123_456, "") == "123456"  # a step has all of its digits
+    assert printed_value(123_456, "") == "123456"  # a step has all of its digits
     alarm = next(line for line in console.splitlines() if line.startswith("Step ") and "gauge 5" in line)
     assert "gauge 5 shows too much, or the asset near it" in alarm
     assert ", since about step 2 (" in alarm

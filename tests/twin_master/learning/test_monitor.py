@@ -16,7 +16,7 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError, Invalid
 from twin_master.learning import hypothesis_weights
 from twin_master.learning.hypothesis_weights import HypothesisWeights
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.mission.journal import line_of, step_record
+from twin_master.mission.journal import encode_line, step_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import NoticeWording
@@ -257,7 +257,7 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
             if step.suspicion is not None:
                 assert 0.0 <= step.suspicion.none_of_these + step.suspicion.gauge_off <= 1.0 + 1e-12
             record = MissionStep(Reading(np.full(2, np.nan)), step)
-            line_of(step_record(record))  # which holds no NaN and no infinity
+            encode_line(step_record(record))  # which holds no NaN and no infinity
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():

@@ -34,8 +34,8 @@ from twin_master.fleet.plan import ensemble
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.store import ENDED
 from twin_master.mission import loop
-from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
-from twin_master.mission.loop import fly, kept_in, taken_up
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line
+from twin_master.mission.loop import fly, journal_sink, restore_flight
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, MissionStep, Plant, SensorStatus, Truth
 from twin_master.network.twin import build_graphical_model
@@ -63,8 +63,8 @@ def part(known: Known, folder: Path, config_hash: str = "abc", kind: type[Plant]
     knowledge, source = known
     plant = kind(knowledge.scenario, knowledge.truth(3), source.open())
     with JournalFile(folder, config_hash) as file:
-        before = taken_up(file, knowledge, plant)
-        return fly(knowledge.scenario, before.twin, plant, kept_in(file, plant), history=before)
+        before = restore_flight(file, knowledge, plant)
+        return fly(knowledge.scenario, before.twin, plant, journal_sink(file, plant), history=before)
 
 
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
@@ -230,7 +230,7 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
             part(known, tmp_path)
     path.write_bytes(whole)
     for step, record in enumerate(journal(tmp_path)):
-        other = line_of(record | {"next_control": 1 - record["next_control"]})
+        other = encode_line(record | {"next_control": 1 - record["next_control"]})
         path.write_bytes(b"".join([*lines[: step + 1], other, *lines[step + 2 :]]))
         with pytest.raises(NotResumableError, match=f"decided otherwise after step {step} .*--replace"):
             part(known, tmp_path)

@@ -28,15 +28,21 @@ from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission import sensor_design
 from twin_master.mission.loop import fly
-from twin_master.mission.planning import compared, expected_plan, policy_file, promised, risk_of
-from twin_master.mission.preparation import Knowledge, kept_knowledge
-from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
+from twin_master.mission.planning import (
+    compare_simple_rules,
+    encode_policy,
+    plan_within_limit,
+    share_beyond_limit,
+    simulate_policy,
+)
+from twin_master.mission.preparation import Knowledge, load_knowledge
+from twin_master.mission.sensor_design import DrawnReadings, choose_sensors, draw_readings, level_separations
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.transition import TransitionModel
-from twin_master.plan_command import _without
-from twin_master.run_folder import kept_scenario
+from twin_master.plan_command import _without_information
+from twin_master.run_folder import read_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
@@ -129,19 +135,19 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
     path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
     given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
-    policy.write_bytes(policy_file(given, knowledge().model))
+    policy.write_bytes(encode_policy(given, knowledge().model))
     (tmp_path / "empty").touch()
     for wrong in (path, tmp_path / "empty"):
         told = refused("run", path, "--policy", wrong, "--out", folder)
         assert "is no policy" in told
         assert "pickle" not in told
     said("run", path, "--policy", policy, "--out", folder, "--no-report")
-    kept = kept_knowledge(folder, kept_scenario(folder)).plan.on_belief
+    kept = load_knowledge(folder, read_scenario(folder)).plan.on_belief
     assert np.array_equal(kept.vectors, given.vectors)
     run = open_run(folder)
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
-    fed = file_feed(folder / "run.nc", kept_scenario(folder)).messages(None)
+    fed = file_feed(folder / "run.nc", read_scenario(folder)).messages(None)
     rows = np.array([message.observed for message, _ in fed])
     np.testing.assert_array_equal(rows[:, :24], observed["strain"])
     for place, name in enumerate(("z1", "z2"), start=24):
@@ -171,7 +177,7 @@ def test_an_action_that_ends_ends_the_mission():
 def planned() -> tuple[Any, Any]:
     known = knowledge(*FOUR_STATES)
     problem = known.problem
-    return problem, expected_plan(known.scenario, problem, known.rewards)[0]
+    return problem, plan_within_limit(known.scenario, problem, known.rewards)[0]
 
 
 def flown_and(known: Knowledge, mean: float, half_width: float) -> tuple[float, float]:
@@ -187,34 +193,37 @@ def flown_and(known: Knowledge, mean: float, half_width: float) -> tuple[float, 
 
 def test_flown_missions_bring_the_return_that_was_promised():
     known, (problem, plan) = knowledge(*FOUR_STATES), planned()
-    said = promised(known.scenario, problem, plan.policy)
+    said = simulate_policy(known.scenario, problem, plan.policy)
     mean, half = flown_and(following(known, plan.policy), said.mean, said.half_width)
     assert plan.lower - half <= mean <= plan.upper + half
 
 
 @pytest.mark.parametrize("decide_on", ["filtered", "predicted"])
 def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
-    monkeypatch.setattr("twin_master.mission.planning.PERIODS", ())
+    monkeypatch.setattr("twin_master.mission.planning.INSPECTION_PERIODS", ())
     for policy in ("mode", "qmdp"):
         known = of_wing(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))[0]
-        rule = compared(known.scenario, planned()[0])[policy == "qmdp"]
+        rule = compare_simple_rules(known.scenario, planned()[0])[policy == "qmdp"]
         flown_and(known, rule.mean, rule.half_width)
 
 
 def test_a_limit_is_kept_by_the_plan():
     known, (problem, plan) = knowledge(*FOUR_STATES), planned()
-    free = risk_of(known.scenario, problem, known.rewards, plan.policy)
+    free = share_beyond_limit(known.scenario, problem, known.rewards, plan.policy)
     limited = scenario(*FOUR_STATES, policy="belief", limit_probability=round(0.6 * free, 4))
-    careful, price = expected_plan(limited, problem, known.rewards)
+    careful, price = plan_within_limit(limited, problem, known.rewards)
     assert price > 0.0
-    assert risk_of(limited, problem, known.rewards, careful.policy) <= 0.6 * free
-    assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
+    assert share_beyond_limit(limited, problem, known.rewards, careful.policy) <= 0.6 * free
+    assert (
+        simulate_policy(limited, problem, careful.policy).mean
+        < simulate_policy(limited, problem, plan.policy).mean
+    )
 
 
 def test_the_command_plans_draws_and_says_what_inspections_gauges_and_simpler_rules_are_worth(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("twin_master.mission.planning.PERIODS", (5,))
+    monkeypatch.setattr("twin_master.mission.planning.INSPECTION_PERIODS", (5,))
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     worse = 2 * (("[0, 40]", "[0, 80]"),)
     path = written(tmp_path, TEXT, *FOUR_STATES, *worse)
@@ -310,7 +319,7 @@ def test_the_information_of_sensors_is_that_of_an_integral_also_where_something_
     residual = np.stack((shown[:, None] - means, np.ones((60_000, 3))), axis=-1)
     turned = np.array([[0.75**0.5, 0.0, 0.5], [-0.5, 0.0, 0.75**0.5]])  # and one shows nothing
     shares = moved[:, None] * turned[0]
-    readings = Readings(state, residual @ turned, shares[..., None], np.zeros((3, 3)))
+    readings = DrawnReadings(state, residual @ turned, shares[..., None], np.zeros((3, 3)))
 
     def entropy(value: float) -> float:
         density = norm.pdf(value - means, scale=spread).mean()
@@ -324,7 +333,7 @@ def test_the_information_of_sensors_is_that_of_an_integral_also_where_something_
 @pytest.mark.parametrize("samples", [7, 30])
 def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monkeypatch):
     monkeypatch.setattr(sensor_design, "SAMPLES", samples)
-    for readings in drawn_readings(gauged()):
+    for readings in draw_readings(gauged()):
         times = np.bincount(readings.state, minlength=25)
         assert times.max() == 1
         assert times.sum() == min(samples, 25)
@@ -333,8 +342,8 @@ def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monke
 
 def test_three_of_twelve_are_those_of_an_exhaustive_search():
     """One beside a region separates its levels, and those of the other region are hardly told."""
-    readings, able = drawn_readings(gauged()), range(0, 24, 2)
-    found = chosen_sensors(readings, able, 3)
+    readings, able = draw_readings(gauged()), range(0, 24, 2)
+    found = choose_sensors(readings, able, 3)
     told = {
         some: float(np.mean([under.information(some) for under in readings]))
         for some in itertools.combinations(able, 3)
@@ -344,8 +353,8 @@ def test_three_of_twelve_are_those_of_an_exhaustive_search():
     assert found.information[-1] == pytest.approx(told[best], rel=1e-12)
     assert found.of_all > found.information[-1] > found.information[0] > 0.0
     with pytest.raises(MissionInputError, match="from 1 to 2"):
-        chosen_sensors(readings, [0, 1], 3)
-    apart, fewer = (separations(gauged(), readings, gauges) for gauges in (range(24), [16, 23]))
+        choose_sensors(readings, [0, 1], 3)
+    apart, fewer = (level_separations(gauged(), readings, gauges) for gauges in (range(24), [16, 23]))
     assert min(far for (name, _), far in apart.items() if name == "z1") > 2.0
     assert max(far for (name, _), far in apart.items() if name == "z2") < 1.0
     assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
@@ -356,7 +365,7 @@ def test_a_gauge_that_is_taken_away_tells_nothing_whatever_its_unit():
     observation = known.scenario.observation.model_copy(update={"standard_deviation": size * 125e-6})
     large = known.scenario.model_copy(update={"observation": observation})
     values = size * known.sensor_model.value_per_draw
-    model = _without(Knowledge(large, known.model, known.draws, values), ["24"]).sensor_model
+    model = _without_information(Knowledge(large, known.model, known.draws, values), ["24"]).sensor_model
     seen = np.where(np.arange(24) == 23, values[0, 0, 1], np.nan)
     assert np.ptp(model.log_likelihood(seen, 1)) < 1e-6
 

@@ -14,8 +14,8 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.mission import Reference
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import groups_of, tables_of
-from twin_master.store.summary import find_fallback, of_fallback, summarise
+from twin_master.store.results import csv_tables, run_groups
+from twin_master.store.summary import fallback_figures, find_fallback, summarise
 from twin_master.store.writing import open_run, write_run
 
 
@@ -30,10 +30,10 @@ def flown(name: str, library_file: Path) -> MissionResult:
 
 
 def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_path):
-    groups = groups_of(result)
+    groups = run_groups(result)
     first = write_run(tmp_path / "a", groups, {"seed": 3}).read_bytes()
-    assert write_run(tmp_path / "b", groups_of(result), {"seed": 3}).read_bytes() == first
-    assert write_run(tmp_path / "c", groups_of(result), {"seed": 4}).read_bytes() != first
+    assert write_run(tmp_path / "b", run_groups(result), {"seed": 3}).read_bytes() == first
+    assert write_run(tmp_path / "c", run_groups(result), {"seed": 4}).read_bytes() != first
     read = open_run(tmp_path / "a")
     assert ([*read.children], read.attrs) == ([*groups], {"seed": 3})
     for name, made in groups.items():
@@ -50,7 +50,7 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_
 
 
 def test_what_is_stored_agrees_with_itself(result, tmp_path):
-    write_run(tmp_path, groups_of(result), {})
+    write_run(tmp_path, run_groups(result), {})
     tree = open_run(tmp_path)
     filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
     levels = result.knowledge.model.states.coordinates
@@ -71,7 +71,7 @@ def test_what_is_stored_agrees_with_itself(result, tmp_path):
 
 
 def test_tables_are_in_the_units_of_their_headers(result):
-    texts = tables_of(groups_of(result), result.scenario.observation)
+    texts = csv_tables(run_groups(result), result.scenario.observation)
     tables = {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
     health, observed = tables["health"], tables["observed"]
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
@@ -114,7 +114,7 @@ def test_fallback(gentle, truth, delay, early):
     assert (found.switch_state, found.switch_level) == ("z1", 0.6)
     assert found.called_for_step == (30 if truth.any() else None)
     assert (found.delay, found.early_step) == (delay, early)
-    told = list(of_fallback(found, SCENARIO)[2])  # one that came before the damage has no delay
+    told = list(fallback_figures(found, SCENARIO)[2])  # one that came before the damage has no delay
     assert told[3:] == [None if early == 29 else delay, early]
 
 
@@ -143,8 +143,8 @@ def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name
     each = flown(name, library_file)
     steps = []
     for step in each.flight.steps:
-        happened = step.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
-        steps.append(replace(step, reading=replace(step.reading, happened=happened)))
+        happened = step.reading.ground_truth._replace(monitors={"strain_error_bound": 2e-6})
+        steps.append(replace(step, reading=replace(step.reading, ground_truth=happened)))
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),

@@ -25,7 +25,7 @@ from tests.twin_master.runs import check_same
 from tests.twin_master.watch.conftest import served, viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
-from twin_master.mission.journal import JOURNAL_NAME, line_of
+from twin_master.mission.journal import JOURNAL_NAME, encode_line
 from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.viewer.flight import Flight, StepBeliefs
 from twin_master.viewer.flight_page import LATEST, FlightPage, Request
@@ -123,10 +123,10 @@ def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
     steps = [json.loads(line[65:]) for line in lines[1:]]
     missed = steps[6] | {"observed": [None] * 24}
     late = steps[9] | {"observation_step": 6, "observed": steps[6]["observed"]}
-    add(begun, lines[0], *map(line_of, [*steps[:6], missed, *steps[7:10]]))
+    add(begun, lines[0], *map(encode_line, [*steps[:6], missed, *steps[7:10]]))
     flight = viewed(begun)
     number = flight.number
-    add(begun, line_of(late | {"filtered": steps[20]["filtered"]}))
+    add(begun, encode_line(late | {"filtered": steps[20]["filtered"]}))
     assert flight.update()
     assert (flight.steps, flight.number) == (10, number + 1)
     expected = [step["observed"] for step in steps[:10]]
@@ -135,10 +135,10 @@ def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
     )
     last = [step["filtered"] for step in flight.records_of_steps(8, 10)]
     assert last == [steps[8]["filtered"], steps[20]["filtered"]]
-    add(begun, *map(line_of, [{"model": {}}, *steps[10:20]]))
+    add(begun, *map(encode_line, [{"model": {}}, *steps[10:20]]))
     assert viewed(begun).steps == 20
     flight.update()
-    add(begun, line_of(steps[30]))
+    add(begun, encode_line(steps[30]))
     with pytest.raises(RunFolderError, match="tells step 30 where 20 was expected"):
         flight.update()
     journal = begun / JOURNAL_NAME
@@ -252,14 +252,18 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         (begun / "teaching" / "figures" / "missing_force.svg").write_bytes(drawing)
         said = json.dumps({"verdict": {"sentence": "A spring is <missing>."}})
         (begun / "teaching" / "verdict.json").write_text(said)
-        add(begun, line_of({"verdict": {"folder": "teaching", "notice": {}}}))
+        add(begun, encode_line({"verdict": {"folder": "teaching", "notice": {}}}))
         tabs[1].wait("!element('force').hidden && element('picture').naturalWidth > 0")
         assert tabs[1].value("element('verdict').textContent") == "A spring is <missing>."
         assert tabs[1].value("document.documentElement.scrollWidth <= innerWidth")
         assert first.value("element('force').hidden")  # nothing was known at step 10
         # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
         tabs[2].value("socket.onclose = null; socket.close()")
-        add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")))
+        add(
+            begun,
+            *lines[31:-1],
+            encode_line(json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")),
+        )
         tabs[1].wait("window.painted.at(-1)[0] === 49")
         first.wait("state.count === 50")
         assert first.value("state.shown") == 10

@@ -23,7 +23,7 @@ from paho.mqtt import client as paho
 from reporting.progress import SilentProgress
 from tests.twin_master.runs import flight_of, text_of
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import BelievedModel
+from twin_master.mission.replay import BelievedModel
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing

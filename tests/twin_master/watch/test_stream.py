@@ -138,7 +138,7 @@ def test_observations_that_no_state_shows_are_refusals(base, mission):
     for step in range(3):
         reading = intake.read(twin)
         assert reading is not None
-        predicted = intake.impossible(reading, ImpossibleObservation("wing", step))
+        predicted = intake.replace_impossible(reading, ImpossibleObservation("wing", step))
         twin.step(predicted.observed, predicted.control)
     assert "probability zero" in intake.stream.report_refusals(twin.steps).sentence
     assert intake.complaint().startswith("The watch ended while messages were refused: the last 3 of 3")

@@ -15,11 +15,11 @@ from fe.runtime.patch import ModelPatch, SensorGain, SensorSaturation
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
-from twin_master.command import _line
 from twin_master.errors import MissionInputError
+from twin_master.mission.decision_record import decision_line
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import replay
-from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.mission.preparation import load_knowledge, save_knowledge
+from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight_page import FlightPage, Request
@@ -274,7 +274,7 @@ def test_a_decision_tells_no_state_that_is_not_believed(unbelieved):
     watch, decisions = unbelieved
     health = {"mean": None, "standard_deviation": None, "unit": "1"}
     assert (decisions[-1]["state_believed"], decisions[-1]["health"]) == (False, {"z1": health, "z2": health})
-    assert "no state is believed; next 2g" in _line(watch.scenario, decisions[-1])
+    assert "no state is believed; next 2g" in decision_line(watch.scenario, decisions[-1])
     assert decisions[0]["state_believed"]
     assert decisions[0]["health"]["z1"]["mean"] >= 0.0
 
@@ -364,8 +364,8 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_pat
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
     file = of_gauge(tmp_path, "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
-    keep_knowledge(tmp_path, taught)
-    for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
+    save_knowledge(tmp_path, taught)
+    for read in (taught, load_knowledge(tmp_path, taught.scenario)):
         np.testing.assert_allclose(read.rewards.health_per_draw, known.rewards.health_per_draw, rtol=1e-9)
         np.testing.assert_array_equal(read.plan.policy, known.plan.policy)
         shown = read.sensor_model.value_per_draw / known.sensor_model.value_per_draw

@@ -23,8 +23,9 @@ from tests.command_line import command, said, seen
 from tests.twin_master.runs import check_same, edited, figures_of, journal
 from tests.twin_master.watch.conftest import begun, killed_at, ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
-from twin_master.mission.journal import JOURNAL_NAME, whole_record
-from twin_master.mission.loop import BelievedModel, journalled_decision
+from twin_master.mission.decision_record import decision_from_line
+from twin_master.mission.journal import JOURNAL_NAME, record_of_line
+from twin_master.mission.replay import BelievedModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.csv_feed import CsvFeed
@@ -46,7 +47,7 @@ def last_line(folder: Path) -> str:
 def journalled(watch: Watch, folder: Path | None = None) -> list[Any]:
     """The decisions that the journal of a watch, or of one like it, holds."""
     model, lines = watch.models[0].knowledge.model, journal(folder or watch.folder)
-    return [journalled_decision(line, watch.scenario, model) for line in lines]
+    return [decision_from_line(line, watch.scenario, model) for line in lines]
 
 
 def belief_of(watch: Watch) -> object:
@@ -210,7 +211,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     file, counts = watch.folder / JOURNAL_NAME, []
     for steps in (60, 100, 196):  # as many steps behind the last snapshot
         ran(watch, feed, steps)
-        with patch("twin_master.mission.journal.whole_record", wraps=whole_record) as read:
+        with patch("twin_master.mission.journal.record_of_line", wraps=record_of_line) as read:
             watch.last_decision()
             ran(watch, feed, steps)
         counts.append(read.call_count)

@@ -1,0 +1,110 @@
+"""The decision that a line of a journal tells the operator, as a record and in words."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from twin_master.mission.journal import array_from_json
+from twin_master.network.estimator import is_state_believed
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.run_folder import JsonObject
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
+
+_KEYS_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
+"""The entries of a suspicion that the decision repeats."""
+
+
+def decision_from_line(
+    line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel
+) -> JsonObject:
+    """Return the decision in a line of a journal; empty if the line tells none.
+
+    A decision always states the probability of its control. If no state explains the sensors, no
+    state is believed, and the decision has no mean and no standard deviation of it.
+
+    Parameters
+    ----------
+    line : mapping of str to object
+        The record of the line.
+    scenario : Scenario
+        What is flown or watched.
+    model : GraphicalModel
+        The states of the belief.
+    """
+    for reason in ("quiet", "refused"):  # such a line repeats the last decision
+        if reason in line:
+            return dict(line[reason])
+    if "filtered" not in line:
+        return {}
+    controls = scenario.control_names
+    next_control = line["next_control"]
+    is_believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
+    decision: JsonObject = {
+        "step": line["step"],
+        "control": controls[line.get("control_in_force", line["control_index"])],
+        "state_believed": is_believed,
+        "health": _health_record(line, scenario, model, is_believed=is_believed),
+        "next_control": controls[next_control],
+        "probability": min(float(line["decision_probability"][next_control]), 1.0),
+        "lost_sensors": line["observed"][: scenario.observation.count].count(None),
+        "log_evidence": line["log_evidence"],
+        "notices": line.get("notices", []),
+    }
+    if "suspicion" in line:
+        decision |= {key: line["suspicion"][key] for key in _KEYS_OF_SUSPICION}
+    if "control_in_force" in line:
+        decision["revised_by_step"] = line["observation_step"]
+    if "learnt" in line:
+        decision["learnt"] = line["learnt"]
+    return decision
+
+
+def _health_record(
+    line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel, *, is_believed: bool
+) -> JsonObject:
+    """Return mean, standard deviation and unit of each state factor, by its name."""
+    filtered = array_from_json(line["filtered"])
+    mean = model.states.mean(filtered)
+    deviation = model.states.standard_deviation(filtered)
+    health: JsonObject = {}
+    for index, factor in enumerate(scenario.state):
+        health[factor.name] = {
+            "mean": mean[index] if is_believed else None,
+            "standard_deviation": deviation[index] if is_believed else None,
+            "unit": factor.unit,
+        }
+    return health
+
+
+def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
+    """Return mean and standard deviation of each state factor as text, such as "20 ± 3 %".
+
+    For a state that is not believed the text is "not believed".
+    """
+    texts = {}
+    for name, moments in decision["health"].items():
+        if moments["mean"] is None:
+            texts[name] = "not believed"
+            continue
+        scale, unit = printed_state(moments["unit"])
+        digits = ".0f" if unit == "%" else ".3g"
+        mean = scale * moments["mean"]
+        deviation = scale * moments["standard_deviation"]
+        texts[name] = f"{mean:{digits}} ± {deviation:{digits}} {unit}"
+    return texts
+
+
+def decision_line(scenario: Scenario, decision: Mapping[str, Any]) -> str:
+    """Return a decision as a line of text for people."""
+    health = "no state is believed"
+    if decision.get("state_believed", True):
+        texts = health_in_words(decision)
+        health = ", ".join(f"{name} {text}" for name, text in texts.items())
+    line = (
+        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
+        f"next {decision['next_control']} with probability {decision['probability']:.3f}"
+    )
+    hypothesis = decision.get("decided_by", "model")
+    if hypothesis == "model":
+        return line
+    return f"{line}; by {hypothesis} ({decision['hypotheses'][hypothesis]:.2f})"

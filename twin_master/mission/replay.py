@@ -1,0 +1,282 @@
+"""The steps of a journal, filtered again: for a run or watch that is resumed, taught or stored."""
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from twin_master.errors import NotResumableError
+from twin_master.mission.journal import (
+    JournalLine,
+    damaged_line_error,
+    decode_state,
+    reading_from_line,
+    records_backwards,
+)
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.steps import History, MissionStep, Reading
+from twin_master.run_folder import JsonObject
+
+
+@dataclass(frozen=True)
+class BelievedModel:
+    """A model that the twin believes from a step on.
+
+    Attributes
+    ----------
+    from_step : int
+        The first step that is filtered with the model.
+    knowledge : Knowledge
+        The observations that the model predicts.
+    patch : Path or None
+        The file of its patch, if the model is patched.
+    """
+
+    from_step: int
+    knowledge: Knowledge
+    patch: Path | None = None
+
+
+class SettledState(NamedTuple):
+    """The state of a twin after a step that no late observation can revise any more.
+
+    Attributes
+    ----------
+    step : int
+        The step.
+    twin_state : bytes
+        The state, as `Twin.save_state` returns it.
+    """
+
+    step: int
+    twin_state: bytes
+
+
+def replay(
+    path: Path,
+    models: Sequence[BelievedModel],
+    lag: int | None,
+    *,
+    first_step: int | None = None,
+    end: int | None = None,
+    question: BelievedModel | None = None,
+) -> tuple[History, JsonObject]:
+    """Filter the steps of a journal again; late observations stand at the step that they belong to.
+
+    The journal is read backwards to the last settled state of the twin before the first step that
+    is asked for. The steps after that state are filtered again.
+
+    Parameters
+    ----------
+    path : Path
+        The journal.
+    models : sequence of BelievedModel
+        The model at the beginning, and those that were adopted later.
+    lag : int or None
+        The lag of the twin, in steps.
+    first_step : int, optional
+        The first step whose belief is asked for; if left out, only the twin after the last step is.
+    end : int, optional
+        The end of the last line to read, in bytes; the end of the journal if left out.
+    question : BelievedModel, optional
+        A further model: what would the twin believe with it? The decisions are not checked then.
+
+    Returns
+    -------
+    History
+        The steps after the settled state; its twin stands after the last one.
+    dict
+        The record of the last line; empty if the journal has none.
+
+    Raises
+    ------
+    NotResumableError
+        If the journal was changed or is damaged, or if the twin now decides otherwise than the
+        journal.
+    """
+    required_steps = []
+    if first_step is not None:
+        required_steps.append(first_step)
+    if question is not None:
+        required_steps.append(question.from_step)
+    scan = _BackwardScan(path, required_steps)
+    for line in records_backwards(path, end):
+        try:
+            needs_earlier_lines = scan.take_in(line)
+        except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
+            reason = f"it has another layout, {error}"
+            raise damaged_line_error(path, line.begin, reason) from error
+        if not needs_earlier_lines:
+            break
+    all_models = [*models] if question is None else [*models, question]
+    history = refilter(scan.readings, all_models, lag, scan.settled)
+    if question is None:
+        scan.check_decisions(history)
+    return history, scan.last_record
+
+
+class _BackwardScan:
+    """What the lines of a journal tell, which are taken in from the last one back.
+
+    Attributes
+    ----------
+    readings : dict of int to Reading
+        The last reading of each step.
+    settled : SettledState or None
+        The last settled state before all required steps, once a line with one was taken in.
+    last_record : dict
+        The record of the last line.
+    """
+
+    def __init__(self, path: Path, required_steps: list[int]) -> None:
+        self.readings: dict[int, Reading] = {}
+        self.settled: SettledState | None = None
+        self.last_record: JsonObject = {}
+        self._path = path
+        self._required_steps = required_steps
+        self._next_controls: dict[int, int] = {}
+        # Decisions of steps from this one on were revised by lines that come later in the journal.
+        self._first_revised_step = math.inf
+        self._later_step: int | None = None
+        self._later_begin = 0
+
+    def take_in(self, line: JournalLine) -> bool:
+        """Take in the line before the last one taken in; return whether to read on."""
+        is_header = line.begin == 0
+        step = -1 if is_header else int(line.record["step"])
+        self._check_order(line, step)
+        settled_step = -1 if self.settled is None else self.settled.step
+        if is_header or step <= settled_step:
+            return False
+        if self._later_step is None:
+            self.last_record = line.record
+        self._later_step = step
+        self._later_begin = line.begin
+        self._take_in_settled_state(line.record)
+        if step < self._first_revised_step:
+            self._next_controls.setdefault(step, line.record["next_control"])
+        self._take_in_change(line.record, step)
+        return True
+
+    def _check_order(self, line: JournalLine, step: int) -> None:
+        """Refuse a line whose step is not that of the line after it, or the step before."""
+        later_step = self._later_step
+        if later_step is None or later_step - step in (0, 1):
+            return
+        begin = self._later_begin if step < later_step else line.begin
+        raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
+
+    def _take_in_settled_state(self, record: JsonObject) -> None:
+        if self.settled is not None or "settled" not in record:
+            return
+        step = int(record["settled"]["step"])
+        state = record["settled"]["state"]
+        # It must lie before each step that is asked for, and before models adopted after it.
+        if all(step < required_step for required_step in self._required_steps):
+            self.settled = SettledState(step, decode_state(state))
+
+    def _take_in_change(self, record: JsonObject, step: int) -> None:
+        """Take in an adopted model or an observation, which revise the decisions from a step on."""
+        if "model" in record:
+            from_step = int(record["model"]["from_step"])
+            self._first_revised_step = min(self._first_revised_step, from_step)
+            self._required_steps.append(from_step)
+        elif "observed" in record:
+            observed_step = int(record.get("observation_step", step))
+            self._first_revised_step = min(self._first_revised_step, observed_step)
+            self.readings.setdefault(observed_step, reading_from_line(record))
+
+    def check_decisions(self, history: History) -> None:
+        """Refuse a history whose twin decides otherwise than the journal."""
+        for step in history.steps:
+            number = step.twin_step.step
+            control = step.twin_step.next_control
+            if self._next_controls.get(number, control) == control:
+                continue
+            advice = "fly the mission again with --replace"
+            is_watch = "intake" in self.last_record
+            if is_watch:
+                observations = f"`--observations {self._path.parent}`"
+                advice = f"begin another watch, in another folder, with {observations}"
+            raise NotResumableError(
+                f"the journal decided otherwise after step {number} than this version does: "
+                f"{advice}."
+            )
+
+
+def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
+    """Return the models that are believed one after the other, given all in the order of adoption.
+
+    A model that was adopted later, but from an earlier or the same step on, replaces the one before
+    it.
+    """
+    in_force = []
+    for index, model in enumerate(models):
+        later_models = models[index + 1 :]
+        if all(later.from_step > model.from_step for later in later_models):
+            in_force.append(model)
+    return in_force
+
+
+def refilter(
+    readings: Mapping[int, Reading],
+    models: Sequence[BelievedModel],
+    lag: int | None = None,
+    settled: SettledState | None = None,
+) -> History:
+    """Return the steps that a twin filters from the readings of consecutive steps.
+
+    Parameters
+    ----------
+    readings : mapping of int to Reading
+        The reading of each step.
+    models : sequence of BelievedModel
+        The models in the order of their adoption.
+    lag : int or None
+        The lag of the twin, in steps.
+    settled : SettledState, optional
+        Where to begin; before the first step if left out.
+    """
+    models = models_in_force(models)
+    first_step = 0 if settled is None else max(settled.step, 0)
+    model_index = 0
+    while model_index + 1 < len(models) and models[model_index + 1].from_step <= first_step:
+        model_index += 1
+    twin = models[model_index].knowledge.twin(lag=lag)
+    if settled is not None:
+        twin.restore_state(settled.twin_state)
+    history = History(twin, models[model_index].knowledge.scenario.observation.count)
+    while twin.steps in readings:
+        if model_index + 1 < len(models) and models[model_index + 1].from_step <= twin.steps:
+            # The twin goes on with the next model, from the belief that it has reached.
+            model_index += 1
+            state = twin.save_state()
+            twin = models[model_index].knowledge.twin(lag=lag)
+            twin.restore_state(state)
+            history.twin = twin
+        reading = readings[twin.steps]
+        history.add(MissionStep(reading, twin.step(reading.observed, reading.control)))
+    return history
+
+
+def spans_of_models(
+    history: History, models: Sequence[BelievedModel]
+) -> list[tuple[Knowledge, slice]]:
+    """Return the knowledge of each model in force, and the steps of a history that are its own.
+
+    Parameters
+    ----------
+    history : History
+        The steps.
+    models : sequence of BelievedModel
+        The models in the order of their adoption.
+    """
+    models = models_in_force(models)
+    begins = [max(0, model.from_step - history.first_step) for model in models]
+    ends = [*begins[1:], len(history.steps)]
+    spans = []
+    for model, begin, end in zip(models, begins, ends, strict=True):
+        spans.append((model.knowledge, slice(begin, end)))
+    return spans

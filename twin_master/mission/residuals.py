@@ -1,0 +1,112 @@
+"""What a twin expects of its sensors in the steps of a history, and the residuals."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from reporting.arrays import Float
+from twin_master.learning.expectation import (
+    Expectation,
+    concatenate_expectations,
+    expectation_of_draws,
+)
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.replay import BelievedModel, spans_of_models
+from twin_master.mission.steps import History
+from twin_master.network.inference import known_control
+
+
+def expected_in_steps(
+    history: History, knowledge: Knowledge, belief: Float, *, smoothed: bool
+) -> Expectation:
+    """Return the observations and rewards that are expected in the steps of a history.
+
+    Parameters
+    ----------
+    history : History
+        The T steps.
+    knowledge : Knowledge
+        The knowledge of the twin in these steps.
+    belief : (T, S) array
+        The filtered or smoothed belief in each step.
+    smoothed : bool
+        Whether the belief is the smoothed one.
+    """
+    learnt_expectation = knowledge.expectation
+    if learnt_expectation is None:
+        joint = known_control(belief, history.control_index, len(knowledge.model.controls))
+        return expectation_of_draws(
+            knowledge.sensor_model, knowledge.rewards, joint, history.observation_rows
+        )
+    carried = [step.twin_step.carried for step in history.steps]
+    if smoothed:
+        return learnt_expectation.smoothed(carried, belief, history.observed)
+    return learnt_expectation.filtered(carried, belief, history.observed)
+
+
+def expected_ahead(
+    history: History, knowledge: Knowledge, predicted: Float
+) -> tuple[Expectation, Float]:
+    """Return what is expected after each step of a history, in the H steps to come.
+
+    Parameters
+    ----------
+    history : History
+        The T steps.
+    knowledge : Knowledge
+        The knowledge of the twin in these steps.
+    predicted : (T, H, S) array
+        The belief predicted in each step.
+
+    Returns
+    -------
+    Expectation
+        The observations and rewards; their leading axes are (T, H).
+    (T, H, U) array
+        The probability of each control.
+    """
+    policy = knowledge.policy_with_doubt(history.unexplained)
+    joint = predicted[..., None] * policy[:, None]  # (T, H, S, U), eqs. (37)-(39)
+    control_probability = joint.sum(axis=-2)
+    learnt_expectation = knowledge.expectation
+    if learnt_expectation is None:
+        expected = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, None)
+        return expected, control_probability
+    carried = [step.twin_step.carried for step in history.steps]
+    horizon = predicted.shape[1]
+    expected = learnt_expectation.predicted(carried, history.filtered, policy, horizon)
+    return expected, control_probability
+
+
+def residual_summary(
+    history: History, from_step: int, models: Sequence[BelievedModel]
+) -> dict[str, float | None]:
+    """Return the root mean square residual and the log evidence of the steps from one on.
+
+    The residuals are in standard deviations of the noise that the twin assumes or has learnt. Both
+    values are None if nothing was observed in these steps.
+
+    Parameters
+    ----------
+    history : History
+        The steps.
+    from_step : int
+        The number of the first step that counts.
+    models : sequence of BelievedModel
+        What the twin believed in the steps, in the order of adoption.
+    """
+    history = history.without_first(from_step - history.first_step)
+    if not history.steps or np.isnan(history.observed).all():
+        return {"rms_residual": None, "log_evidence": None}
+    expected_parts = []
+    for knowledge, span in spans_of_models(history, models):
+        part = replace(history, steps=history.steps[span])
+        if part.steps:
+            expected_parts.append(expected_in_steps(part, knowledge, part.filtered, smoothed=False))
+    expected = concatenate_expectations(expected_parts)
+    residual = (history.observed - expected.mean) / expected.noise
+    return {
+        "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
+        "log_evidence": float(np.sum(history.log_evidence)),
+    }
