@@ -202,36 +202,44 @@ class LinearisedTrial:
 
     @cached_property
     def force_by_weight(self) -> FloatArray:
-        """The laws' force (F, L, W) at each port at state zero, for a unit of each weight.
+        """The coefficients (F, L, W) of the laws' force at each port in the weights [N or N m].
 
-        The whole force of the laws is `force_by_weight` times the weights plus `force_by_state`
-        times the state.
+        The weights are (1, unknowns). The laws are linear about the trajectory and about values u0
+        of the unknowns, so that their force is
+
+            f = force_by_weight @ (1, u) + force_by_state @ state.
+
+        Each derivative d by an unknown contributes d (u - u0): d is the coefficient of the unknown,
+        and -d u0 is added to the constant, which is the coefficient of the first weight.
         """
         trial = self.trial
         trajectory = self.trajectory
-        force = np.zeros((len(trial.fine_time), len(self.law_ports), self.weight_count))
+        force_coefficients = np.zeros(
+            (len(trial.fine_time), len(self.law_ports), self.weight_count)
+        )
         for row, port in enumerate(self.law_ports):
             law = self.forces[port].law_force
-            # motion at state zero and zero unknowns, minus that of the trajectory
+            # motion of the model's response (state zero), minus that of the trajectory
             position_offset = trial.port_positions[:, port] - trajectory.positions[:, port]
             speed_offset = trial.port_speeds[:, port] - trajectory.speeds[:, port]
-            # unknowns that move the ports in the model's response
+            # unknowns that change the motion of the ports: their part of the motion is removed from
+            # the offsets, which are then at zero unknowns
             for unknown, (positions, speeds) in trial.port_motion_derivatives.items():
-                value = trial.linearisation_point[unknown]
-                position_offset = position_offset - value * positions[:, port]
-                speed_offset = speed_offset - value * speeds[:, port]
-                force[:, row, self.weight_index(unknown)] += (
+                present_value = trial.linearisation_point[unknown]
+                position_offset = position_offset - present_value * positions[:, port]
+                speed_offset = speed_offset - present_value * speeds[:, port]
+                force_coefficients[:, row, self.weight_index(unknown)] += (
                     law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
             # the first weight: the force at zero unknowns
-            force[:, row, 0] = (
+            force_coefficients[:, row, 0] = (
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
-            # unknowns that change the laws; the law's force is that at their present values
+            # unknowns that change the laws; `law.force` is the force at u0
             for unknown, derivative in self.forces[port].by_unknown.items():
-                force[:, row, 1 + unknown] += derivative
-                force[:, row, 0] -= self._value_of_unknown(unknown) * derivative
-        return force
+                force_coefficients[:, row, 1 + unknown] += derivative
+                force_coefficients[:, row, 0] -= self._value_of_unknown(unknown) * derivative
+        return force_coefficients
 
     def _value_of_unknown(self, unknown: int) -> float:
         """Return the value of an unknown, shared or of an effect, about which laws are linear."""

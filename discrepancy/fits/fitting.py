@@ -304,33 +304,40 @@ class _Descent:
     def state_at(
         self, point: Point, nearby_derivatives: tuple[TrialDerivatives, ...] | None = None
     ) -> FitState:
-        """Return the objective and the derivatives at a point.
+        """Return the objective, the residuals and the derivatives of all trials at a point.
 
         Parameters
         ----------
         point : Point
             The values of all unknowns.
         nearby_derivatives : tuple of TrialDerivatives, optional
-            Derivatives of each trial with respect to nuisances at a nearby point. If given, only
-            the response and the derivatives with respect to effect parameters are computed.
+            The derivatives of each trial with respect to nuisances at a nearby point, which are
+            reused here; only the response and the derivatives with respect to effect parameters are
+            then computed. If left out, all derivatives are computed.
         """
-        derivatives = tuple(
+        all_derivatives = tuple(
             self.problem.linearise(
-                number,
+                trial_index,
                 point,
                 self.candidate,
-                nearby_derivatives=nearby,
+                nearby_derivatives=nearby_derivatives_of_trial,
                 effect_steps=self.effect_deviation,
             )
-            for number, nearby in enumerate(nearby_derivatives or [None] * len(self.problem.trials))
+            for trial_index, nearby_derivatives_of_trial in enumerate(
+                nearby_derivatives or [None] * len(self.problem.trials)
+            )
         )
-        misfit = _misfit_at(self.problem, point, [trial.response for trial in derivatives])
+        misfit = _misfit_at(
+            self.problem,
+            point,
+            [derivatives_of_trial.response for derivatives_of_trial in all_derivatives],
+        )
         return FitState(
             point=point,
             objective=misfit.objective,
             residuals=misfit.residuals,
             squares_by_channel=misfit.sums,
-            trial_derivatives=derivatives,
+            trial_derivatives=all_derivatives,
         )
 
     def damped_step(self, state: FitState, damping: float) -> tuple[Point, float]:

@@ -357,17 +357,17 @@ def compare_under_wide_noise(search: Search) -> None:
     score, which is computed from their present residuals. If another hypothesis is the best one
     under the wider noise, the noise is computed again from its residuals.
     """
-    best = search.best()
-    chosen = _most_probable_sets(search)
+    best_fit = search.best()
+    probable_fits = _most_probable_sets(search)
     for _ in range(MOST_ROUNDS):
-        process = estimate_residual_process(search.problem, best)
+        process = estimate_residual_process(search.problem, best_fit)
         search.wide_problem = with_wide_noise(search.problem, process)
         search.wide_fits = {}
-        wide_fits = _fit_under_wide_noise(search, search.wide_problem, chosen)
-        leading = max(wide_fits.values(), key=search.score)
-        if leading.candidate.key == best.candidate.key:
+        wide_fits = _fit_under_wide_noise(search, search.wide_problem, probable_fits)
+        best_wide_fit = max(wide_fits.values(), key=search.score)
+        if best_wide_fit.candidate.key == best_fit.candidate.key:
             break
-        best = leading
+        best_fit = best_wide_fit
     search.wide_fits = wide_fits
 
 
@@ -377,18 +377,19 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
     Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has
     the number of sets of each length.
     """
-    best: dict[tuple[str, ...], CandidateFit] = {}
+    best_by_set: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
         identifiers = fit.candidate.identifiers
         if identifiers and (
-            identifiers not in best or search.score(fit) > search.score(best[identifiers])
+            identifiers not in best_by_set
+            or search.score(fit) > search.score(best_by_set[identifiers])
         ):
-            best[identifiers] = fit
-    chosen: list[CandidateFit] = []
+            best_by_set[identifiers] = fit
+    probable_fits: list[CandidateFit] = []
     for length, count in enumerate(SEARCH.most_weighed_sets, start=1):
-        fits_of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
-        chosen += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
-    return chosen
+        fits_of_length = [fit for fit in best_by_set.values() if len(fit.candidate.terms) == length]
+        probable_fits += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
+    return probable_fits
 
 
 def _fit_under_wide_noise(
@@ -406,10 +407,10 @@ def _fit_under_wide_noise(
         The fits to choose from.
     """
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
-    fits_with_scores.sort(key=lambda entry: entry[1], reverse=True)
-    least = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
+    fits_with_scores.sort(key=lambda fit_and_score: fit_and_score[1], reverse=True)
+    least_score = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
     promising = [
-        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least
+        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least_score
     ]
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
@@ -434,9 +435,11 @@ def _add_wide_fit(
     wide_problem: Problem,
     fit: CandidateFit,
 ) -> None:
-    """Add the fit of a hypothesis under a wider noise, if it can be fitted under that noise.
+    """Fit a hypothesis under the wider noise, and add this fit to `wide_fits`.
 
-    The model without effect is always added, at its present point if it cannot be fitted.
+    A hypothesis that cannot be fitted under the wider noise is left out. The hypothesis without
+    effects (without terms) is evaluated at the point of `fit` instead, without any step of the
+    iteration, since all others are compared with it.
     """
     wide_fit = refit_under_wide_noise(search.problem, wide_problem, fit)
     if wide_fit is None and not fit.candidate.terms:
@@ -446,15 +449,17 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score that a fit would have under a wider noise at its present point [nat].
+    """Return the score that a fit would have under a wider noise, without fitting it again [nat].
 
-    The score is ln (evidence times prior). Of its parts, only the misfit is computed again.
+    The score is ln (evidence times prior). Only the misfit of the residuals is computed for the
+    wider noise; the other terms of the score are those under the recorded noise.
     """
     problem = search.problem
     scaled_residuals = []
     for data, wide_data, residual in zip(
         problem.trials, wide_problem.trials, fit.residuals, strict=True
     ):
+        # residuals are in recorded noise deviations: convert them to deviations of the wider noise
         scaled_residuals.append(data.deviation / wide_data.deviation * residual)
     wide_sums = problem.squares_by_channel(scaled_residuals)
     return (
