@@ -347,9 +347,11 @@ class LinearisedTrial:
         mean = np.zeros((len(generator), self.weight_count))
         if not self.trial.begins_at_rest:
             return covariance, mean
-        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known.
-        # With the rates B by the laws' forces T s + u:  (A + B T) s + B u + (column of A for f) f =
-        # 0
+        # At rest the rate of the structure's state s is zero under the laws and the missing forces
+        # f. With the laws' force T s + u and its effect B on the rate,
+        #     (A + B T) s + B u + a f = 0,  a: the column of the generator A for f.
+        # The solution for u is the mean. The first value of f is not known and has variance one, so
+        # that its solution s = h f adds h h^T to the covariance.
         structure = self.structure
         state_rate_by_force = self.state_rate_by_force[structure]
         rate_matrix = (
@@ -362,39 +364,46 @@ class LinearisedTrial:
         covariance = covariance.copy()
         covariance[structure, structure] = 0.0
         for index in self.force_filter.force_state_indices:
-            at_rest = np.linalg.lstsq(rate_matrix, -generator[structure, index], rcond=1e-12)[0]
-            covariance[structure, structure] += np.outer(at_rest, at_rest)
-            covariance[structure, index] = at_rest
-            covariance[index, structure] = at_rest
+            state_per_force = np.linalg.lstsq(
+                rate_matrix, -generator[structure, index], rcond=1e-12
+            )[0]
+            covariance[structure, structure] += np.outer(state_per_force, state_per_force)
+            covariance[structure, index] = state_per_force
+            covariance[index, structure] = state_per_force
         return covariance, mean
 
     # ------------------------------------------------------------ readings
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
-        """Return the readings by the state, and the residuals by the weights.
+        """Return the observation equation columns @ weights = rows @ state + noise of the filter.
+
+        All values are divided by the standard deviation of the white part of the noise.
 
         Returns
         -------
         rows : (N, C, n) array
-            The derivatives of the readings by the scaled state, divided by the deviation of the
-            white part of the noise.
+            The derivatives of the readings by the scaled state.
         columns : (N, C, W) array
-            The residual at state zero and zero unknowns (first weight), and minus the derivatives
-            of the readings by the unknowns; columns times weights is the residual that the state
-            explains. Zero if a reading does not count.
+            The coefficients of the residual in the weights (1, unknowns): first the residual at
+            zero unknowns, then minus the derivatives of the readings by the unknowns. They are zero
+            if a reading does not count.
         """
         trial = self.trial
         substeps = trial.substeps
         samples, channels = trial.residual.shape
         rows = np.repeat(self.force_filter.state_space.output_rows[None], samples, axis=0)
         columns = np.zeros((samples, channels, self.weight_count))
+        # Errors of sensors: a change c0 + d (u - u0) of the readings reduces the residual. Its
+        # coefficients are -d for the unknown u, and -c0 + d u0 for the constant.
         columns[:, :, 0] = trial.residual - self.sensor_errors.change
         for unknown, derivative in self.sensor_errors.by_unknown.items():
             columns[:, :, 1 + unknown] -= derivative
             columns[:, :, 0] += self._value_of_unknown(unknown) * derivative
+        # response of the model, whose residual is at zero unknowns already
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
         for unknown, derivative in enumerate(derivatives):
             columns[:, :, self.weight_index(unknown)] -= derivative
+        # output of the added state, linear about `linearisation_point`
         for unknown, derivative in self._readings_by_shared_unknowns().items():
             columns[:, :, 1 + unknown] -= derivative
             columns[:, :, 0] += trial.linearisation_point[unknown] * derivative

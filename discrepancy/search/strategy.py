@@ -122,7 +122,7 @@ class Search(FittedCandidates):
         return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
 
     def _has_large_residuals(self, base: CandidateFit) -> bool:
-        """Return whether χ² per sample of a fit is above `SEARCH.far`: much more than noise."""
+        """Return whether χ² per sample of a fit is above `SEARCH.far_chi_square`."""
         return base.chi_square > SEARCH.far_chi_square * float(self.problem.sample_counts.sum())
 
     def _is_far_from_truth(self, base: CandidateFit) -> bool:
@@ -465,8 +465,8 @@ class Search(FittedCandidates):
     def _single_fits_to_free(self) -> list[CandidateFit]:
         """Return the single effects that are to be fitted with a free shape, the best first.
 
-        If the best effect does not explain the data, these are the `SEARCH.exact_fits` best ones.
-        If it does, they are the effects that explain the data with a score near that of the best.
+        If the best effect does not explain the data, these are the best ones, at most
+        `SEARCH.most_exact_fits`. If it does, they are the effects that explain the data with a score near that of the best.
         If it is the only such effect, or if the model without effect explains the data too, there
         are none: the test of shape (`gates.check_shape`) examines the best effect later.
         """
