@@ -93,15 +93,15 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
             "load."
         )
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
-    worst = min(tests, key=lambda test: test.p_value)
-    statistic = min(1.0, worst.p_value * len(tests))
+    worst_test = min(tests, key=lambda test: test.p_value)
+    statistic = min(1.0, worst_test.p_value * len(tests))
     passed = statistic >= CONSISTENCY_LEVEL
     if passed:
         reason = "What is left follows neither loads, runs nor the effect's own channel."
     else:
         reason = (
-            f"What is left follows the {worst.name}: χ² {worst.statistic:.0f} along "
-            f"{counted(worst.count, 'direction')}, most of all {worst.strongest}."
+            f"What is left follows the {worst_test.name}: χ² {worst_test.statistic:.0f} along "
+            f"{counted(worst_test.count, 'direction')}, most of all {worst_test.strongest}."
         )
     return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
 
@@ -247,11 +247,11 @@ def _score_test(
     """
     gradient = projected.gradient
     eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
-    is_separate = eigenvalues > LEAST_REMAINING_LENGTH
-    count = int(is_separate.sum())
-    gradient_components = (eigenvectors.T @ gradient)[is_separate]
-    statistic = float(np.sum(gradient_components**2 / eigenvalues[is_separate]))
-    if not count or noise.freedom - count < LEAST_FREEDOM:
+    is_independent = eigenvalues > LEAST_REMAINING_LENGTH
+    direction_count = int(is_independent.sum())
+    gradient_components = (eigenvectors.T @ gradient)[is_independent]
+    statistic = float(np.sum(gradient_components**2 / eigenvalues[is_independent]))
+    if not direction_count or noise.freedom - direction_count < LEAST_FREEDOM:
         return None
     # the strongest direction by itself
     single_information = np.diag(projected.information)
@@ -263,8 +263,8 @@ def _score_test(
     return ScoreTest(
         name=name,
         statistic=statistic,
-        count=count,
-        p_value=_p_value(statistic, count, noise),
+        count=direction_count,
+        p_value=_p_value(statistic, direction_count, noise),
         strongest=f"{projected.labels[strongest]} ({z_scores[strongest]:.1f} deviations)",
     )
 
@@ -283,12 +283,15 @@ def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
     """
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, count))
+    # The statistic is in units of the noise variance estimated by all degrees of freedom. In units
+    # of the variance estimated by the remaining ones, the sum of squares before the test is
+    # `freedom`, and freedom - statistic is what the directions do not explain.
     scaled_statistic = statistic * noise.remaining_share
     if scaled_statistic >= noise.freedom:
         return 0.0
     remaining_freedom = noise.freedom - count
-    ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
-    return float(f.sf(ratio, count, remaining_freedom))
+    f_ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
+    return float(f.sf(f_ratio, count, remaining_freedom))
 
 
 # ---------------------------------------------------------------- directions

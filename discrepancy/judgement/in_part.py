@@ -145,13 +145,13 @@ def verdict_without_negligible_effect(
     compare_under_wide_noise(search)
     full_set = search.wide_fits.get(fit.candidate.key, fit)
     for subset in sorted(search.wide_fits.values(), key=lambda fit: len(fit.candidate.terms)):
-        key = set(subset.candidate.key)
-        if not key or not key < full_set_key:
+        subset_key = set(subset.candidate.key)
+        if not subset_key or not subset_key < full_set_key:
             continue
         if comparison.held_out_or_fitted_share(subset).value < least_share:
             continue
         least_score = search.score(full_set) - SEARCH.least_gain_of_negligible_effect
-        if key == notable_key or search.score(subset) > least_score:
+        if subset_key == notable_key or search.score(subset) > least_score:
             probability = comparison.probability(subset)
             if comparison.objection_to_naming(subset) or probability < SEARCH.name_probability:
                 return _unexplained_outcome(comparison, naming_verdict, subset)
@@ -375,24 +375,24 @@ def _unexplained_outcome(
         The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
         or else that its probability is too low.
     """
-    gap = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
-    nearest = _hypothesis_explaining_most(comparison) if considered is None else considered
+    gap_sentences = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
+    mentioned = _hypothesis_explaining_most(comparison) if considered is None else considered
     judged_hypothesis = None
     resembles: tuple[str, ...] = ()
-    if nearest is None or not _explains_mentioned_share(comparison, nearest):
-        sentence = f"{gap} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(nearest):
-        sentence = f"{gap} {_larger_error_sentence(comparison, nearest)}"
+    if mentioned is None or not _explains_mentioned_share(comparison, mentioned):
+        sentence = f"{gap_sentences} No effect of the catalogue follows it."
+    elif comparison.enlarges_error(mentioned):
+        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned)}"
     else:
-        reason = reason or comparison.objection_to_naming(nearest)
+        reason = reason or comparison.objection_to_naming(mentioned)
         if considered is not None and not reason:
-            probability = comparison.probability(nearest)
+            probability = comparison.probability(mentioned)
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        sentence = f"{gap} {_best_hypothesis_sentence(comparison, nearest, reason)}"
-        judged_hypothesis = nearest
-        resembles = names_without_free_shape(nearest.candidate.identifiers)
+        sentence = f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned, reason)}"
+        judged_hypothesis = mentioned
+        resembles = names_without_free_shape(mentioned.candidate.identifiers)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,

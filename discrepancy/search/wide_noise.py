@@ -45,7 +45,7 @@ SECOND_DIFFERENCES = 6.0
 """Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
 
 
-# ---------------------------------------------------------------- what a fit leaves
+# ---------------------------------------------------------------- residual process of a fit
 
 
 @dataclass(frozen=True)
@@ -109,23 +109,26 @@ def _channel_process(
     residual_freedom = max(sample_count - fit.absorbed_freedom[channel], 1.0)
     has_record = problem.record_freedom[channel] > 0.0
     mean_square = _sum_of_squares(residual_series) / residual_freedom
-    interval = max(float(np.median(record.steps)) for record in records)
-    colour = _recorded_colour(problem, problem.channel_names[channel], records, interval)
+    sampling_interval = max(float(np.median(record.steps)) for record in records)
+    recorded_colour = _recorded_colour(
+        problem, problem.channel_names[channel], records, sampling_interval
+    )
     # compare the variance of the residuals with the noise record
     is_larger = False
     if has_record:
         p_value = noise_tests.variance_p_value(
             mean_square,
-            residual_freedom / colour.samples_per_independent,
-            problem.record_freedom[channel] / colour.samples_per_independent,
+            residual_freedom / recorded_colour.samples_per_independent,
+            problem.record_freedom[channel] / recorded_colour.samples_per_independent,
         )
         is_larger = p_value < LEAST_P_VALUE
+    # white noise of the recorded level: no process
     if not is_larger and whiteness_p_value(records) > LEAST_P_VALUE:
         return _ChannelProcess()
     # compare their correlation with that of the noise record
     autocorrelation, white_variance = noise_tests.autocorrelation(residual_series)
-    correlation_deviation = np.sqrt(1.0 / sample_count + colour.variance)
-    correlation_difference = abs(autocorrelation[0] - colour.correlation)
+    correlation_deviation = np.sqrt(1.0 / sample_count + recorded_colour.variance)
+    correlation_difference = abs(autocorrelation[0] - recorded_colour.correlation)
     has_record_colour = (
         correlation_difference < LARGEST_CORRELATION_DIFFERENCE * correlation_deviation
     )
@@ -146,7 +149,7 @@ def _channel_process(
     if is_recorded_colour or process_variance <= 0.0:
         return process
     return _add_correlation_in_time(
-        process, process_variance, autocorrelation, white_variance, interval
+        process, process_variance, autocorrelation, white_variance, sampling_interval
     )
 
 
@@ -257,35 +260,39 @@ def _recorded_colour(
     interval : float
         Their sampling interval [s].
     """
-    unknown = _RecordedColour(np.nan, 0.0, 1.0)
+    unknown_colour = _RecordedColour(np.nan, 0.0, 1.0)
     record = problem.campaign.channels[name].noise
-    noise = problem.noise_models[name]
+    noise_model = problem.noise_models[name]
     if record is None or record.samples is None or record.interval is None:
-        return unknown
+        return unknown_colour
     if not np.any(record.samples):
-        return unknown
+        return unknown_colour
     centred_record = record.samples - record.samples.mean()
     if abs(record.interval - interval) > LARGEST_INTERVAL_DIFFERENCE * interval:
-        return unknown
+        return unknown_colour
     colours = []
     for residuals in records:
         is_whitened = len(residuals.steps) == 1
         comparable_noise = (
-            noise.whiten(centred_record, record.interval) if is_whitened else centred_record
+            noise_model.whiten(centred_record, record.interval) if is_whitened else centred_record
         )
         autocorrelation, white_variance = noise_tests.autocorrelation([comparable_noise])
         if is_whitened:
             correlation = float(autocorrelation[0])
-            times_fewer = 1.0
+            samples_per_independent = 1.0
         else:
             # correlation of the record at the steps of the residuals
-            lags = np.arange(1 + len(autocorrelation))
-            at_steps = np.interp(
-                residuals.steps / record.interval, lags, np.r_[1.0, autocorrelation]
+            lag_numbers = np.arange(1 + len(autocorrelation))
+            correlation_at_steps = np.interp(
+                residuals.steps / record.interval, lag_numbers, np.r_[1.0, autocorrelation]
             )
-            correlation = float(np.mean(at_steps))
-            times_fewer = noise_tests.statistical_inefficiency(autocorrelation, white_variance)
-        colours.append(_RecordedColour(correlation, 1.0 / len(centred_record), times_fewer))
+            correlation = float(np.mean(correlation_at_steps))
+            samples_per_independent = noise_tests.statistical_inefficiency(
+                autocorrelation, white_variance
+            )
+        colours.append(
+            _RecordedColour(correlation, 1.0 / len(centred_record), samples_per_independent)
+        )
     return _RecordedColour(*np.mean(colours, axis=0).tolist())
 
 
