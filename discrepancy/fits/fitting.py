@@ -159,7 +159,7 @@ def fit(
             next_state = descent.descend(state, step)
         if next_state is not None:
             decrease = state.objective - next_state.objective
-            # the better the prediction, the less damping has the next step
+            # less damping for the next step, the more so the better the predicted decrease was
             reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
             damping = max(damping * reduction, 1e-9)
             state = next_state
@@ -229,8 +229,11 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
         If the model cannot be evaluated with the effects.
     """
     point = _within_bounds(problem, point)
-    numbers = range(len(problem.trials))
-    responses = [problem.response_of_candidate(number, point, candidate) for number in numbers]
+    trial_indices = range(len(problem.trials))
+    responses = [
+        problem.response_of_candidate(trial_index, point, candidate)
+        for trial_index in trial_indices
+    ]
     return _misfit_at(problem, point, responses).objective
 
 
@@ -366,20 +369,20 @@ class _Descent:
         first_local = first_effect + self.candidate.parameter_count
         precision = problem.noise_precisions(state.squares_by_channel)
         equations = normal_equations(problem, state, self.candidate, precision)
-        size = len(equations.gradient)
+        unknown_count = len(equations.gradient)
         # posterior deviations of the effect parameters: their columns of the inverse matrix
-        unit_vectors = np.eye(size)[:, first_effect:first_local]
+        unit_vectors = np.eye(unknown_count)[:, first_effect:first_local]
         covariance_columns = solve_factored(cholesky_factor(equations.matrix), unit_vectors)
         self.effect_deviation = np.sqrt(np.diag(covariance_columns[first_effect:first_local]))
         # unknowns that may move
         first_free = first_local if self.local_only else 0
-        is_free = np.arange(size) >= first_free
+        is_free = np.arange(unknown_count) >= first_free
         downhill = check_finite(equations.gradient)[:first_effect]
         is_free[:first_effect] &= ~self._is_held_at_bound(state.point.shared, downhill)
         # Levenberg-Marquardt step
         damped_matrix = equations.matrix + damping * np.diag(np.diag(equations.matrix))
         damped_matrix = damped_matrix[np.ix_(is_free, is_free)]
-        step = np.zeros(size)
+        step = np.zeros(unknown_count)
         step[is_free] = solve_factored(cholesky_factor(damped_matrix), equations.gradient[is_free])
         predicted_decrease = 0.5 * float(equations.gradient @ step)
         return self._split_step(step), predicted_decrease
@@ -439,12 +442,16 @@ def _with_evidence(
     factor = cholesky_factor(equations.matrix)
     covariance = solve_factored(factor, np.eye(len(factor)))
     # degrees of freedom: the trace of the hat matrix, channel by channel
-    spent_freedom = np.zeros(len(problem.channel_names))
-    for data, (trial_rows, unknown_indices) in zip(problem.trials, equations.trials, strict=True):
+    absorbed_freedom = np.zeros(len(problem.channel_names))
+    for data, (trial_jacobian, unknown_indices) in zip(
+        problem.trials, equations.trials, strict=True
+    ):
         trial_covariance = covariance[np.ix_(unknown_indices, unknown_indices)]
-        leverage = ((trial_covariance @ trial_rows.jacobian) * trial_rows.jacobian).sum(axis=0)
+        leverage = ((trial_covariance @ trial_jacobian.jacobian) * trial_jacobian.jacobian).sum(
+            axis=0
+        )
         np.add.at(
-            spent_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
+            absorbed_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
         )
     shared_count = problem.shared.unknown_count + candidate.parameter_count
     return CandidateFit(
@@ -452,7 +459,7 @@ def _with_evidence(
         candidate=candidate,
         log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
         covariance=covariance[:shared_count, :shared_count],
-        absorbed_freedom=spent_freedom,
+        absorbed_freedom=absorbed_freedom,
         converged=converged,
     )
 

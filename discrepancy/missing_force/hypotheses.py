@@ -74,11 +74,13 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
     terms = candidate.terms
     if not terms:
         return log(SEARCH.prior_none)
+    # The number of effects has a prior probability, which is divided equally among the sets of this
+    # number, and among the places of each effect.
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
-    shape_price = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
+    shape_penalty = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
     probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_probabilities[len(terms) - 1]
-    number_of_sets = comb(max(effect_count, len(terms)), len(terms))
-    return log(probability_of_length / number_of_sets) - log_places - shape_price
+    set_count = comb(max(effect_count, len(terms)), len(terms))
+    return log(probability_of_length / set_count) - log_places - shape_penalty
 
 
 def values_to_try(term: EffectTerm) -> list[FloatArray]:

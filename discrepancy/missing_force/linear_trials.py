@@ -344,10 +344,12 @@ class LinearTrials:
         if self.constant_column is not None:
             hypothesis_change = hypothesis_change.plus(self.constant_column[trial_index], 1.0)
         # the model's own laws move the trial, but are not among the forces that the model lacks
-        whole_change = hypothesis_change
+        change_with_model_laws = hypothesis_change
         if self.model_laws_column is not None:
-            whole_change = whole_change.plus(self.model_laws_column[trial_index], 1.0)
-        added_state = whole_change.added_state
+            change_with_model_laws = change_with_model_laws.plus(
+                self.model_laws_column[trial_index], 1.0
+            )
+        added_state = change_with_model_laws.added_state
         assert added_state is not None
         unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
         positions, speeds = trial.port_motion(unknowns, added_state)
@@ -355,7 +357,8 @@ class LinearTrials:
         for port, force, speed in zip(
             processes, smoothed.force_deviations, smoothed.speed_deviations, strict=True
         ):
-            # the last samples have no later readings: their speeds are known less well than others
+            # The last samples have few later readings, so that their deviations are larger: take
+            # that of the sample `INFORMING_SAMPLES` before the end for the whole record.
             deviations[port] = PortDeviations(force, float(speed[-INFORMING_SAMPLES:][0]))
         return TrialMotion(
             added_state=added_state,
@@ -379,8 +382,8 @@ def _columns_along_motion(trial: PortedTrial, motion: TrialMotion) -> dict[int, 
     # gains change the readings of their channel
     readings = trial.readings_of_state(motion.added_state, motion.forces)
     for unknown, channel, scale in trial.gain_unknowns:
-        is_channel = np.eye(readings.shape[1])[channel]
-        change = TrialColumn(readings * scale * is_channel)
+        channel_mask = np.eye(readings.shape[1])[channel]
+        change = TrialColumn(readings * scale * channel_mask)
         columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
     return columns
 

@@ -103,9 +103,9 @@ class ProcessSearch:
         time_range : (float, float)
             The shortest and the longest correlation time that the records can show [s].
         """
-        center = logarithms({port: median[port] for port in initial})
-        low = center - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
-        high = center + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
+        log_medians = logarithms({port: median[port] for port in initial})
+        low = log_medians - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
+        high = log_medians + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         shortest, longest = np.log(time_range)
         low[:, 1] = np.clip(low[:, 1], shortest, longest)
         high[:, 1] = np.clip(high[:, 1], shortest, longest)
@@ -142,7 +142,10 @@ class ProcessSearch:
         return self.processes(logs), value
 
     def _best_of_grid(self, logs: FloatArray) -> FloatArray:
-        """Return the best logarithms (P, 2) of a grid, one port after the other."""
+        """Return the best logarithms (P, 2) of a grid about given ones (P, 2).
+
+        The grid of each port is searched in turn, with the other ports at their best values so far.
+        """
         for port in range(len(logs)):
             candidates = []
             for factors in START_FACTORS:
@@ -228,8 +231,8 @@ class ProcessSearch:
         step[free_axes] = eigenvectors @ (
             eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), 1e-300)
         )
-        shortening = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        return np.asarray(step.reshape(logs.shape) / shortening)
+        length_ratio = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
+        return np.asarray(step.reshape(logs.shape) / length_ratio)
 
     def _backtrack(
         self, logs: FloatArray, value: float, step: FloatArray

@@ -318,7 +318,7 @@ class PortedTrial:
         start = np.zeros(len(system_derivative.generator))
         if self.begins_at_rest:
             start = -np.linalg.lstsq(self.system.generator, inputs[0], rcond=1e-12)[0]
-        # only these states have an input: the others need no column in `_moved`
+        # all other states have no input and are left out
         driven_states = np.flatnonzero(np.any(inputs, axis=0))
         state_derivative = self._state_under_inputs(
             start, np.eye(len(start))[:, driven_states], inputs[:, driven_states]

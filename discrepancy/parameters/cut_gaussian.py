@@ -52,9 +52,9 @@ class TruncatedGaussian:
         # mode within the range: least (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2
         mode = lsq_linear(inverse_factor, inverse_factor @ self.mean, bounds, method="bvls").x
         normal_at_mode = inverse_factor @ (mode - self.mean)
-        # At the mode x = L^T l, with the Lagrange multipliers l of the ends of the range: x_i is the
-        # sum of L_ji l_j over j >= i. The truncation of parameter i itself moves a draw by L_ii l_i.
-        # The shift is the remaining part, which anticipates the ranges of later parameters.
+        # The mode is x = L^T l, with the Lagrange multipliers l of the ends of the range: x_i is
+        # the sum of L_ji l_j over j >= i. The truncation of parameter i itself moves a draw by
+        # L_ii l_i. The shift is the remaining part, which anticipates the later parameters.
         return np.asarray(
             normal_at_mode - np.diag(self.factor) * (inverse_factor.T @ normal_at_mode)
         )
