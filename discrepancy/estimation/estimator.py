@@ -245,7 +245,8 @@ class EstimatorStart:
     trajectories : tuple of Trajectory
         The trajectory of each trial.
     processes : mapping of int to Process
-        The missing forces, so large that the trajectory can follow the readings whatever the laws.
+        The missing forces. They are large enough for the trajectory to follow the readings with any
+        laws.
     """
 
     effect: FloatArray
@@ -587,6 +588,7 @@ class MotionEstimator:
                 trajectories=trajectories,
                 processes=current.processes,
             )
+            # admissible if the error is at most one; None if the laws are not possible there
             error = self._linearisation_error(laws, current, stepped, linear, speed_window)
             if error is None:
                 continue
@@ -637,6 +639,7 @@ class MotionEstimator:
             )
             if true_forces is None:
                 return None
+            # the linear law after the step, against the true law there
             for port, linearised_force in trial.forces.items():
                 linear_force = linearised_force.extrapolate(
                     trajectory.positions[:, port] - trial.trajectory.positions[:, port],

@@ -307,7 +307,7 @@ def smooth_record(
             adjoint = backward @ adjoint
             propagate_covariance(backward, information, work, carried)
             information[:] = carried
-        # take in the readings of a sample, in reverse order
+        # update by the readings of a sample, in reverse order
         if j % substeps == 0:
             k = j // substeps
             for c in range(channel_count - 1, -1, -1):

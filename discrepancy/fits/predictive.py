@@ -107,6 +107,8 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
         amplitude_index = data.unknowns.zero_count
         if release is None or amplitude_index >= data.unknowns.unknown_count:
             continue
+        # For a release from rest the unknown is the difference from the nominal amplitude. The
+        # amplitude of a free initial state is nominal at the scaled value 1 / scale.
         nominal_amplitude = 0.0
         amplitude_step = 1.0
         if not release.at_rest:
@@ -201,6 +203,7 @@ class _TrialPredictions:
                 self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
             factors = self._covariance_factors(rows, data.unknowns.unknown_count)
+            # columns: shared unknowns and effects, then the unknowns of one trial after another
             sensitivity = None
             if sensitivities:
                 shape = self.local_fit.residuals[trial_index].shape

@@ -346,6 +346,7 @@ def parameter_grid(
     levels = SEARCH.grid_levels_if_many
     if other_parameter_count < len(SEARCH.grid_levels):
         levels = SEARCH.grid_levels[other_parameter_count]
+    # one axis for each parameter: the scaled values at which it is tried
     axes: list[tuple[float, ...]] = []
     has_magnitude = False
     for parameter in term.parameters:

@@ -33,6 +33,7 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
     no_effect = search.compared_no_effect
     probabilities = search.set_probabilities()
     conclusion = Conclusion.from_probabilities(search, best, probabilities)
+    # the model without effect
     no_effect_gate = check_absolute_fit(problem, no_effect)
     probability_of_none = probabilities.get((), 0.0)
     may_lack_nothing = probability_of_none > 1.0 - SEARCH.name_probability
@@ -42,6 +43,7 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
         and _residuals_have_recorded_colour(no_effect)
     ):
         return _nothing_missing_outcome(conclusion, no_effect, no_effect_gate, probability_of_none)
+    # the best hypothesis
     if (
         not best.candidate.terms
         or best.candidate.has_free_shape
@@ -89,6 +91,7 @@ def _nothing_missing_outcome(
             gates=(gate,),
             remainders=remainders,
         )
+    # effects that are too probable to be excluded
     possible_effects = []
     for name, probability in conclusion.inclusion_probabilities.items():
         if probability > 1.0 - SEARCH.name_probability:

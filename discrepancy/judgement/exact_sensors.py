@@ -54,7 +54,7 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
 
     The drop of the sum of squares by a free zero (or gain) is first estimated with all other
     unknowns fixed. The channels of the largest drops are then fitted with the zero free, one by one
-    and at last all together, since other unknowns may compensate it. A channel is reported if its
+    and then all together, since other unknowns may compensate it. A channel is reported if its
     fit removes at least `LEAST_REMOVED_SHARE` of the misfit of all channels.
 
     Parameters

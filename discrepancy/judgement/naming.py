@@ -195,6 +195,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     problem = search.problem
     without_name = replace(verdict, effects=(), group=())
     causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    # reason 1: errors that any instrument has
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
             f"The model explains the data but for {causes} below "
@@ -202,6 +203,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
             "instruments and no name."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
+    # reason 2: a gain that only keeps calibrated parameters within their priors
     if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
     if not _are_instrument_errors_with_gain(verdict):

@@ -314,7 +314,7 @@ def feasible_proposals(problem: Problem, *, is_oscillating: bool = True) -> Iter
         changed_trial = _changed_trial(
             problem, varied_trial, proposal_table["change"], proposal_table["by"]
         )
-        if changed_trial is None:
+        if changed_trial is None:  # the change is not possible with this trial or model
             continue
         level = varied_trial.level
         description = proposal_table["description"].format(
@@ -378,6 +378,7 @@ def _changed_trial(
     if change == "length":
         sample_count = int(amount) * len(trial.time)
         time = trial.time[0] + trial.interval * np.arange(sample_count)
+        # the readings are not used: the recorded rows are repeated to fill the longer record
         longer_trial = trial.rows(np.arange(sample_count) % len(trial.time), time=time)
         return _ChangedTrial(longer_trial, sample_count * trial.interval)
     if change == "place" and stations is not None:

@@ -236,7 +236,7 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
     variance_within = 0.0
     for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
         used = without_effect.used
-        # densities are in units of the noise, which differs where none is recorded
+        # densities are in units of the noise deviation, which differs for channels without a record
         noise_ratio = np.log(without_effect.noise_deviation / with_effect.noise_deviation)
         gain = log_density(with_effect) - log_density(without_effect) + noise_ratio
         gain = np.where(used, gain, 0.0)
@@ -388,6 +388,7 @@ def prove_effects(
     FitError
         If no sample of the fitted or of the held-out trials is used.
     """
+    # the same noise deviation for both, so that errors and scores can be compared
     after = residuals_with_noise_of(after, before)
     held_out_before = _held_out_scores(before, seed)
     held_out_after = _held_out_scores(after, seed)

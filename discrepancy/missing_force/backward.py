@@ -142,7 +142,7 @@ def filter_backward(
     steady = False
     for k in range(sample_count - 1, -1, -1):
         reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
-        # take in the readings of the sample
+        # add the information of the readings of the sample
         for channel in range(len(output_rows)):
             if used[k, channel]:
                 h += np.outer(output_rows[channel], columns[k, channel])

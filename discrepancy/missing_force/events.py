@@ -137,6 +137,7 @@ class EventSearch(EventTrials):
             )
             return minus_log_prior - float(self.log_evidence(self.products(forces(moves), paths)))
 
+        # Nelder-Mead search over four moves, one unit of which is the initial step of a logarithm
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": evaluations, "initial_simplex": simplex}
         fit = minimize(objective, simplex[0], method="Nelder-Mead", options=options)

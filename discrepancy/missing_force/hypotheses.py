@@ -411,6 +411,7 @@ class ColumnBuilder:
         """
         added_state = np.zeros_like(motion.added_state)
         readings = np.zeros_like(trial.residual)
+        # sum over all laws: the force along the motion, and what it adds to state and readings
         forces: dict[int, FloatArray] = {}
         for law in self.problem.model.forces_at_ports(laws):
             if not isinstance(law, PortForce):
@@ -425,6 +426,7 @@ class ColumnBuilder:
                 0.0 if deviations is None else deviations.speed,
                 motion.forces.get(port, 0.0),
             )
+            # response of the linear system to the force
             added_by_law = trial.state_under_force(port, force)
             added_state += added_by_law
             readings += trial.readings_of_state(added_by_law, {port: force})

@@ -337,7 +337,7 @@ def missing_force_of_verdict(
     if len({law.place for law in laws}) > 1:
         names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
         at_port = replace(at_port, law=" and ".join(names_at_ports))
-    # without the shares, the force is returned as it is
+    # if the shares cannot be computed, the force is returned without them
     with suppress(*ESTIMATION_ERRORS):
         shares = ForceShares(search)
         held_out = None

@@ -93,7 +93,7 @@ class ForceShares:
         remaining_rms = _largest_rms([motion.unexplained_forces for motion in motions], ports)
         total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
         law_rms = _largest_rms([motion.law_forces for motion in motions], ports)
-        # in trials where the force of the law is small, its share says nothing about it
+        # trials in which the force of the law is small do not test the law
         is_tested = not law_ports or law_rms**2 > LEAST_FORCE_RATIO * total_rms**2
         of_forces, of_predictions = self._block_sums(
             hypothesis, linear_trials, motions, motions_without
@@ -210,7 +210,7 @@ class ForceShares:
         """Return the trials, and the motion and unexplained force of each with a hypothesis.
 
         The unexplained force has the standard deviation of the force that is missing without any
-        effect, so that it can take up all that the hypothesis does not explain.
+        effect, so that it can describe all that the hypothesis does not explain.
 
         Parameters
         ----------

@@ -483,10 +483,12 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     """
     data = problem.trials[trial_index]
     trial = data.trial
+    # linear system with ports, at the point
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
     system, system_derivatives = _ported_system(problem, trial, point.shared)
     system = _with_gains(system, gains)
     substeps = _substep_count(system, trial.time)
+    # response of the model, about which the missing forces are added
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
     residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
     deviation = trial.noise_factor * np.array(

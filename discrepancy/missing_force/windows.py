@@ -96,10 +96,12 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
     port_number, hypothesis = _port_or_channel_error(
         search.ports.index(port), search.hypothesis_with_jumps(port), channels_by_trial
     )
+    # no windows without a missing force
     if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
         return ()
     process = hypothesis.processes[port_number]
     best_events = find_events(hypothesis.linear_trials, port_number, process, evidence_of_law)
+    # the part of the readings that the force causes gives the size of each window
     readings_by_force = []
     for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
         force = motion.forces[port_number]

@@ -266,6 +266,7 @@ def _range_findings(
     optimum = posterior.optima[0]
     fitted_parameters = optimum.point.shared[marginal.parameter_indices]
     deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.parameter_indices]), 1e-12)
+    # probability of the Gaussian posterior that lies outside of the range before it is truncated
     probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
     probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
     is_determined = remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
@@ -277,6 +278,7 @@ def _range_findings(
                 f"{prior.high:g}, and is cut off there: widen the range if the model holds beyond "
                 "it."
             )
+    # failures of the model within the range, near the optimum
     refusals = [
         refusal
         for refusal in marginal.refusals

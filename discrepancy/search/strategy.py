@@ -154,6 +154,7 @@ class Search(FittedCandidates):
         """
         has_effects = bool(base.candidate.terms)
         least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
+        # screen all effects
         screen = Screen(self.problem, base)
         changes_by_effect = []
         for effect in report_each(
@@ -167,6 +168,7 @@ class Search(FittedCandidates):
         changes_by_effect.sort(
             key=lambda changes: -max((change.gain for change in changes), default=0.0)
         )
+        # fit the promising ones
         starts_by_effect = []
         for changes in changes_by_effect:
             if changes:
@@ -180,7 +182,7 @@ class Search(FittedCandidates):
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
         """Return a base whose nuisances are not distorted by the errors of the model.
 
-        The nuisances of a wrong model take up part of its error, which makes them a bad start. They
+        The nuisances of a wrong model compensate a part of its error, and are a bad start. They
         are taken from a fit that includes a free missing force. If a trial is at rest, or no force
         can be estimated, they are set to their prior means.
         """
