@@ -333,6 +333,7 @@ class LinearisedTrial:
                 by_input_at_end[interval_of_substep, :, structure],
                 rate_change[1:],
             )
+            # linear about u0 = `linearisation_point`: the change is proportional to u - u0
             drift[:, :, 1 + unknown] += state_change
             drift[:, :, 0] -= trial.linearisation_point[unknown] * state_change
         return drift
@@ -477,7 +478,7 @@ class LinearisedTrial:
         record = self.filtered_record
         whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
         whitened = whitened.reshape(-1, self.weight_count)
-        # `_observations` has minus the derivatives of the readings: change the sign
+        # the columns of `_observations` are minus the derivatives of the readings: change the sign
         whitened[:, 1:] *= -1.0
         used = self.trial.used
         half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[used]))

@@ -268,15 +268,15 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
         The response of the model in each trial at the point.
     """
     residuals = tuple(
-        problem.standardised_residual(number, point, response)
-        for number, response in enumerate(responses)
+        problem.standardised_residual(trial_index, point, response)
+        for trial_index, response in enumerate(responses)
     )
     sums = problem.squares_by_channel(residuals)
-    prior_energy = 0.5 * float(problem.shared.precision @ point.shared**2)
-    prior_energy += 0.5 * float(point.effect @ point.effect)
+    minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+    minus_log_prior += 0.5 * float(point.effect @ point.effect)
     for data, u in zip(problem.trials, point.local, strict=True):
-        prior_energy += 0.5 * float(data.unknowns.precision @ u**2)
-    negative_log_posterior = problem.misfit(sums) + prior_energy
+        minus_log_prior += 0.5 * float(data.unknowns.precision @ u**2)
+    negative_log_posterior = problem.misfit(sums) + minus_log_prior
     if not np.isfinite(negative_log_posterior):
         negative_log_posterior = np.inf
     return _Misfit(negative_log_posterior, residuals, sums)

@@ -207,9 +207,10 @@ def normal_equations(
     effect_precision : (E,) array, optional
         The prior precisions of the effect parameters; 1 if left out.
     """
-    numbers = range(len(problem.trials))
+    trial_indices = range(len(problem.trials))
     trial_equations = [
-        trial_jacobian(problem, number, state, candidate, precision) for number in numbers
+        trial_jacobian(problem, trial_index, state, candidate, precision)
+        for trial_index in trial_indices
     ]
     # prior: each scaled unknown u adds precision u^2 / 2 to the objective
     if effect_precision is None:
@@ -218,9 +219,9 @@ def normal_equations(
     prior_precision = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
     effect = state.point.effect[: candidate.parameter_count]
     local_values = [trial.local_values for trial in trial_equations]
-    values = np.concatenate((state.point.shared, effect, *local_values))
+    scaled_values = np.concatenate((state.point.shared, effect, *local_values))
     matrix = np.diag(prior_precision + LEAST_PRECISION)
-    gradient = -prior_precision * values
+    gradient = -prior_precision * scaled_values
     # readings: J J^T and J r of each trial, with its derivatives J (M, N C) and residuals r
     first_local = problem.shared.unknown_count + candidate.parameter_count
     trials_with_indices = []

@@ -415,9 +415,9 @@ class TrialData:
         # is not compared if one of them is left out
         weight = trial.used.astype(np.float64)
         for column in np.flatnonzero(is_whitened):
-            order = len(noise_models[column].autoregression)
-            for row in np.flatnonzero(~trial.used[:, column]):
-                weight[row : row + order + 1, column] = 0.0
+            filter_order = len(noise_models[column].autoregression)
+            for unused_row in np.flatnonzero(~trial.used[:, column]):
+                weight[unused_row : unused_row + filter_order + 1, column] = 0.0
         return cls(
             trial=trial,
             deviation=deviation,

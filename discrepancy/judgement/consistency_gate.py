@@ -1,9 +1,9 @@
 """The test of consistency: residuals of a fit must not depend on load, run, or sensor channel.
 
-An effect that is not in the catalogue can be imitated by one that is, so closely that the sum of
-squares of many thousand samples does not show it. The difference then lies in few patterns of the
-readings: the response of one kind of trial has another size, slope over the span, or zero than the
-fitted effect gives it. Such a pattern is called a *direction* here. A score test (Rao 1948, Proc.
+An effect that is not in the catalogue can be imitated by one of the catalogue, so closely that the
+sum of squares of many thousand samples does not show the difference. The difference then lies in
+few patterns of the readings: the response of one kind of trial has another size, slope over the
+span, or zero than the fitted effect gives it. Such a pattern is called a *direction* here. A score test (Rao 1948, Proc.
 Camb. Phil. Soc. 44, 50-57) examines whether the misfit falls along these directions more than by
 chance, while nuisances and the parameters of the effect are refitted.
 """
@@ -165,7 +165,7 @@ class _ProjectedDirections(NamedTuple):
 def _projected_directions(
     problem: Problem, screen: Screen, group: Mapping[str, Direction]
 ) -> _ProjectedDirections:
-    """Return a group of directions after the part that nuisances and effect can do is removed.
+    """Return directions without the part that nuisances and effect parameters can compensate.
 
     Parameters
     ----------
@@ -176,23 +176,23 @@ def _projected_directions(
     group : mapping of str to Direction
         The directions by their names.
     """
-    sign = screen.inner_product_signs
+    signs = screen.inner_product_signs
     labels = []
-    vectors = []
+    unit_vectors = []
     scores = []
     for label, direction in group.items():
         changes = {}
         for trial_index, change in direction.items():
             changes[trial_index] = problem.trials[trial_index].standardise(change)
-        vector, score, _ = screen.project(changes)
-        length = float(np.linalg.norm(vector[sign > 0.0]))
+        projected_vector, score, _ = screen.project(changes)
+        length = float(np.linalg.norm(projected_vector[signs > 0.0]))
         if length > 0.0:
             labels.append(label)
-            vectors.append(vector / length)
+            unit_vectors.append(projected_vector / length)
             scores.append(score / length)
     if not labels:
         return _ProjectedDirections(labels, np.zeros(0), np.zeros((0, 0)))
-    information = (np.array(vectors) * sign) @ np.array(vectors).T
+    information = (np.array(unit_vectors) * signs) @ np.array(unit_vectors).T
     return _ProjectedDirections(labels, np.array(scores), information)
 
 

@@ -135,7 +135,7 @@ def verdict_without_negligible_effect(
     fit : CandidateFit
         The fit of the set.
     """
-    # is there an effect of little influence at all?
+    # nothing is dropped if each effect is notable and no subset explains as much
     comparison = SimulationComparison(search)
     full_set_key = set(fit.candidate.key)
     notable_key = _key_of_notable_terms(comparison, fit)

@@ -23,8 +23,8 @@ from .linear_trials import LinearTrials
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
 FURTHER_PORT_FACTOR = 0.1
-"""Factor on the size of a further port's missing force, estimated alone, with which the search for
-all of them together begins."""
+"""Factor on the standard deviation of a missing force as estimated at its port alone. The search for
+the forces at all ports together begins with the product. At the best port the factor is one."""
 
 
 class MissingForces:
@@ -133,6 +133,7 @@ class MissingForces:
         for port in ports:
             scale = scales.ports[self.ports[port]]
             rate = scale.angular_frequency or 1.0 / scales.duration
+            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
             processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 

@@ -73,6 +73,7 @@ class ForceHypothesis:
         covariance = self.solution.covariance
         if not len(self.effect):
             return mean[:first_effect]
+        # conditional mean of a joint Gaussian: m_s + C_se C_ee^-1 (effect - m_e)
         residual = self.effect - mean[first_effect:]
         weighted_residual = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
         return np.asarray(

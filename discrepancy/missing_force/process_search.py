@@ -17,12 +17,13 @@ Processes = Mapping[int, Process]
 """Missing forces as processes, by the numbers of their ports."""
 
 PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
-"""Prior standard deviations of the logarithms of size and correlation time of a process."""
+"""Prior standard deviations of the logarithms of size and correlation time of a process. They allow
+factors of about 20 in size and 3 in time."""
 PRIOR_LOG_DEVIATIONS = np.array((PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME))
 """Both of these deviations, as an array."""
 START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
 """Logarithms of the factors on size and time that make the grid around the given processes. Small
-sizes are in it because a law leaves only a part of the force that was missing without it."""
+sizes are in it, as only a part of the force remains missing if a law explains the rest."""
 LARGEST_DISTANCE = 5.0
 """Bound of the search, in prior standard deviations from the median."""
 DIFFERENCE = 0.02

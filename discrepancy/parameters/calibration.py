@@ -341,7 +341,7 @@ def _undetermined_findings(
 
 
 def _distance_from_optimum(posterior: ParameterPosterior, u: FloatArray) -> float:
-    """Return the distance of scaled parameters from the best optimum [standard deviations].
+    """Return the Mahalanobis distance of parameters from the best optimum [standard deviations].
 
     Parameters
     ----------

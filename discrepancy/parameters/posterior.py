@@ -183,20 +183,23 @@ def _draws_by_quadrature(
     """
     nodes = _QuadratureNodes(index, marginal, optima[0])
     initial_nodes = _initial_nodes(marginal, optima, index)
+    # first nodes, from the optimum outwards, as each fit begins at the nearest fitted node
     for node in sorted(initial_nodes, key=lambda node: abs(node - nodes.centre)):
         nodes.add_node(node)
-    points, distribution = _cumulative_distribution(nodes.energy)
+    distribution_points, distribution = _cumulative_distribution(nodes.energy)
+    # further nodes, in the middle of intervals with much probability
     while len(nodes.energy) < MOST_NODES:
         probabilities = np.diff(
             distribution[::INTERPOLATION_INTERVALS]
         )  # between neighbouring nodes
-        largest = int(np.argmax(probabilities))
-        if not probabilities[largest] > LARGEST_MASS:
+        interval = int(np.argmax(probabilities))
+        if not probabilities[interval] > LARGEST_MASS:
             break
-        left, right = sorted(nodes.energy)[largest : largest + 2]
-        nodes.add_node(0.5 * (left + right))
-        points, distribution = _cumulative_distribution(nodes.energy)
-    quadrature_values = np.interp(stratified(generator, count), distribution, points)
+        lower_node, upper_node = sorted(nodes.energy)[interval : interval + 2]
+        nodes.add_node(0.5 * (lower_node + upper_node))
+        distribution_points, distribution = _cumulative_distribution(nodes.energy)
+    # the parameter of the quadrature: inverse of its cumulative distribution
+    quadrature_values = np.interp(stratified(generator, count), distribution, distribution_points)
 
     # the other parameters: their mean interpolates those at the nodes, and their covariance is
     # that at the nearest node
@@ -294,14 +297,14 @@ def _initial_nodes(
         np.linspace(max(low, -QUADRATURE_RANGE), min(high, QUADRATURE_RANGE), NODES_OF_PRIOR)
     ]
     for optimum in optima:
-        deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
-        about_optimum = optimum.point.shared[shared_index] + deviation * np.linspace(
+        posterior_deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
+        about_optimum = optimum.point.shared[shared_index] + posterior_deviation * np.linspace(
             -3.0, 3.0, NODES_PER_OPTIMUM
         )
         node_grids.append(np.clip(about_optimum, low, high))
     nodes = np.unique(np.concatenate(node_grids))
-    is_apart = np.diff(nodes, prepend=-np.inf) > LEAST_NODE_DISTANCE * (nodes[-1] - nodes[0])
-    return [float(node) for node in nodes[is_apart]]
+    is_separate = np.diff(nodes, prepend=-np.inf) > LEAST_NODE_DISTANCE * (nodes[-1] - nodes[0])
+    return [float(node) for node in nodes[is_separate]]
 
 
 def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
