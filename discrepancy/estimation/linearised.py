@@ -429,11 +429,13 @@ class LinearisedTrial:
         trial = self.trial
         trajectory = self.trajectory
         derivatives: dict[int, FloatArray] = {}
+        # parameters change the matrices of the output equation
         for unknown, derivative in enumerate(trial.system_derivatives):
             if derivative is not None:
                 derivatives[unknown] = trial.divide_by_noise(
                     trial.outputs_of_state(derivative, trajectory.added_state, trajectory.forces)
                 )
+        # a gain multiplies the readings of its channel
         added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
         for unknown, channel, scale in trial.gain_unknowns:
             derivatives[unknown] = added_readings * scale * np.eye(added_readings.shape[1])[channel]

@@ -231,8 +231,8 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the kind of shared unknowns that a hypothesis moves far from their priors.
 
         It is empty if there is none. The test is that of χ² with prior deviations that are
-        `SEARCH.prior_widening` times the stated ones, since calibrated values take up errors that
-        the hypothesis does not explain.
+        `SEARCH.prior_widening` times the stated ones, since calibrated values also compensate
+        errors that the hypothesis does not explain.
         """
         shared = self.problem.shared
         has_prior = shared.precision > 0.0

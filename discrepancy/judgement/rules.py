@@ -268,7 +268,7 @@ class VerdictCase:
         )
 
     def _no_group_verdict(self, most_probable: FittedEffectSet, count: int) -> VerdictOutcome:
-        """Return the verdict of a gap if none of the probable sets passes the test, or too many do.
+        """Return the verdict of an unexplained gap if no set passes the test, or too many do.
 
         Parameters
         ----------

@@ -23,8 +23,8 @@ from .linear_trials import LinearTrials
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
 FURTHER_PORT_FACTOR = 0.1
-"""Factor on the standard deviation of a missing force as estimated at its port alone. The search for
-the forces at all ports together begins with the product. At the best port the factor is one."""
+"""Factor on the standard deviation of a missing force as estimated at its port alone. The search
+for the forces at all ports together begins with the product. At the best port the factor is one."""
 
 
 class MissingForces:

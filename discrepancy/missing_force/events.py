@@ -210,6 +210,7 @@ class Events:
         """
         on = self.paths[trial_index]
         time = self.search.trials[trial_index].time
+        # divide the intervals of a short record, so that a change may lie between samples
         substeps = max(1, CHANGE_GRID_SIZE // len(on))
         record = self.switched_record(trial_index, substeps)
         fine_path = np.repeat(on, substeps)[: (len(on) - 1) * substeps + 1]
@@ -217,7 +218,8 @@ class Events:
         for change in range(len(times_of_changes)):
             samples, log_evidence = record.evidence_of_change_samples(fine_path, change)
             sample_times = np.interp(samples / substeps, np.arange(len(on)), time)
-            # the posterior density of the moment, integrated by the trapezoidal rule
+            # posterior density of the time of the change, integrated by the trapezoidal rule; its
+            # quantiles are found by inverse interpolation
             density = np.exp(log_evidence - log_evidence.max())
             probabilities = 0.5 * (density[1:] + density[:-1]) * np.diff(sample_times)
             distribution = np.r_[0.0, np.cumsum(probabilities)]

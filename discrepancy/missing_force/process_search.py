@@ -190,6 +190,8 @@ class ProcessSearch:
     ) -> FloatArray:
         """Return the second differences (2 P, 2 P) of the value, by all pairs of logarithms.
 
+        They are the second derivatives, multiplied by `DIFFERENCE` squared.
+
         Parameters
         ----------
         logs : (P, 2) array
@@ -199,11 +201,13 @@ class ProcessSearch:
         values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
-        offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
-        # central differences on the diagonal, forward ones of both logarithms off it
+        logarithm_steps = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        # on the diagonal: central differences; off the diagonal: forward differences in both
         curvature = np.diag(values_above + values_below - 2.0 * value)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            value_with_both_larger = self.log_posterior(logs + offsets[i] + offsets[k])
+            value_with_both_larger = self.log_posterior(
+                logs + logarithm_steps[i] + logarithm_steps[k]
+            )
             curvature[i, k] = value_with_both_larger - values_above[i] - values_above[k] + value
             curvature[k, i] = curvature[i, k]
         return curvature
