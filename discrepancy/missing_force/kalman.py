@@ -3,7 +3,7 @@
 The forward filter gives the state at a moment by the readings before it, the backward filter the
 information on that state by the readings after it (Fraser and Potter 1969, IEEE Transactions on
 Automatic Control 14, 387-390). Together they give the evidence of all readings, and the state at
-that moment. Readings are taken in one at a time, so that the forward filter inverts no matrix.
+that moment. Readings are processed one at a time, so that the forward filter inverts no matrix.
 Covariance and information are updated in Joseph form; once they have converged they are kept.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
@@ -161,7 +161,7 @@ def filter_forward(
     output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     first : int
-        The first sample whose readings are taken in.
+        The first sample whose readings are processed.
     covariance, mean : (n, n), (n, W) ndarray
         The state after the sample before `first`; for the first sample of a record, the state at
         that sample before its readings.
@@ -387,7 +387,7 @@ class RecordFilter:
         step_of_sample : (N,) array
             The step that leads to each sample.
         first : int
-            The first sample whose readings are taken in.
+            The first sample whose readings are processed.
         state : FilterState
             The state of the filter before that sample.
         query_samples : (B,) array

@@ -180,15 +180,15 @@ class LinearTrials:
         model's response is in `PortedTrial.shared_derivatives`.
         """
         # without a motion (no entry in `motions`) nothing is added that parameters could change
-        by_trial = [
+        columns_by_trial = [
             _columns_along_motion(trial, motion)
             for trial, motion in zip(self.trials, self.motions, strict=False)
         ]
-        by_trial += [{} for _ in range(len(self.trials) - len(by_trial))]
+        columns_by_trial += [{} for _ in range(len(self.trials) - len(columns_by_trial))]
         for unknown, column in enumerate(self.effect_columns, start=len(self.shared_precision)):
-            for change, columns in zip(column, by_trial, strict=True):
+            for change, columns in zip(column, columns_by_trial, strict=True):
                 columns[unknown] = UnknownColumn(change, 0.0)
-        return by_trial
+        return columns_by_trial
 
     @cached_property
     def regression_rows(self) -> list[FloatArray]:
@@ -197,12 +197,13 @@ class LinearTrials:
         Row 0 is the residual at zero unknowns. The K shared unknowns and those of effects follow,
         then the L unknowns of the trial alone. All are divided by the noise deviations.
         """
-        by_trial = []
+        rows_by_trial = []
         first_local = 1 + len(self.prior_precision)
         for trial_index, trial in enumerate(self.trials):
             row_count = first_local + len(trial.local_derivatives)
             # the rows of one reading lie side by side in memory, as the filter needs them
             rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
+            # changes without an unknown are subtracted from the residual
             readings_without_unknown = [
                 column[trial_index].readings
                 for column in (self.constant_column, self.model_laws_column)
@@ -216,8 +217,8 @@ class LinearTrials:
                 # the change is proportional to (unknown - zero_value): refer the residual to an
                 # unknown of zero
                 rows[0] += zero_value * change.readings
-            by_trial.append(rows)
-        return by_trial
+            rows_by_trial.append(rows)
+        return rows_by_trial
 
     def force_filters(self, processes: Processes) -> list[ForceFilter]:
         """Return the Kalman filter of each trial with given missing forces."""

@@ -327,6 +327,7 @@ def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray,
     nodes = np.array(sorted(energy))
     energies = np.array([energy[node] for node in nodes.tolist()])
     energies = np.minimum(energies - energies.min(), LARGEST_ENERGY)
+    # density at the nodes and at equally spaced points between them
     fractions = np.linspace(0.0, 1.0, INTERPOLATION_INTERVALS, endpoint=False)
     between_nodes = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
     points = np.append(between_nodes, nodes[-1])

@@ -169,13 +169,14 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         that are projections on nuisances count negative, as they are subtracted from those of
         readings.
     """
-    best: dict[tuple[str, str], ScreenedPair] = {}
+    best_by_effects: dict[tuple[str, str], ScreenedPair] = {}
     for first, second in combinations(changes, 2):
-        key = (first.term.effect.identifier, second.term.effect.identifier)
+        effect_names = (first.term.effect.identifier, second.term.effect.identifier)
         inner_product = float(first.vector * sign @ second.vector)
         gram = np.array([[first.squared_size, inner_product], [inner_product, second.squared_size]])
         overlap = np.array([first.overlap, second.overlap])
-        if key[0] == key[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
+        # no pair: the same effect twice, or two effects of parallel changes
+        if effect_names[0] == effect_names[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
         # least misfit F(s) = F(0) - b^T s + s^T G s / 2: s = G^-1 b, F(s) - F(0) = -b^T s / 2
         best_scales = np.linalg.solve(gram, overlap)
@@ -184,14 +185,17 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
             for factor, change in zip(best_scales, (first, second), strict=True)
         ]
         misfit_change = -0.5 * float(overlap @ best_scales)
-        is_best_of_effects = key not in best or misfit_change < best[key].misfit
+        is_best_of_effects = (
+            effect_names not in best_by_effects
+            or misfit_change < best_by_effects[effect_names].misfit
+        )
         if all(has_possible_sign) and is_best_of_effects:
-            best[key] = ScreenedPair(
+            best_by_effects[effect_names] = ScreenedPair(
                 misfit_change,
                 _with_scale(first, best_scales[0]),
                 _with_scale(second, best_scales[1]),
             )
-    return sorted(best.values(), key=lambda pair: pair.misfit)
+    return sorted(best_by_effects.values(), key=lambda pair: pair.misfit)
 
 
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:

@@ -106,6 +106,7 @@ class Search(FittedCandidates):
         if self._has_large_residuals(base):
             screened = tuple(effect for effect in effects if not changes_structure(effect, setting))
         fits = self._fit_from_screen(base, screened)
+        # far from the truth: also from the best points of a grid
         is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
         if self._has_large_residuals(base) or (self._is_far_from_truth(base) and not is_explained):
             unbiased_base = self._with_unbiased_nuisances(base)
@@ -115,6 +116,7 @@ class Search(FittedCandidates):
                     starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
             starts_by_effect = [starts for starts in starts_by_effect if starts]
             fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
+        # in ascending order of score, so that the best fit of each set replaces the others
         best_by_effects: dict[tuple[str, ...], CandidateFit] = {}
         for fit in sorted(fits, key=self.score):
             self.record_fit(fit, exact=False)

@@ -329,14 +329,16 @@ def refit_under_wide_noise(
     Returns
     -------
     CandidateFit or None
-        None if the hypothesis cannot be fitted under the wider noise. Its evidence under the
-        recorded noise could not be compared with that of others under the wider noise.
+        The fit; the given one if both problems are the same. None if the hypothesis cannot be
+        fitted under the wider noise: its evidence under the recorded noise could not be compared
+        with that of others under the wider noise.
     """
     if wide_problem is problem:
         return fit
     wide_fit = try_fit(wide_problem, fit.candidate, fit.point, iterations=iterations)
     if wide_fit is None:
         return None
+    # without iterations: residuals at the same point, relative to the recorded noise
     recorded_fit = try_fit(problem, fit.candidate, wide_fit.point, iterations=0)
     if recorded_fit is None:
         return None
@@ -413,12 +415,14 @@ def _fit_under_wide_noise(
     chosen : sequence of CandidateFit
         The fits to choose from.
     """
+    # choose by the expected score under the wider noise
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
     fits_with_scores.sort(key=lambda fit_and_score: fit_and_score[1], reverse=True)
     least_score = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
     promising = [
         fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least_score
     ]
+    # fit the model without effect, and the chosen hypotheses
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in report_each(
@@ -427,7 +431,7 @@ def _fit_under_wide_noise(
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
         _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))
-    # the subsets of the leading set: each of its effects has to earn its place
+    # fit the subsets of the best set, to compare whether each of its effects is needed
     leading_names = set(max(wide_fits.values(), key=search.score).candidate.identifiers)
     for fit in list(search.compared_fits().values()):
         names = set(fit.candidate.identifiers)
