@@ -72,7 +72,8 @@ class EffectLaws:
         shared : (K,) array
             The values of the shared unknowns.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -107,7 +108,8 @@ class EffectLaws:
         shared : (K,) array
             The values of the shared unknowns.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -221,7 +223,8 @@ class EffectLaws:
         patch : ModelPatch
             The patch; what is not a law at a port is left out.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
         """
         trial = self.trials[trial_index]
         forces: dict[int, LawForce] = {}

@@ -37,10 +37,12 @@ from .linearised import (
 )
 
 DEVIATION_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Standard deviations of the missing force in turn, over the one at the start."""
+"""Standard deviations of the missing force that are tried in turn, divided by the one at the
+start."""
 SPEED_WINDOWS = (0.1, 0.02, 0.005)
-"""Half windows of speeds over which laws of the speed are averaged, over the rms speed. They become
-narrower from one estimate to the next, so that the jump of dry friction is introduced gradually."""
+"""Half widths of the window of speeds over which laws of the speed are averaged, divided by the rms
+speed. The window becomes narrower from one estimate to the next, so that the jump of dry friction
+is introduced gradually."""
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
 CONVERGED_STEP = 0.02
@@ -87,7 +89,8 @@ class HypothesisLaws(Protocol):
         shared : (K,) array
             The values of the shared unknowns.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -117,7 +120,8 @@ class HypothesisLaws(Protocol):
         shared : (K,) array
             The values of the shared unknowns.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -189,12 +193,12 @@ class Linearisation:
         sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
         half_log_determinant = 0.0
         for linear_trial in self.trials:
-            products, half_of_trial = linear_trial.whitened_products
-            products_without_local, half_without_local = integrate_out_last(
-                products, np.asarray(half_of_trial), linear_trial.trial.local_precision
+            products, half_determinant = linear_trial.whitened_products
+            products_without_local, half_determinant_without_local = integrate_out_last(
+                products, np.asarray(half_determinant), linear_trial.trial.local_precision
             )
             sum_of_products += products_without_local
-            half_log_determinant += float(half_without_local)
+            half_log_determinant += float(half_determinant_without_local)
         regression = Regression(sum_of_products, half_log_determinant)
         all_unknowns = range(len(self.prior_precision))
         solution = regression.solve(all_unknowns, self.prior_precision)
@@ -241,7 +245,8 @@ class EstimatorStart:
     trajectories : tuple of Trajectory
         The trajectory of each trial.
     processes : mapping of int to Process
-        The missing forces, so large that the trajectory can follow the readings whatever the laws.
+        The missing forces. They are large enough for the trajectory to follow the readings with any
+        laws.
     """
 
     effect: FloatArray
@@ -306,41 +311,46 @@ class MotionEstimator:
     def _lower_missing_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
     ) -> MotionEstimate | None:
-        """Return the estimate with the most probable of several sizes of the missing force.
+        """Return the most probable of several estimates with smaller and smaller missing forces.
 
-        With a large missing force the trajectory follows the readings whatever the laws are. The
-        size is then lowered in steps, and each estimate begins where the last one ended.
+        This is a continuation. With a large missing force the trajectory follows the readings
+        whatever the laws are. Its standard deviation is then lowered to each of
+        `DEVIATION_FRACTIONS` times that at the start. Each estimate begins with the unknowns and
+        the trajectories of the previous one.
 
         Parameters
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
-            The values to begin with, and the first size.
+            The unknowns, trajectories and missing forces of the first estimate.
 
         Returns
         -------
         MotionEstimate or None
-            The estimate; None if the laws are not possible even at the first size.
+            The estimate; None if there is none even with the first missing force.
         """
-        best: MotionEstimate | None = None
-        current = start
+        best_estimate: MotionEstimate | None = None
+        current_start = start
         for fraction in DEVIATION_FRACTIONS:
+            # each fraction is of the missing force at the start, not of the previous one
             processes = {
                 port: replace(process, standard_deviation=fraction * process.standard_deviation)
                 for port, process in start.processes.items()
             }
+            # the narrowest window of speeds: `estimate` has used the wider ones before
             estimate = self._iterate_gauss_newton(
-                laws, replace(current, processes=processes), SPEED_WINDOWS[-1]
+                laws, replace(current_start, processes=processes), SPEED_WINDOWS[-1]
             )
             if estimate is None:
                 break
-            if best is None or estimate.log_evidence > best.log_evidence:
-                best = estimate
-            elif estimate.log_evidence < best.log_evidence - LARGEST_DECLINE:
+            if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
+                best_estimate = estimate
+            # far below the best evidence, still smaller forces are not expected to rise above it
+            elif estimate.log_evidence < best_estimate.log_evidence - LARGEST_DECLINE:
                 break
-            current = start_from_estimate(estimate)
-        return best
+            current_start = start_from_estimate(estimate)
+        return best_estimate
 
     def _tune_processes(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
@@ -394,7 +404,8 @@ class MotionEstimator:
         start : EstimatorStart
             The values and trajectories to begin with, and the missing forces.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -495,7 +506,8 @@ class MotionEstimator:
         start : EstimatorStart
             The trajectories, the values of unknowns and the missing forces.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -551,7 +563,8 @@ class MotionEstimator:
         linear : Linearisation
             The trials, linear about `current`.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -575,6 +588,7 @@ class MotionEstimator:
                 trajectories=trajectories,
                 processes=current.processes,
             )
+            # admissible if the error is at most one; None if the laws are not possible there
             error = self._linearisation_error(laws, current, stepped, linear, speed_window)
             if error is None:
                 continue
@@ -602,7 +616,8 @@ class MotionEstimator:
         linear : Linearisation
             The trials, linear about `current`.
         speed_window : float
-            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
 
         Returns
         -------
@@ -624,6 +639,7 @@ class MotionEstimator:
             )
             if true_forces is None:
                 return None
+            # the linear law after the step, against the true law there
             for port, linearised_force in trial.forces.items():
                 linear_force = linearised_force.extrapolate(
                     trajectory.positions[:, port] - trial.trajectory.positions[:, port],

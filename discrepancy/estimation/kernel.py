@@ -224,32 +224,32 @@ def filter_record(
     gains, variances : (N, C, n), (N, C) ndarray
         The gain of each reading, and the variance of its innovation.
     """
-    stamps, states, width = len(transitions) + 1, mean.shape[0], mean.shape[1]
-    samples, channels = columns.shape[0], columns.shape[1]
-    means = np.empty((stamps, states, width))
-    covariances = np.empty((stamps, states, states))
-    innovations = np.zeros((samples, channels, width))
-    gains = np.zeros((samples, channels, states))
-    variances = np.ones((samples, channels))
+    stamp_count, state_count, weight_count = len(transitions) + 1, mean.shape[0], mean.shape[1]
+    sample_count, channel_count = columns.shape[0], columns.shape[1]
+    means = np.empty((stamp_count, state_count, weight_count))
+    covariances = np.empty((stamp_count, state_count, state_count))
+    innovations = np.zeros((sample_count, channel_count, weight_count))
+    gains = np.zeros((sample_count, channel_count, state_count))
+    variances = np.ones((sample_count, channel_count))
     mean, covariance = mean.copy(), covariance.copy()
-    work = np.empty((states, states))
-    for j in range(stamps):
+    work = np.empty((state_count, state_count))
+    for j in range(stamp_count):
         means[j] = mean
         covariances[j] = covariance
-        # every `parts`-th fine stamp is a sample: take in its readings
+        # every `substeps`-th fine stamp is a sample: process its readings
         if j % substeps == 0:
             k = j // substeps
-            for c in range(channels):
+            for c in range(channel_count):
                 if used[k, c]:
-                    for w in range(width):
+                    for w in range(weight_count):
                         innovations[k, c, w] = columns[k, c, w]
-                        for i in range(states):
+                        for i in range(state_count):
                             innovations[k, c, w] -= output_rows[k, c, i] * mean[i, w]
                     variances[k, c] = update_by_reading(
                         covariance, mean, output_rows[k, c], innovations[k, c], gains[k, c]
                     )
         # predict over the substep
-        if j < stamps - 1:
+        if j < stamp_count - 1:
             filtered_mean = mean.copy()
             multiply(transitions[j], filtered_mean, mean)
             mean += drifts[j]
@@ -278,7 +278,7 @@ def smooth_record(
 
     Parameters
     ----------
-    parts, transition, rows, used
+    substeps, transitions, output_rows, used
         The arguments of `filter_record`.
     states : (F, n) ndarray
         The predicted states at the values of all weights.
@@ -292,39 +292,39 @@ def smooth_record(
     smoothed, variance : (F, n), (F, n) ndarray
         The state given all readings, and the variance of each of its entries.
     """
-    stamps, size = states.shape
-    channels = output_rows.shape[1]
-    smoothed = np.empty((stamps, size))
-    variance = np.empty((stamps, size))
-    adjoint = np.zeros(size)
-    information = np.zeros((size, size))
-    work, carried = np.empty((2, size, size))
-    information_gain = np.empty(size)
-    for j in range(stamps - 1, -1, -1):
+    stamp_count, state_count = states.shape
+    channel_count = output_rows.shape[1]
+    smoothed = np.empty((stamp_count, state_count))
+    variance = np.empty((stamp_count, state_count))
+    adjoint = np.zeros(state_count)
+    information = np.zeros((state_count, state_count))
+    work, carried = np.empty((2, state_count, state_count))
+    information_gain = np.empty(state_count)
+    for j in range(stamp_count - 1, -1, -1):
         # carry both back over the substep
-        if j < stamps - 1:
+        if j < stamp_count - 1:
             backward = np.ascontiguousarray(transitions[j].T)
             adjoint = backward @ adjoint
             propagate_covariance(backward, information, work, carried)
             information[:] = carried
-        # take in the readings of a sample, in reverse order
+        # update by the readings of a sample, in reverse order
         if j % substeps == 0:
             k = j // substeps
-            for c in range(channels - 1, -1, -1):
+            for c in range(channel_count - 1, -1, -1):
                 if not used[k, c]:
                     continue
                 row, gain = output_rows[k, c], gains[k, c]
                 row_information, later_correction = 1.0 / variances[k, c], 0.0
-                for i in range(size):
+                for i in range(state_count):
                     information_gain[i] = 0.0
-                    for m in range(size):
+                    for m in range(state_count):
                         information_gain[i] += information[i, m] * gain[m]
                     row_information += gain[i] * information_gain[i]
                     later_correction += gain[i] * adjoint[i]
                 correction = innovations[k, c] / variances[k, c] - later_correction
-                for i in range(size):
+                for i in range(state_count):
                     adjoint[i] += row[i] * correction
-                    for m in range(size):
+                    for m in range(state_count):
                         information[i, m] += (
                             row_information * row[i] * row[m]
                             - row[i] * information_gain[m]
@@ -332,10 +332,10 @@ def smooth_record(
                         )
         # smoothed state: prediction + C r; its covariance is C - C N C
         multiply(covariances[j], information, work)
-        for i in range(size):
+        for i in range(state_count):
             reduction = 0.0
             smoothed[j, i] = states[j, i]
-            for m in range(size):
+            for m in range(state_count):
                 smoothed[j, i] += covariances[j, i, m] * adjoint[m]
                 reduction += work[i, m] * covariances[j, m, i]
             variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)

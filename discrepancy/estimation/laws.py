@@ -60,7 +60,7 @@ def fill_force_and_tangents(
     by_position: FloatArray,
     by_speed: FloatArray,
 ) -> None:
-    """Fill the force of a law along a motion of its port, and its tangents.
+    """Fill the force of a law along a motion of its port, and its tangents, in place.
 
     A law of the speed is averaged over a window of speeds, so that the jump of dry friction has a
     finite tangent. The tangent of a law with memory is that for its present memory; the influence
@@ -77,7 +77,7 @@ def fill_force_and_tangents(
     positions, speeds : (F,) array
         The motion of the port [m or rad, and per s].
     half_width : float
-        Half the window of speeds [m/s or rad/s].
+        The half width of the window of speeds [m/s or rad/s].
     half_difference : float
         Half the difference of the position in a tangent [m or rad].
     memory : (M,) array
@@ -92,13 +92,14 @@ def fill_force_and_tangents(
             memory[POSITION] = x
             force[j], by_position[j] = force_and_slope(law_index, law, memory, x, 1.0)
             continue
-        total = 0.0
+        force_sum = 0.0
         for i in range(WINDOW_NODES):
             # midpoints of `WINDOW_NODES` equal parts of the window
             offset = half_width * ((2.0 * i + 1.0) / WINDOW_NODES - 1.0)
-            total += steady_force(law, x, v + offset)
-        force[j] = total / WINDOW_NODES
-        # the exact derivative of the mean over the window
+            force_sum += steady_force(law, x, v + offset)
+        force[j] = force_sum / WINDOW_NODES
+        # the exact derivative of the mean over the window: d/dv of the integral of f from v - h to
+        # v + h is f(v + h) - f(v - h), divided by the width 2 h
         difference_over_window = steady_force(law, x, v + half_width) - steady_force(
             law, x, v - half_width
         )
@@ -130,7 +131,8 @@ def force_and_tangents(
     time, positions, speeds : (F,) ndarray
         The fine stamps [s], and the motion of the port there [m or rad, and per s].
     speed_window : float
-        Half the window of speeds over which a law of the speed is averaged, over the rms speed.
+        The half width of the window of speeds over which a law of the speed is averaged, divided
+        by the rms speed.
     """
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))

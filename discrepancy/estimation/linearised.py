@@ -202,36 +202,44 @@ class LinearisedTrial:
 
     @cached_property
     def force_by_weight(self) -> FloatArray:
-        """The laws' force (F, L, W) at each port at state zero, for a unit of each weight.
+        """The coefficients (F, L, W) of the laws' force at each port in the weights [N or N m].
 
-        The whole force of the laws is `force_by_weight` times the weights plus `force_by_state`
-        times the state.
+        The weights are (1, unknowns). The laws are linear about the trajectory and about values u0
+        of the unknowns, so that their force is
+
+            f = force_by_weight @ (1, u) + force_by_state @ state.
+
+        Each derivative d by an unknown contributes d (u - u0): d is the coefficient of the unknown,
+        and -d u0 is added to the constant, which is the coefficient of the first weight.
         """
         trial = self.trial
         trajectory = self.trajectory
-        force = np.zeros((len(trial.fine_time), len(self.law_ports), self.weight_count))
+        force_coefficients = np.zeros(
+            (len(trial.fine_time), len(self.law_ports), self.weight_count)
+        )
         for row, port in enumerate(self.law_ports):
             law = self.forces[port].law_force
-            # motion at state zero and zero unknowns, minus that of the trajectory
+            # motion of the model's response (state zero), minus that of the trajectory
             position_offset = trial.port_positions[:, port] - trajectory.positions[:, port]
             speed_offset = trial.port_speeds[:, port] - trajectory.speeds[:, port]
-            # unknowns that move the ports in the model's response
+            # unknowns that change the motion of the ports: their part of the motion is removed from
+            # the offsets, which are then at zero unknowns
             for unknown, (positions, speeds) in trial.port_motion_derivatives.items():
-                value = trial.linearisation_point[unknown]
-                position_offset = position_offset - value * positions[:, port]
-                speed_offset = speed_offset - value * speeds[:, port]
-                force[:, row, self.weight_index(unknown)] += (
+                present_value = trial.linearisation_point[unknown]
+                position_offset = position_offset - present_value * positions[:, port]
+                speed_offset = speed_offset - present_value * speeds[:, port]
+                force_coefficients[:, row, self.weight_index(unknown)] += (
                     law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
             # the first weight: the force at zero unknowns
-            force[:, row, 0] = (
+            force_coefficients[:, row, 0] = (
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
-            # unknowns that change the laws; the law's force is that at their present values
+            # unknowns that change the laws; `law.force` is the force at u0
             for unknown, derivative in self.forces[port].by_unknown.items():
-                force[:, row, 1 + unknown] += derivative
-                force[:, row, 0] -= self._value_of_unknown(unknown) * derivative
-        return force
+                force_coefficients[:, row, 1 + unknown] += derivative
+                force_coefficients[:, row, 0] -= self._value_of_unknown(unknown) * derivative
+        return force_coefficients
 
     def _value_of_unknown(self, unknown: int) -> float:
         """Return the value of an unknown, shared or of an effect, about which laws are linear."""
@@ -325,6 +333,7 @@ class LinearisedTrial:
                 by_input_at_end[interval_of_substep, :, structure],
                 rate_change[1:],
             )
+            # linear about u0 = `linearisation_point`: the change is proportional to u - u0
             drift[:, :, 1 + unknown] += state_change
             drift[:, :, 0] -= trial.linearisation_point[unknown] * state_change
         return drift
@@ -339,9 +348,11 @@ class LinearisedTrial:
         mean = np.zeros((len(generator), self.weight_count))
         if not self.trial.begins_at_rest:
             return covariance, mean
-        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known.
-        # With the rates B by the laws' forces T s + u:  (A + B T) s + B u + (column of A for f) f =
-        # 0
+        # At rest the rate of the structure's state s is zero under the laws and the missing forces
+        # f. With the laws' force T s + u and its effect B on the rate,
+        #     (A + B T) s + B u + a f = 0,  a: the column of the generator A for f.
+        # The solution for u is the mean. The first value of f is not known and has variance one, so
+        # that its solution s = h f adds h h^T to the covariance.
         structure = self.structure
         state_rate_by_force = self.state_rate_by_force[structure]
         rate_matrix = (
@@ -354,39 +365,46 @@ class LinearisedTrial:
         covariance = covariance.copy()
         covariance[structure, structure] = 0.0
         for index in self.force_filter.force_state_indices:
-            at_rest = np.linalg.lstsq(rate_matrix, -generator[structure, index], rcond=1e-12)[0]
-            covariance[structure, structure] += np.outer(at_rest, at_rest)
-            covariance[structure, index] = at_rest
-            covariance[index, structure] = at_rest
+            state_per_force = np.linalg.lstsq(
+                rate_matrix, -generator[structure, index], rcond=1e-12
+            )[0]
+            covariance[structure, structure] += np.outer(state_per_force, state_per_force)
+            covariance[structure, index] = state_per_force
+            covariance[index, structure] = state_per_force
         return covariance, mean
 
     # ------------------------------------------------------------ readings
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
-        """Return the readings by the state, and the residuals by the weights.
+        """Return the observation equation columns @ weights = rows @ state + noise of the filter.
+
+        All values are divided by the standard deviation of the white part of the noise.
 
         Returns
         -------
         rows : (N, C, n) array
-            The derivatives of the readings by the scaled state, divided by the deviation of the
-            white part of the noise.
+            The derivatives of the readings by the scaled state.
         columns : (N, C, W) array
-            The residual at state zero and zero unknowns (first weight), and minus the derivatives
-            of the readings by the unknowns; columns times weights is the residual that the state
-            explains. Zero if a reading does not count.
+            The coefficients of the residual in the weights (1, unknowns): first the residual at
+            zero unknowns, then minus the derivatives of the readings by the unknowns. They are zero
+            if a reading does not count.
         """
         trial = self.trial
         substeps = trial.substeps
         samples, channels = trial.residual.shape
         rows = np.repeat(self.force_filter.state_space.output_rows[None], samples, axis=0)
         columns = np.zeros((samples, channels, self.weight_count))
+        # Errors of sensors: a change c0 + d (u - u0) of the readings reduces the residual. Its
+        # coefficients are -d for the unknown u, and -c0 + d u0 for the constant.
         columns[:, :, 0] = trial.residual - self.sensor_errors.change
         for unknown, derivative in self.sensor_errors.by_unknown.items():
             columns[:, :, 1 + unknown] -= derivative
             columns[:, :, 0] += self._value_of_unknown(unknown) * derivative
+        # response of the model, whose residual is at zero unknowns already
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
         for unknown, derivative in enumerate(derivatives):
             columns[:, :, self.weight_index(unknown)] -= derivative
+        # output of the added state, linear about `linearisation_point`
         for unknown, derivative in self._readings_by_shared_unknowns().items():
             columns[:, :, 1 + unknown] -= derivative
             columns[:, :, 0] += trial.linearisation_point[unknown] * derivative
@@ -411,11 +429,13 @@ class LinearisedTrial:
         trial = self.trial
         trajectory = self.trajectory
         derivatives: dict[int, FloatArray] = {}
+        # parameters change the matrices of the output equation
         for unknown, derivative in enumerate(trial.system_derivatives):
             if derivative is not None:
                 derivatives[unknown] = trial.divide_by_noise(
                     trial.outputs_of_state(derivative, trajectory.added_state, trajectory.forces)
                 )
+        # a gain multiplies the readings of its channel
         added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
         for unknown, channel, scale in trial.gain_unknowns:
             derivatives[unknown] = added_readings * scale * np.eye(added_readings.shape[1])[channel]
@@ -460,7 +480,7 @@ class LinearisedTrial:
         record = self.filtered_record
         whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
         whitened = whitened.reshape(-1, self.weight_count)
-        # `_observations` has minus the derivatives of the readings: change the sign
+        # the columns of `_observations` are minus the derivatives of the readings: change the sign
         whitened[:, 1:] *= -1.0
         used = self.trial.used
         half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[used]))

@@ -220,5 +220,6 @@ def _speed_deviation(trial: PortedTrial, port: int, state_deviation: FloatArray)
     state_deviation : (F, n) array
         The standard deviations of the states.
     """
+    # speed = row @ state: the variance is the sum of row^2 times the variances of the states
     row = trial.system.speeds[port]
     return float(np.median(np.sqrt(np.square(state_deviation) @ np.square(row))))

@@ -25,10 +25,10 @@ LARGEST_CHI_SQUARE = 1.5
 def refit_from_first_readings(
     problem: Problem, fit: CandidateFit, *, iterations: int = 60, local_only: bool = False
 ) -> CandidateFit:
-    """Return a fit again from initial states that are fitted to the first readings.
+    """Repeat a fit from initial states that are fitted to the first readings.
 
-    The given fit is returned if it explains the readings already, if no trial has an unknown
-    initial state, or if the new fit is not better.
+    The better of both fits is returned. The fit is not repeated if it explains the readings
+    already, or if no trial has an unknown initial state.
 
     Parameters
     ----------
@@ -73,13 +73,15 @@ def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Poi
     They are fitted once, with the model without effect, and kept in `Problem.initial_states` by the
     name of the trial, since the initial state of a trial is nearly the same under all hypotheses.
     """
-    beginnings = problem.initial_states
-    if any(data.trial.name not in beginnings for data in problem.trials):
+    unknowns_by_trial = problem.initial_states
+    if any(data.trial.name not in unknowns_by_trial for data in problem.trials):
         without_effect = replace(point, effect=np.zeros(0))
         fitted_point = _fit_to_growing_records(problem, without_effect)
         for data, unknowns in zip(problem.trials, fitted_point.local, strict=True):
-            beginnings[data.trial.name] = unknowns
-    return replace(point, local=tuple(beginnings[data.trial.name] for data in problem.trials))
+            unknowns_by_trial[data.trial.name] = unknowns
+    return replace(
+        point, local=tuple(unknowns_by_trial[data.trial.name] for data in problem.trials)
+    )
 
 
 def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
@@ -87,13 +89,13 @@ def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
 
     The shared unknowns are fixed. If a fit fails, the point of the last one is returned.
     """
-    longest = max(len(data.trial.time) for data in problem.trials)
-    samples = FIRST_SAMPLES
-    while samples < 2 * longest:
-        shortened = problem.with_first_samples(samples)
+    longest_record = max(len(data.trial.time) for data in problem.trials)
+    sample_count = FIRST_SAMPLES
+    while sample_count < 2 * longest_record:
+        shortened = problem.with_first_samples(sample_count)
         fit = try_fit(shortened, Candidate(), point, iterations=MOST_STEPS, local_only=True)
         if fit is None:
             break
         point = fit.point
-        samples *= 2
+        sample_count *= 2
     return point

@@ -30,7 +30,8 @@ def nuisance_derivatives(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of a trial's response with respect to its nuisances.
 
-    They are one-sided difference quotients.
+    They are one-sided difference quotients, except that a shift of time zero uses the time
+    derivative of the response if the model gives it.
 
     Parameters
     ----------
@@ -118,17 +119,19 @@ def _health_derivatives(
         region_entries = np.flatnonzero(unknowns.health_columns == region)
         if not len(region_entries):
             continue
-        stepped = local.copy()
+        stepped_local = local.copy()
         # step towards zero, away from the limits of the stiffness loss
-        sign = np.where(stepped[first_health + region_entries] > 0.0, -1.0, 1.0)
-        stepped[first_health + region_entries] += sign * PARAMETER_STEP
-        difference_quotient = slope(stepped)
+        step_signs = np.where(stepped_local[first_health + region_entries] > 0.0, -1.0, 1.0)
+        stepped_local[first_health + region_entries] += step_signs * PARAMETER_STEP
+        difference_quotient = slope(stepped_local)
         if data.trial.is_dynamic:
-            derivatives[region_entries] = sign[:, np.newaxis, np.newaxis] * difference_quotient
+            derivatives[region_entries] = (
+                step_signs[:, np.newaxis, np.newaxis] * difference_quotient
+            )
         else:
             reading_rows = unknowns.health_rows[region_entries]
             derivatives[region_entries, reading_rows] = (
-                sign[:, np.newaxis] * difference_quotient[reading_rows]
+                step_signs[:, np.newaxis] * difference_quotient[reading_rows]
             )
     return derivatives
 

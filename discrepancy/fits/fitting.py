@@ -159,7 +159,7 @@ def fit(
             next_state = descent.descend(state, step)
         if next_state is not None:
             decrease = state.objective - next_state.objective
-            # the better the prediction, the less damping has the next step
+            # less damping for the next step, the more so the better the predicted decrease was
             reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
             damping = max(damping * reduction, 1e-9)
             state = next_state
@@ -229,8 +229,11 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
         If the model cannot be evaluated with the effects.
     """
     point = _within_bounds(problem, point)
-    numbers = range(len(problem.trials))
-    responses = [problem.response_of_candidate(number, point, candidate) for number in numbers]
+    trial_indices = range(len(problem.trials))
+    responses = [
+        problem.response_of_candidate(trial_index, point, candidate)
+        for trial_index in trial_indices
+    ]
     return _misfit_at(problem, point, responses).objective
 
 
@@ -265,15 +268,15 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
         The response of the model in each trial at the point.
     """
     residuals = tuple(
-        problem.standardised_residual(number, point, response)
-        for number, response in enumerate(responses)
+        problem.standardised_residual(trial_index, point, response)
+        for trial_index, response in enumerate(responses)
     )
     sums = problem.squares_by_channel(residuals)
-    prior_energy = 0.5 * float(problem.shared.precision @ point.shared**2)
-    prior_energy += 0.5 * float(point.effect @ point.effect)
+    minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+    minus_log_prior += 0.5 * float(point.effect @ point.effect)
     for data, u in zip(problem.trials, point.local, strict=True):
-        prior_energy += 0.5 * float(data.unknowns.precision @ u**2)
-    negative_log_posterior = problem.misfit(sums) + prior_energy
+        minus_log_prior += 0.5 * float(data.unknowns.precision @ u**2)
+    negative_log_posterior = problem.misfit(sums) + minus_log_prior
     if not np.isfinite(negative_log_posterior):
         negative_log_posterior = np.inf
     return _Misfit(negative_log_posterior, residuals, sums)
@@ -304,33 +307,40 @@ class _Descent:
     def state_at(
         self, point: Point, nearby_derivatives: tuple[TrialDerivatives, ...] | None = None
     ) -> FitState:
-        """Return the objective and the derivatives at a point.
+        """Return the objective, the residuals and the derivatives of all trials at a point.
 
         Parameters
         ----------
         point : Point
             The values of all unknowns.
         nearby_derivatives : tuple of TrialDerivatives, optional
-            Derivatives of each trial with respect to nuisances at a nearby point. If given, only
-            the response and the derivatives with respect to effect parameters are computed.
+            The derivatives of each trial with respect to nuisances at a nearby point, which are
+            reused here; only the response and the derivatives with respect to effect parameters are
+            then computed. If left out, all derivatives are computed.
         """
-        derivatives = tuple(
+        all_derivatives = tuple(
             self.problem.linearise(
-                number,
+                trial_index,
                 point,
                 self.candidate,
-                nearby_derivatives=nearby,
+                nearby_derivatives=nearby_derivatives_of_trial,
                 effect_steps=self.effect_deviation,
             )
-            for number, nearby in enumerate(nearby_derivatives or [None] * len(self.problem.trials))
+            for trial_index, nearby_derivatives_of_trial in enumerate(
+                nearby_derivatives or [None] * len(self.problem.trials)
+            )
         )
-        misfit = _misfit_at(self.problem, point, [trial.response for trial in derivatives])
+        misfit = _misfit_at(
+            self.problem,
+            point,
+            [derivatives_of_trial.response for derivatives_of_trial in all_derivatives],
+        )
         return FitState(
             point=point,
             objective=misfit.objective,
             residuals=misfit.residuals,
             squares_by_channel=misfit.sums,
-            trial_derivatives=derivatives,
+            trial_derivatives=all_derivatives,
         )
 
     def damped_step(self, state: FitState, damping: float) -> tuple[Point, float]:
@@ -359,20 +369,20 @@ class _Descent:
         first_local = first_effect + self.candidate.parameter_count
         precision = problem.noise_precisions(state.squares_by_channel)
         equations = normal_equations(problem, state, self.candidate, precision)
-        size = len(equations.gradient)
+        unknown_count = len(equations.gradient)
         # posterior deviations of the effect parameters: their columns of the inverse matrix
-        unit_vectors = np.eye(size)[:, first_effect:first_local]
+        unit_vectors = np.eye(unknown_count)[:, first_effect:first_local]
         covariance_columns = solve_factored(cholesky_factor(equations.matrix), unit_vectors)
         self.effect_deviation = np.sqrt(np.diag(covariance_columns[first_effect:first_local]))
         # unknowns that may move
         first_free = first_local if self.local_only else 0
-        is_free = np.arange(size) >= first_free
+        is_free = np.arange(unknown_count) >= first_free
         downhill = check_finite(equations.gradient)[:first_effect]
         is_free[:first_effect] &= ~self._is_held_at_bound(state.point.shared, downhill)
         # Levenberg-Marquardt step
         damped_matrix = equations.matrix + damping * np.diag(np.diag(equations.matrix))
         damped_matrix = damped_matrix[np.ix_(is_free, is_free)]
-        step = np.zeros(size)
+        step = np.zeros(unknown_count)
         step[is_free] = solve_factored(cholesky_factor(damped_matrix), equations.gradient[is_free])
         predicted_decrease = 0.5 * float(equations.gradient @ step)
         return self._split_step(step), predicted_decrease
@@ -432,12 +442,16 @@ def _with_evidence(
     factor = cholesky_factor(equations.matrix)
     covariance = solve_factored(factor, np.eye(len(factor)))
     # degrees of freedom: the trace of the hat matrix, channel by channel
-    spent_freedom = np.zeros(len(problem.channel_names))
-    for data, (trial_rows, unknown_indices) in zip(problem.trials, equations.trials, strict=True):
+    absorbed_freedom = np.zeros(len(problem.channel_names))
+    for data, (trial_jacobian, unknown_indices) in zip(
+        problem.trials, equations.trials, strict=True
+    ):
         trial_covariance = covariance[np.ix_(unknown_indices, unknown_indices)]
-        leverage = ((trial_covariance @ trial_rows.jacobian) * trial_rows.jacobian).sum(axis=0)
+        leverage = ((trial_covariance @ trial_jacobian.jacobian) * trial_jacobian.jacobian).sum(
+            axis=0
+        )
         np.add.at(
-            spent_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
+            absorbed_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
         )
     shared_count = problem.shared.unknown_count + candidate.parameter_count
     return CandidateFit(
@@ -445,7 +459,7 @@ def _with_evidence(
         candidate=candidate,
         log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
         covariance=covariance[:shared_count, :shared_count],
-        absorbed_freedom=spent_freedom,
+        absorbed_freedom=absorbed_freedom,
         converged=converged,
     )
 

@@ -57,15 +57,15 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     has_variance_test = any(test.name.startswith("variance") for test in tests)
     has_noise_record = bool(np.any(problem.record_freedom[problem.sample_counts > 0.0] > 0.0))
     cause = "Too few readings for the unknowns" if has_noise_record else "No noise record"
-    worst = min(tests, key=lambda test: test.p_value, default=NamedTest("", np.nan))
-    statistic = min(worst.p_value * len(tests), 1.0)
+    worst_test = min(tests, key=lambda test: test.p_value, default=NamedTest("", np.nan))
+    statistic = min(worst_test.p_value * len(tests), 1.0)
     passed = True if has_variance_test else None
     reason = "What is left agrees with the noise records."
     if not tests:
         reason = f"{cause}: the fit cannot be judged."
     elif statistic < ABSOLUTE_FIT_LEVEL:
         passed = False
-        reason = f"More is left than noise and priors allow: {worst.name}."
+        reason = f"More is left than noise and priors allow: {worst_test.name}."
     elif not has_variance_test:
         reason = (
             f"{cause}: only priors and the whiteness of what is left could be judged, and they "
@@ -95,7 +95,8 @@ def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     testable_channels = np.flatnonzero(is_testable)
     tests = []
     for channel in testable_channels:
-        # sum of squares over counts - spent: the second divisor undoes that of residual_freedom
+        # sum of squares / (samples - absorbed freedom): the division of `residual_freedom` by
+        # samples_per_independent cancels here
         mean_square = (
             fit.squares_by_channel[channel]
             / residual_freedom[channel]
@@ -267,19 +268,19 @@ def check_shape(canonical_fit: CandidateFit, free_fit: CandidateFit | None) -> G
 
 
 def time_step_error(problem: Problem, fit: CandidateFit) -> float:
-    """Return the error of the time integration in a fit, relative to the noise deviation.
+    """Return the error of the time integration in a fit, in noise deviations.
 
     The time steps are halved, and the rms change of each channel in each trial in motion is divided
     by the noise deviation of the channel. The largest of these ratios is returned.
     """
-    largest = 0.0
-    for number, data in enumerate(problem.trials):
+    largest_error = 0.0
+    for trial_index, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
         finer_response = problem.response_of_candidate(
-            number, fit.point, fit.candidate, refinement=2
+            trial_index, fit.point, fit.candidate, refinement=2
         )
-        standardised_change = (finer_response - fit.responses[number]) / data.deviation
-        rms = np.sqrt((standardised_change**2).mean(axis=0))
-        largest = max(largest, float(rms.max()))
-    return largest
+        standardised_change = (finer_response - fit.responses[trial_index]) / data.deviation
+        rms_changes = np.sqrt((standardised_change**2).mean(axis=0))
+        largest_error = max(largest_error, float(rms_changes.max()))
+    return largest_error

@@ -125,7 +125,9 @@ class TrialJacobian:
 def trial_jacobian(
     problem: Problem, trial_index: int, state: FitState, candidate: Candidate, precision: FloatArray
 ) -> TrialJacobian:
-    """Return the derivatives and residuals of a trial in units of the noise deviation.
+    """Return the derivatives and residuals of a trial in units of the estimated noise deviation.
+
+    These are the trial's rows of the least-squares problem that `normal_equations` assembles.
 
     Parameters
     ----------
@@ -141,19 +143,21 @@ def trial_jacobian(
         The estimated noise precision (inverse variance) of each channel over the recorded one.
     """
     data = problem.trials[trial_index]
-    by_unknowns, shared_indices = problem.prediction_derivatives(
+    prediction_derivatives, shared_indices = problem.prediction_derivatives(
         trial_index, state.point, state.trial_derivatives[trial_index], candidate
     )
     precision_root = np.sqrt(precision[data.channel_indices])
-    residual = (state.residuals[trial_index] * precision_root).ravel()
-    jacobian = (data.standardise(by_unknowns) * precision_root).reshape(
-        len(by_unknowns), residual.size
+    # in estimated noise deviations: a value in recorded ones times recorded / estimated deviation,
+    # which is the root of the precision of each channel; it is broadcast over unknowns and samples
+    scaled_residual = (state.residuals[trial_index] * precision_root).ravel()
+    jacobian = (data.standardise(prediction_derivatives) * precision_root).reshape(
+        len(prediction_derivatives), scaled_residual.size
     )
     return TrialJacobian(
         jacobian=jacobian,
         shared_indices=shared_indices,
         precision_root=precision_root,
-        residual=residual,
+        residual=scaled_residual,
         local_values=state.point.local[trial_index],
         local_precision=data.unknowns.precision,
     )
@@ -203,9 +207,10 @@ def normal_equations(
     effect_precision : (E,) array, optional
         The prior precisions of the effect parameters; 1 if left out.
     """
-    numbers = range(len(problem.trials))
+    trial_indices = range(len(problem.trials))
     trial_equations = [
-        trial_jacobian(problem, number, state, candidate, precision) for number in numbers
+        trial_jacobian(problem, trial_index, state, candidate, precision)
+        for trial_index in trial_indices
     ]
     # prior: each scaled unknown u adds precision u^2 / 2 to the objective
     if effect_precision is None:
@@ -214,9 +219,9 @@ def normal_equations(
     prior_precision = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
     effect = state.point.effect[: candidate.parameter_count]
     local_values = [trial.local_values for trial in trial_equations]
-    values = np.concatenate((state.point.shared, effect, *local_values))
+    scaled_values = np.concatenate((state.point.shared, effect, *local_values))
     matrix = np.diag(prior_precision + LEAST_PRECISION)
-    gradient = -prior_precision * values
+    gradient = -prior_precision * scaled_values
     # readings: J J^T and J r of each trial, with its derivatives J (M, N C) and residuals r
     first_local = problem.shared.unknown_count + candidate.parameter_count
     trials_with_indices = []

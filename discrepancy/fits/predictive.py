@@ -102,25 +102,27 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
     finds only the nearest. So a grid of amplitudes, `RELEASE_AMPLITUDES`, is tried.
     """
     best_local = list(start.local)
-    for number, data in enumerate(held_out.trials):
+    for trial_index, data in enumerate(held_out.trials):
         release = data.trial.release
         amplitude_index = data.unknowns.zero_count
         if release is None or amplitude_index >= data.unknowns.unknown_count:
             continue
-        nominal = 0.0
-        step = 1.0
+        # For a release from rest the unknown is the difference from the nominal amplitude. The
+        # amplitude of a free initial state is nominal at the scaled value 1 / scale.
+        nominal_amplitude = 0.0
+        amplitude_step = 1.0
         if not release.at_rest:
-            nominal = 1.0 / data.unknowns.scale[amplitude_index]
-            step = 0.1 * nominal
-        least = np.inf
-        for amplitude in nominal + step * np.array(RELEASE_AMPLITUDES):
-            local = start.local[number].copy()
+            nominal_amplitude = 1.0 / data.unknowns.scale[amplitude_index]
+            amplitude_step = 0.1 * nominal_amplitude
+        least_objective = np.inf
+        for amplitude in nominal_amplitude + amplitude_step * np.array(RELEASE_AMPLITUDES):
+            local = start.local[trial_index].copy()
             local[amplitude_index] = amplitude
-            trial_locals = (*best_local[:number], local, *best_local[number + 1 :])
-            value = objective(held_out, candidate, replace(start, local=trial_locals))
-            if value < least:
-                least = value
-                best_local[number] = local
+            trial_locals = (*best_local[:trial_index], local, *best_local[trial_index + 1 :])
+            trial_objective = objective(held_out, candidate, replace(start, local=trial_locals))
+            if trial_objective < least_objective:
+                least_objective = trial_objective
+                best_local[trial_index] = local
     return replace(start, local=tuple(best_local))
 
 
@@ -201,6 +203,7 @@ class _TrialPredictions:
                 self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
             factors = self._covariance_factors(rows, data.unknowns.unknown_count)
+            # columns: shared unknowns and effects, then the unknowns of one trial after another
             sensitivity = None
             if sensitivities:
                 shape = self.local_fit.residuals[trial_index].shape
@@ -309,7 +312,7 @@ class _TrialPredictions:
 
 LEAST_MISFIT_RISE = 0.6
 """Rise of the misfit at the ends of a Gaussian 90 % interval below which the posterior is sampled
-[nat]; a Gaussian posterior has NINETY^2 / 2 = 1.35."""
+[nat]; a Gaussian posterior has NINETY_PERCENT_QUANTILE^2 / 2 = 1.35."""
 SEED = 20211
 """Seed of the draws."""
 ROUNDS = 5
@@ -386,7 +389,7 @@ def importance_draws(
 
     Returns
     -------
-    (KEPT_DRAWS, E) array
+    (RETURNED_DRAWS, E) array
         The draws; the same density gives the same draws.
     """
     generator = np.random.default_rng(SEED)

@@ -449,16 +449,16 @@ class Problem:
         count : int
             The number of samples.
         """
-        shorter = copy(self)
+        shortened_problem = copy(self)
         shorter_trials = []
         for data in self.trials:
             if data.trial.is_dynamic:
-                is_counted = np.arange(len(data.weight)) < count
-                data = replace(data, weight=data.weight * is_counted[:, None])
+                is_compared = np.arange(len(data.weight)) < count
+                data = replace(data, weight=data.weight * is_compared[:, None])
             shorter_trials.append(data)
-        shorter.trials = tuple(shorter_trials)
-        shorter.sample_counts = shorter._sample_counts()
-        return shorter
+        shortened_problem.trials = tuple(shorter_trials)
+        shortened_problem.sample_counts = shortened_problem._sample_counts()
+        return shortened_problem
 
     def with_wider_noise(self, factors: FloatArray) -> "Problem":
         """Return the problem under a noise with a larger standard deviation, taken as known.
@@ -470,13 +470,13 @@ class Problem:
         factors : (channels,) array
             The factor on the noise deviation of each channel.
         """
-        wider = copy(self)
+        wide_problem = copy(self)
         is_unrecorded = self.record_freedom == 0.0
         wider_trials = []
         for data in self.trials:
             is_wider = is_unrecorded[data.channel_indices] | data.trial.is_dynamic
             factor = np.where(is_wider, factors[data.channel_indices], 1.0)
             wider_trials.append(replace(data, deviation=data.deviation * factor))
-        wider.trials = tuple(wider_trials)
-        wider.record_freedom = np.where(factors != 1.0, inf, self.record_freedom)
-        return wider
+        wide_problem.trials = tuple(wider_trials)
+        wide_problem.record_freedom = np.where(factors != 1.0, inf, self.record_freedom)
+        return wide_problem

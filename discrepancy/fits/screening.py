@@ -113,8 +113,8 @@ class Screen:
         precision = problem.noise_precisions(fit.squares_by_channel)
         if record_noise:
             precision = np.where(problem.record_freedom > 0.0, 1.0, precision)
-        adapting = Candidate() if effect_precision is None else fit.candidate
-        equations = normal_equations(problem, fit, adapting, precision, effect_precision)
+        eliminated_effects = Candidate() if effect_precision is None else fit.candidate
+        equations = normal_equations(problem, fit, eliminated_effects, precision, effect_precision)
         self._trials = equations.trials
         self._nuisance_count = len(equations.gradient)
         factor = cholesky_factor(equations.matrix)
@@ -176,13 +176,15 @@ class Screen:
         point = self.fit.point
         patch = candidate.patch(problem.setting, effect)
         standardised_changes: dict[int, FloatArray] = {}
-        for number, data in enumerate(problem.trials):
+        for trial_index, data in enumerate(problem.trials):
             if data.trial.kind not in kinds:
                 continue
-            response, _ = problem.response(number, point.shared, point.local[number], patch)
+            response, _ = problem.response(
+                trial_index, point.shared, point.local[trial_index], patch
+            )
             gains = 1.0 + problem.shared.gains(point.shared, data.trial.channels)
-            standardised_changes[number] = data.standardise(
-                gains * (response - self.fit.responses[number])
+            standardised_changes[trial_index] = data.standardise(
+                gains * (response - self.fit.responses[trial_index])
             )
         return self.project(standardised_changes)
 
@@ -203,18 +205,18 @@ class Screen:
         overlap, squared_size : float
             b(d) and G(d, d) of the module docstring.
         """
-        nuisance_overlaps = np.zeros(self._nuisance_count)  # J d
+        nuisance_overlaps = np.zeros(self._nuisance_count)  # J d, with the change d of all trials
         trial_changes = []
         overlap = 0.0
         squared_size = 0.0
-        for number, (trial_rows, nuisance_indices) in enumerate(self._trials):
-            d: FloatArray = np.zeros(trial_rows.residual.shape)
-            if number in changes:
-                d = (changes[number] * trial_rows.precision_root).ravel()
-                nuisance_overlaps[nuisance_indices] += trial_rows.jacobian @ d
-                overlap += float(trial_rows.residual @ d)
-                squared_size += float(d @ d)
-            trial_changes.append(d)
+        for trial_index, (trial_rows, nuisance_indices) in enumerate(self._trials):
+            trial_change: FloatArray = np.zeros(trial_rows.residual.shape)
+            if trial_index in changes:
+                trial_change = (changes[trial_index] * trial_rows.precision_root).ravel()
+                nuisance_overlaps[nuisance_indices] += trial_rows.jacobian @ trial_change
+                overlap += float(trial_rows.residual @ trial_change)
+                squared_size += float(trial_change @ trial_change)
+            trial_changes.append(trial_change)
         projections = self._inverse_factor @ nuisance_overlaps
         overlap -= float(self._gradient @ projections)
         squared_size -= float(projections @ projections)
@@ -311,13 +313,13 @@ def _largest_peaks(power: FloatArray) -> list[int]:
     """
     is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
     peaks = np.flatnonzero(is_peak) + 1
-    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.most_peaks]]
-    chosen: list[int] = []
-    for index in largest:
-        is_apart = all(abs(index - other) > 2 * SEARCH.zero_padding for other in chosen)
-        if is_apart and len(chosen) < SEARCH.most_peaks:
-            chosen.append(int(index))
-    return chosen
+    peaks_by_power = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.most_peaks]]
+    separate_peaks: list[int] = []
+    for index in peaks_by_power:
+        is_apart = all(abs(index - other) > 2 * SEARCH.zero_padding for other in separate_peaks)
+        if is_apart and len(separate_peaks) < SEARCH.most_peaks:
+            separate_peaks.append(int(index))
+    return separate_peaks
 
 
 # ---------------------------------------------------------------- grid of parameters
@@ -344,6 +346,7 @@ def parameter_grid(
     levels = SEARCH.grid_levels_if_many
     if other_parameter_count < len(SEARCH.grid_levels):
         levels = SEARCH.grid_levels[other_parameter_count]
+    # one axis for each parameter: the scaled values at which it is tried
     axes: list[tuple[float, ...]] = []
     has_magnitude = False
     for parameter in term.parameters:

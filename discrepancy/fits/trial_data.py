@@ -230,6 +230,7 @@ def shared_unknowns(
     gain_estimates : dict of str to float
         The ratio of readings to model for channels of unknown scale: a first estimate of 1 + gain.
     """
+    # calibrated parameters first, then gains
     priors = [ScaledPrior(*prior, 1.0) for prior in model.prior_moments(campaign)]
     used_channels = {name for trial in trials for name in trial.channels}
     gain_channels: list[str] = []
@@ -244,6 +245,7 @@ def shared_unknowns(
             fixed_gain[name] = estimate
             continue
         gain_channels.append(name)
+        # flat prior about the first estimate, or a normal prior about a gain error of zero
         if has_unknown_scale:
             gain_scale = max(abs(1.0 + estimate), 1e-12)
             priors.append(ScaledPrior(estimate, gain_scale, 0.0))
@@ -415,9 +417,9 @@ class TrialData:
         # is not compared if one of them is left out
         weight = trial.used.astype(np.float64)
         for column in np.flatnonzero(is_whitened):
-            order = len(noise_models[column].autoregression)
-            for row in np.flatnonzero(~trial.used[:, column]):
-                weight[row : row + order + 1, column] = 0.0
+            filter_order = len(noise_models[column].autoregression)
+            for unused_row in np.flatnonzero(~trial.used[:, column]):
+                weight[unused_row : unused_row + filter_order + 1, column] = 0.0
         return cls(
             trial=trial,
             deviation=deviation,

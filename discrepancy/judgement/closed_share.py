@@ -86,6 +86,7 @@ class SquaredErrors:
         )
         before = times_drawn @ self.before
         after = times_drawn @ self.after
+        # a draw of blocks without any error has no share
         has_error = before > 0.0
         shares = 1.0 - after[has_error] / before[has_error]
         low, high = np.quantile(shares, (0.05, 0.95))
@@ -202,17 +203,17 @@ def rms_errors_text(
         before,
         key=lambda name: -before[name] / _recorded_noise_or_fallback(channels[name], before[name]),
     )
-    parts = []
+    channel_texts = []
     for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
         change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
         if unit != NOMINAL_UNIT:
             change = f"{change} {unit}"
-        parts.append(f"{name} {change}")
+        channel_texts.append(f"{name} {change}")
     remaining = len(names) - CHANNELS_MENTIONED
     if remaining > 0:
-        parts.append(f"{remaining} more in the report")
-    return ", ".join(parts)
+        channel_texts.append(f"{remaining} more in the report")
+    return ", ".join(channel_texts)
 
 
 def _recorded_noise_or_fallback(channel: Channel, fallback: float) -> float:

@@ -33,11 +33,17 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
     no_effect = search.compared_no_effect
     probabilities = search.set_probabilities()
     conclusion = Conclusion.from_probabilities(search, best, probabilities)
+    # the model without effect
     no_effect_gate = check_absolute_fit(problem, no_effect)
     probability_of_none = probabilities.get((), 0.0)
-    is_possible = probability_of_none > 1.0 - SEARCH.name_probability
-    if is_possible and not no_effect_gate.has_failed and _residuals_have_recorded_colour(no_effect):
+    may_lack_nothing = probability_of_none > 1.0 - SEARCH.name_probability
+    if (
+        may_lack_nothing
+        and not no_effect_gate.has_failed
+        and _residuals_have_recorded_colour(no_effect)
+    ):
         return _nothing_missing_outcome(conclusion, no_effect, no_effect_gate, probability_of_none)
+    # the best hypothesis
     if (
         not best.candidate.terms
         or best.candidate.has_free_shape
@@ -85,6 +91,7 @@ def _nothing_missing_outcome(
             gates=(gate,),
             remainders=remainders,
         )
+    # effects that are too probable to be excluded
     possible_effects = []
     for name, probability in conclusion.inclusion_probabilities.items():
         if probability > 1.0 - SEARCH.name_probability:

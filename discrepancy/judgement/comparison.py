@@ -231,8 +231,8 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the kind of shared unknowns that a hypothesis moves far from their priors.
 
         It is empty if there is none. The test is that of χ² with prior deviations that are
-        `SEARCH.prior_widening` times the stated ones, since calibrated values take up errors that
-        the hypothesis does not explain.
+        `SEARCH.prior_widening` times the stated ones, since calibrated values also compensate
+        errors that the hypothesis does not explain.
         """
         shared = self.problem.shared
         has_prior = shared.precision > 0.0
@@ -342,7 +342,8 @@ class Comparison(ABC, Generic[HypothesisT]):
             return False
         if not family_place_pairs(option) <= family_place_pairs(best):
             return False
-        # any freedom gains something in trials that were fitted, so more may be lost there
+        # Any further parameter explains a little more of the fitted trials, by fitting noise. So
+        # the simpler hypothesis may explain less there, by three times the tolerance.
         best_fitted_share = self.gap_share(best, held_out=False).value
         least_fitted_share = best_fitted_share - 3.0 * SEARCH.least_added_share
         if self.gap_share(option, held_out=False).value <= least_fitted_share:
@@ -372,10 +373,10 @@ class Comparison(ABC, Generic[HypothesisT]):
             includes_asked.append(
                 any(asked_families <= families for asked_families in families_asked)
             )
-        holds = np.array(includes_asked)
-        if not holds.any():
+        is_true_with_asked = np.array(includes_asked)
+        if not is_true_with_asked.any():
             return 0.0
-        return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
+        return float(np.exp(logsumexp(scores[is_true_with_asked]) - logsumexp(scores)))
 
     def _is_refuted_by_trials(self, hypothesis: HypothesisT) -> bool:
         """Return whether trials show that a hypothesis does not explain enough of the gap."""
@@ -402,7 +403,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             candidate = hypothesis.candidate
             is_same_family = family_place_pairs(hypothesis) == family_place_pairs(best)
             is_longer = len(candidate.terms) > len(best.candidate.terms)
-            # the same law with a free shape is no other cause, and more effects are no simpler one
+            # no competitors: the same law with a free shape, and hypotheses of more effects
             if (candidate.has_free_shape and is_same_family) or is_longer:
                 continue
             if self.score(hypothesis) <= least_competing_score:

@@ -311,14 +311,14 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
 
 def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatArray]:
     """Return the lower and upper ends (E,) of the 90 % intervals of scaled effect parameters."""
-    value = hypothesis.effect
+    fitted_values = hypothesis.effect
     if isinstance(hypothesis, CandidateFit) and hypothesis.draws is not None:
         low, high = np.quantile(hypothesis.draws, (0.05, 0.95), axis=0)
         # the most probable value may lie outside of the quantiles, and is included
-        return np.minimum(low, value), np.maximum(high, value)
+        return np.minimum(low, fitted_values), np.maximum(high, fitted_values)
     variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
     half_width = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
-    return value - half_width, value + half_width
+    return fitted_values - half_width, fitted_values + half_width
 
 
 def _estimate(
@@ -440,10 +440,10 @@ def is_negligible_instrument_error(
         size = _instrument_error(problem, primitive)
         if size is None:
             return False
-        least = LEAST_INSTRUMENT_ERROR
+        least_named_size = LEAST_INSTRUMENT_ERROR
         if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
-            least = least_unstated_gain
-        ratios.append(size / least)
+            least_named_size = least_unstated_gain
+        ratios.append(size / least_named_size)
     # an empty change is not an error of instruments
     return max(ratios, default=1.0) < 1.0
 

@@ -1,11 +1,11 @@
 """The test of consistency: residuals of a fit must not depend on load, run, or sensor channel.
 
-An effect that is not in the catalogue can be imitated by one that is, so closely that the sum of
-squares of many thousand samples does not show it. The difference then lies in few patterns of the
-readings: the response of one kind of trial has another size, slope over the span, or zero than the
-fitted effect gives it. Such a pattern is called a *direction* here. A score test (Rao 1948, Proc.
-Camb. Phil. Soc. 44, 50-57) examines whether the misfit falls along these directions more than by
-chance, while nuisances and the parameters of the effect are refitted.
+An effect that is not in the catalogue can be imitated by one of the catalogue, so closely that the
+sum of squares of many thousand samples does not show the difference. The difference then lies in
+few patterns of the readings: the response of one kind of trial has another size, slope over the
+span, or zero than the fitted effect gives it. Such a pattern is called a *direction* here. A score
+test (Rao 1948, Proc. Camb. Phil. Soc. 44, 50-57) examines whether the misfit falls along these
+directions more than by chance, while nuisances and the parameters of the effect are refitted.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -93,15 +93,15 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
             "load."
         )
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
-    worst = min(tests, key=lambda test: test.p_value)
-    statistic = min(1.0, worst.p_value * len(tests))
+    worst_test = min(tests, key=lambda test: test.p_value)
+    statistic = min(1.0, worst_test.p_value * len(tests))
     passed = statistic >= CONSISTENCY_LEVEL
     if passed:
         reason = "What is left follows neither loads, runs nor the effect's own channel."
     else:
         reason = (
-            f"What is left follows the {worst.name}: χ² {worst.statistic:.0f} along "
-            f"{counted(worst.count, 'direction')}, most of all {worst.strongest}."
+            f"What is left follows the {worst_test.name}: χ² {worst_test.statistic:.0f} along "
+            f"{counted(worst_test.count, 'direction')}, most of all {worst_test.strongest}."
         )
     return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
 
@@ -165,7 +165,7 @@ class _ProjectedDirections(NamedTuple):
 def _projected_directions(
     problem: Problem, screen: Screen, group: Mapping[str, Direction]
 ) -> _ProjectedDirections:
-    """Return a group of directions after the part that nuisances and effect can do is removed.
+    """Return directions without the part that nuisances and effect parameters can compensate.
 
     Parameters
     ----------
@@ -176,23 +176,23 @@ def _projected_directions(
     group : mapping of str to Direction
         The directions by their names.
     """
-    sign = screen.inner_product_signs
+    signs = screen.inner_product_signs
     labels = []
-    vectors = []
+    unit_vectors = []
     scores = []
     for label, direction in group.items():
         changes = {}
         for trial_index, change in direction.items():
             changes[trial_index] = problem.trials[trial_index].standardise(change)
-        vector, score, _ = screen.project(changes)
-        length = float(np.linalg.norm(vector[sign > 0.0]))
+        projected_vector, score, _ = screen.project(changes)
+        length = float(np.linalg.norm(projected_vector[signs > 0.0]))
         if length > 0.0:
             labels.append(label)
-            vectors.append(vector / length)
+            unit_vectors.append(projected_vector / length)
             scores.append(score / length)
     if not labels:
         return _ProjectedDirections(labels, np.zeros(0), np.zeros((0, 0)))
-    information = (np.array(vectors) * sign) @ np.array(vectors).T
+    information = (np.array(unit_vectors) * signs) @ np.array(unit_vectors).T
     return _ProjectedDirections(labels, np.array(scores), information)
 
 
@@ -247,11 +247,11 @@ def _score_test(
     """
     gradient = projected.gradient
     eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
-    is_separate = eigenvalues > LEAST_REMAINING_LENGTH
-    count = int(is_separate.sum())
-    gradient_components = (eigenvectors.T @ gradient)[is_separate]
-    statistic = float(np.sum(gradient_components**2 / eigenvalues[is_separate]))
-    if not count or noise.freedom - count < LEAST_FREEDOM:
+    is_independent = eigenvalues > LEAST_REMAINING_LENGTH
+    direction_count = int(is_independent.sum())
+    gradient_components = (eigenvectors.T @ gradient)[is_independent]
+    statistic = float(np.sum(gradient_components**2 / eigenvalues[is_independent]))
+    if not direction_count or noise.freedom - direction_count < LEAST_FREEDOM:
         return None
     # the strongest direction by itself
     single_information = np.diag(projected.information)
@@ -263,8 +263,8 @@ def _score_test(
     return ScoreTest(
         name=name,
         statistic=statistic,
-        count=count,
-        p_value=_p_value(statistic, count, noise),
+        count=direction_count,
+        p_value=_p_value(statistic, direction_count, noise),
         strongest=f"{projected.labels[strongest]} ({z_scores[strongest]:.1f} deviations)",
     )
 
@@ -283,12 +283,15 @@ def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
     """
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, count))
+    # The statistic is in units of the noise variance estimated by all degrees of freedom. In units
+    # of the variance estimated by the remaining ones, the sum of squares before the test is
+    # `freedom`, and freedom - statistic is what the directions do not explain.
     scaled_statistic = statistic * noise.remaining_share
     if scaled_statistic >= noise.freedom:
         return 0.0
     remaining_freedom = noise.freedom - count
-    ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
-    return float(f.sf(ratio, count, remaining_freedom))
+    f_ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
+    return float(f.sf(f_ratio, count, remaining_freedom))
 
 
 # ---------------------------------------------------------------- directions

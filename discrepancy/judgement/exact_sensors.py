@@ -28,7 +28,7 @@ UNKNOWN_GAIN_DEVIATION = 1.0
 
 
 class _Nuisance(NamedTuple):
-    """A nuisance of a channel that a campaign may state to be exact.
+    """A property of a sensor, its zero or its gain, that a campaign may state to be exact.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class _Nuisance(NamedTuple):
     noun : str
         Its name.
     wide_deviation : float
-        The deviation with which it is free.
+        The prior standard deviation with which it is fitted as an unknown.
     """
 
     key: str
@@ -54,7 +54,7 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
 
     The drop of the sum of squares by a free zero (or gain) is first estimated with all other
     unknowns fixed. The channels of the largest drops are then fitted with the zero free, one by one
-    and at last all together, since other unknowns may compensate it. A channel is reported if its
+    and then all together, since other unknowns may compensate it. A channel is reported if its
     fit removes at least `LEAST_REMOVED_SHARE` of the misfit of all channels.
 
     Parameters
@@ -70,10 +70,11 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
             drop = _expected_drop(problem, no_effect, name, nuisance)
             if drop > 0.0:
                 drop_by_channel[name] = drop
-        promising = sorted(drop_by_channel, key=lambda name: drop_by_channel[name])
-        sets_of_channels = [[name] for name in promising[::-1][:MOST_SINGLE_CHANNEL_FITS]]
-        if len(promising) > 1:
-            sets_of_channels.append(promising)
+        # ascending, so that the channels of the largest drops are the last ones
+        channels_by_drop = sorted(drop_by_channel, key=lambda name: drop_by_channel[name])
+        sets_of_channels = [[name] for name in channels_by_drop[::-1][:MOST_SINGLE_CHANNEL_FITS]]
+        if len(channels_by_drop) > 1:
+            sets_of_channels.append(channels_by_drop)
         for names in sets_of_channels:
             share = _removed_share(problem, no_effect, names, nuisance)
             if share >= LEAST_REMOVED_SHARE:

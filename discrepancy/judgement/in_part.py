@@ -135,6 +135,7 @@ def verdict_without_negligible_effect(
     fit : CandidateFit
         The fit of the set.
     """
+    # nothing is dropped if each effect is notable and no subset explains as much
     comparison = SimulationComparison(search)
     full_set_key = set(fit.candidate.key)
     notable_key = _key_of_notable_terms(comparison, fit)
@@ -142,20 +143,22 @@ def verdict_without_negligible_effect(
     is_each_notable = notable_key == full_set_key
     if is_each_notable and not _has_equal_subset(comparison, full_set_key, least_share):
         return VerdictOutcome(naming_verdict, search, fit)
+    # compare the subsets under the wider noise, those of the fewest effects first
     compare_under_wide_noise(search)
     full_set = search.wide_fits.get(fit.candidate.key, fit)
     for subset in sorted(search.wide_fits.values(), key=lambda fit: len(fit.candidate.terms)):
-        key = set(subset.candidate.key)
-        if not key or not key < full_set_key:
+        subset_key = set(subset.candidate.key)
+        if not subset_key or not subset_key < full_set_key:
             continue
         if comparison.held_out_or_fitted_share(subset).value < least_share:
             continue
         least_score = search.score(full_set) - SEARCH.least_gain_of_negligible_effect
-        if key == notable_key or search.score(subset) > least_score:
+        if subset_key == notable_key or search.score(subset) > least_score:
             probability = comparison.probability(subset)
             if comparison.objection_to_naming(subset) or probability < SEARCH.name_probability:
                 return _unexplained_outcome(comparison, naming_verdict, subset)
             return _named_in_part_outcome(comparison, subset, probability)
+    # the whole set is needed: the verdict remains, and so does the comparison under recorded noise
     search.wide_fits = {}
     return VerdictOutcome(naming_verdict, search, fit)
 
@@ -197,7 +200,7 @@ def _key_of_notable_terms(
 def _verdict_by_comparison(
     comparison: Comparison[HypothesisT], simulation_verdict: Verdict
 ) -> VerdictOutcome:
-    """Return the verdict that a comparison of hypotheses leads to.
+    """Return the verdict of a comparison: named in part, a group, or an unexplained gap.
 
     Parameters
     ----------
@@ -208,12 +211,14 @@ def _verdict_by_comparison(
     """
     if not comparison.nameable_hypotheses:
         return _unexplained_outcome(comparison, simulation_verdict)
+    # the best hypothesis, and those that the data do not separate from it
     best = comparison.simplest_equivalent_hypothesis(comparison.nameable_hypotheses[0])
     members = [best, *comparison.competing_hypotheses(best)]
     other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
         reason = f"{other_count} others are as much of it: that tells nothing"
         return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+    # conditions that a name must fulfil
     if comparison.enlarges_error(best):
         return _unexplained_outcome(comparison, simulation_verdict, best)
     probability = comparison.probability(*members)
@@ -227,6 +232,7 @@ def _verdict_by_comparison(
             f"{SEARCH.least_log_bayes_factor:g})"
         )
         return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+    # one hypothesis is named in part; several are a group if all of them pass the absolute test
     if other_count == 0:
         return _named_in_part_outcome(comparison, best, probability)
     if all(comparison.passes_absolute_fit(member) for member in members):
@@ -254,12 +260,14 @@ def _named_in_part_outcome(
     share = comparison.held_out_or_fitted_share(best)
     families = {term.effect.family for term in best.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
+    # what is missing: effects of the catalogue, and families with a shape of their own
     phrases = []
     canonical = effects_text(effect for effect in effects if not effect.shape)
     if canonical:
         phrases.append(canonical)
     if family:
         phrases.append(f"an effect of the family {family}, with a shape of its own,")
+    # what it explains, and what remains
     share_clause = comparison.closed_share(best).clause
     sentence = (
         f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
@@ -375,24 +383,24 @@ def _unexplained_outcome(
         The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
         or else that its probability is too low.
     """
-    gap = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
-    nearest = _hypothesis_explaining_most(comparison) if considered is None else considered
+    gap_sentences = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
+    mentioned = _hypothesis_explaining_most(comparison) if considered is None else considered
     judged_hypothesis = None
     resembles: tuple[str, ...] = ()
-    if nearest is None or not _explains_mentioned_share(comparison, nearest):
-        sentence = f"{gap} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(nearest):
-        sentence = f"{gap} {_larger_error_sentence(comparison, nearest)}"
+    if mentioned is None or not _explains_mentioned_share(comparison, mentioned):
+        sentence = f"{gap_sentences} No effect of the catalogue follows it."
+    elif comparison.enlarges_error(mentioned):
+        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned)}"
     else:
-        reason = reason or comparison.objection_to_naming(nearest)
+        reason = reason or comparison.objection_to_naming(mentioned)
         if considered is not None and not reason:
-            probability = comparison.probability(nearest)
+            probability = comparison.probability(mentioned)
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        sentence = f"{gap} {_best_hypothesis_sentence(comparison, nearest, reason)}"
-        judged_hypothesis = nearest
-        resembles = names_without_free_shape(nearest.candidate.identifiers)
+        sentence = f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned, reason)}"
+        judged_hypothesis = mentioned
+        resembles = names_without_free_shape(mentioned.candidate.identifiers)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,
@@ -478,6 +486,7 @@ def _outcome_of_comparison(
     effects, group, family, gates, resembles
         Further attributes of the `Verdict`.
     """
+    # all hypotheses with their probabilities: the members first, then the others by probability
     remaining = []
     for ranked in comparison.ranked_hypotheses:
         if not any(ranked is member for member in members):
@@ -491,6 +500,7 @@ def _outcome_of_comparison(
     first_other = len(members)
     other_weighted = sorted(weighted[first_other:], key=lambda entry: -entry.probability)
     weighted = weighted[:first_other] + other_weighted
+    # the simulation that represents the verdict
     fit = comparison.search.no_effect
     if judged_hypothesis is not None:
         fit = comparison.simulation(judged_hypothesis)

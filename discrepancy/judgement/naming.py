@@ -68,9 +68,11 @@ def reach_verdict(
 def _verdict_of_two_searches(
     problem: Problem, effects: Sequence[Effect], on_progress: OnProgress, on_search: OnSearch
 ) -> VerdictOutcome:
-    """Return the verdict on a search, and if the missing force gives no name, on a second search.
+    """Return the verdict on a search, or on a second one that compares simulations only.
 
-    The second search compares simulations only.
+    The second search is made if hypotheses were compared by the missing force and the gap remains
+    unexplained. Its verdict is returned if it names effects in part, at least one of which acts on
+    the structure, and if these close enough of the gap in fitted trials.
     """
     first_search = search(problem, effects, on_progress, on_search)
     first_outcome = _verdict_on_search(first_search)
@@ -91,11 +93,15 @@ def _verdict_of_two_searches(
     second_search.force_hypotheses = first_search.force_hypotheses
     is_named = second_outcome.verdict.kind is VerdictKind.NAMED_IN_PART
     has_law = any(_effects_acting_on_structure(problem, second_outcome.fit))
-    # held-out trials alone are not enough: most of the gap in fitted trials must be closed too
-    count = float(problem.sample_counts.sum())
-    gap = second_search.no_effect.chi_square - count
-    remaining = second_outcome.fit.chi_square - count
-    closes_gap = gap > 0.0 and remaining < (1.0 - SEARCH.least_gap_share) * gap
+    # Held-out trials alone are not enough: most of the gap in fitted trials must be closed too. The
+    # gap is the excess of χ² over its expected value for noise alone, the number of readings.
+    reading_count = float(problem.sample_counts.sum())
+    excess_without_effect = second_search.no_effect.chi_square - reading_count
+    remaining_excess = second_outcome.fit.chi_square - reading_count
+    closes_gap = (
+        excess_without_effect > 0.0
+        and remaining_excess < (1.0 - SEARCH.least_gap_share) * excess_without_effect
+    )
     return second_outcome if is_named and has_law and closes_gap else first_outcome
 
 
@@ -112,6 +118,7 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
     """
     outcome = verdict_by_simulations(search)
     verdict = outcome.verdict
+    # test on held-out trials
     may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if may_be_named or verdict.kind is VerdictKind.GROUP:
         gate = check_held_out(residual_set(search.problem, outcome.fit, sensitivities=False))
@@ -120,17 +127,20 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
             sentence = f"{sentence} {gate.reason}"
             may_be_named = False
         verdict = replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
+    # reject named errors of instruments that are no cause
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP):
         rejection = _verdict_rejecting_instruments(search, verdict)
         if rejection is not None:
             return VerdictOutcome(rejection, search, search.no_effect)
+    # sets of several effects: drop errors of readings, and effects of hardly any influence
     if may_be_named and len(verdict.effects) > 1:
         laws_only = _outcome_naming_laws_only(search, verdict, outcome.fit)
         if laws_only is not None:
             return laws_only
         return verdict_without_negligible_effect(search, verdict, outcome.fit)
-    failed = {gate.name for gate in verdict.gates if gate.has_failed}
-    has_misfit = bool(failed & {"absolute fit", "held-out trials"})
+    # no name under the recorded noise: try to name in part
+    failed_tests = {gate.name for gate in verdict.gates if gate.has_failed}
+    has_misfit = bool(failed_tests & {"absolute fit", "held-out trials"})
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     is_open = not may_be_named and (has_misfit or verdict.kind in open_kinds)
     is_open_group = verdict.kind is VerdictKind.GROUP and bool(search.force_hypotheses)
@@ -147,11 +157,13 @@ def verdict_by_simulations(search: Search) -> VerdictOutcome:
     """
     probabilities = search.set_probabilities()
     for _ in range(SEARCH.largest_group):
-        exact = {fit.candidate.identifiers for fit in search.exact_fits.values()}
-        rough = [names for names in most_probable_sets(probabilities) if names not in exact]
-        if not rough:
+        exactly_fitted_sets = {fit.candidate.identifiers for fit in search.exact_fits.values()}
+        roughly_fitted_sets = [
+            names for names in most_probable_sets(probabilities) if names not in exactly_fitted_sets
+        ]
+        if not roughly_fitted_sets:
             break
-        search.fit_exactly(search.best_fit_of_set(rough[0]))
+        search.fit_exactly(search.best_fit_of_set(roughly_fitted_sets[0]))
         probabilities = search.set_probabilities()
     return decide_verdict(VerdictCase(search, probabilities))
 
@@ -165,8 +177,8 @@ def _outcome_naming_laws_only(
     do not explain. None is returned if the set does not contain both kinds of effects, or if laws
     alone cannot be named.
     """
-    acts = _effects_acting_on_structure(search.problem, fit)
-    names_both = any(acts) and not all(acts)
+    acts_on_structure = _effects_acting_on_structure(search.problem, fit)
+    names_both = any(acts_on_structure) and not all(acts_on_structure)
     if not search.force_hypotheses or not names_both:
         return None
     return verdict_naming_laws_only(search, verdict)
@@ -183,6 +195,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     problem = search.problem
     without_name = replace(verdict, effects=(), group=())
     causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    # reason 1: errors that any instrument has
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
             f"The model explains the data but for {causes} below "
@@ -190,6 +203,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
             "instruments and no name."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
+    # reason 2: a gain that only keeps calibrated parameters within their priors
     if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
     if not _are_instrument_errors_with_gain(verdict):

@@ -66,17 +66,19 @@ class Proposal:
 def next_experiments(
     problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]]
 ) -> tuple[Experiment, ...]:
-    """Return the experiments that best separate the open hypotheses.
+    """Return the experiments that best separate the open hypotheses, to propose them to the user.
 
-    They are sorted by information over cost, the best first.
+    An experiment is a feasible trial of at least `LEAST_INFORMATION`. At most `MOST_PROPOSED` are
+    returned, those of the largest information per cost first.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model of the fits.
     open_fits : sequence of (CandidateFit, float)
-        The hypotheses that are still open, with their probabilities.
+        The hypotheses that are still open with their probabilities, the most probable first.
     """
+    # a hypothesis of nearly no probability would make its logarithm infinite
     probabilities = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
     probabilities /= probabilities.sum()
     fits = [fit for fit, _ in open_fits]
@@ -85,7 +87,7 @@ def next_experiments(
     for proposal in feasible_proposals(problem, is_oscillating=is_oscillating):
         try:
             information = mutual_information(problem, proposal, fits, probabilities)
-        except DiscrepancyError:  # not feasible with this model
+        except DiscrepancyError:  # the model cannot simulate this trial
             continue
         if information >= LEAST_INFORMATION:
             experiments.append(
@@ -124,8 +126,8 @@ def mutual_information(
     trial_problem = problem.with_trials((proposal.trial,), model)
     # without a noise record, the rms residual of the most probable hypothesis, which is the first,
     # is taken for the noise deviation; a precision is (recorded / actual deviation)^2
-    recorded_over_residual = np.sqrt(problem.noise_precisions(fits[0].squares_by_channel))
-    noise_scale = np.where(problem.record_freedom > 0.0, 1.0, recorded_over_residual)
+    recorded_over_residual_deviation = np.sqrt(problem.noise_precisions(fits[0].squares_by_channel))
+    noise_scale = np.where(problem.record_freedom > 0.0, 1.0, recorded_over_residual_deviation)
     predictions = [_predicted_trial(trial_problem, fit, noise_scale) for fit in fits]
     gaussians = _reduce_dimensions(predictions, weights)
     return _simulate_information(gaussians, weights)
@@ -168,13 +170,16 @@ def _predicted_trial(
     # the trial's own unknowns are at their prior means: no reading has determined them
     point = Point(fit.point.shared, (np.zeros(local_count),), fit.point.effect)
     derivatives = trial_problem.linearise(0, point, fit.candidate)
-    by_unknowns, shared_indices = trial_problem.prediction_derivatives(
+    derivatives_by_unknowns, shared_indices = trial_problem.prediction_derivatives(
         0, point, derivatives, fit.candidate
     )
     # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
     reading_scale = np.broadcast_to(noise_scale[data.channel_indices], data.weight.shape).ravel()
     jacobian = (
-        data.standardise(by_unknowns).reshape(len(by_unknowns), reading_scale.size) * reading_scale
+        data.standardise(derivatives_by_unknowns).reshape(
+            len(derivatives_by_unknowns), reading_scale.size
+        )
+        * reading_scale
     )
     local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
@@ -207,11 +212,18 @@ class _Gaussian(NamedTuple):
 def _reduce_dimensions(
     predictions: Sequence[_PredictedTrial], weights: FloatArray
 ) -> list[_Gaussian]:
-    """Return the predictions of all hypotheses, noise included, in a space of fewer dimensions.
+    """Return the predictions of all hypotheses, noise included, in the subspace where they differ.
 
-    The space is spanned by the differences of the means and by the factors of the covariances.
-    Along all other directions the readings are the same noise under every hypothesis, so they do
-    not separate the hypotheses.
+    The subspace is spanned by the differences of the means and by the rows of the factors of the
+    covariances. Along all other directions of the space of readings, every hypothesis predicts the
+    same noise, so that these directions do not separate the hypotheses.
+
+    Parameters
+    ----------
+    predictions : sequence of _PredictedTrial
+        The predictions of the H hypotheses.
+    weights : (H,) array
+        The probabilities of the hypotheses, of sum one.
     """
     means = [prediction.mean for prediction in predictions]
     factors = [prediction.factor for prediction in predictions]
@@ -291,26 +303,34 @@ def feasible_proposals(problem: Problem, *, is_oscillating: bool = True) -> Iter
         Whether the motion after a release oscillates. If not, a longer record is not proposed, as
         it would only show the structure at rest.
     """
-    for row in SENTENCES.tables["proposal"]:
+    for proposal_table in SENTENCES.tables["proposal"]:
         trials_of_kind = [
-            trial for trial in problem.campaign.trials if trial.kind.value == row["kind"]
+            trial for trial in problem.campaign.trials if trial.kind.value == proposal_table["kind"]
         ]
-        if not trials_of_kind or (row["change"] == "length" and not is_oscillating):
+        if not trials_of_kind or (proposal_table["change"] == "length" and not is_oscillating):
             continue
-        min_or_max = min if row.get("of") == "smallest" else max
-        varied_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
-        changed_trial = _changed_trial(problem, varied_trial, row["change"], row["by"])
-        if changed_trial is None:
+        select_trial = min if proposal_table.get("of") == "smallest" else max
+        varied_trial = select_trial(trials_of_kind, key=lambda trial: trial.level)
+        changed_trial = _changed_trial(
+            problem, varied_trial, proposal_table["change"], proposal_table["by"]
+        )
+        if changed_trial is None:  # the change is not possible with this trial or model
             continue
         level = varied_trial.level
-        description = row["description"].format(
+        description = proposal_table["description"].format(
             top=level,
-            most=abs(row["by"]) * level,
-            signed=row["by"] * level,
+            most=abs(proposal_table["by"]) * level,
+            signed=proposal_table["by"] * level,
             value=changed_trial.value,
         )
-        trial = replace(changed_trial.trial, name=row["name"])
-        yield Proposal(trial, description, row["reason"], row["cost"], changed_trial.added_patch)
+        trial = replace(changed_trial.trial, name=proposal_table["name"])
+        yield Proposal(
+            trial,
+            description,
+            proposal_table["reason"],
+            proposal_table["cost"],
+            changed_trial.added_patch,
+        )
 
 
 class _ChangedTrial(NamedTuple):
@@ -356,10 +376,11 @@ def _changed_trial(
     if change in ("force", "load_factor"):
         return _ChangedTrial(replace(trial, **{change: amount * getattr(trial, change)}))
     if change == "length":
-        count = int(amount) * len(trial.time)
-        time = trial.time[0] + trial.interval * np.arange(count)
-        longer = trial.rows(np.arange(count) % len(trial.time), time=time)
-        return _ChangedTrial(longer, count * trial.interval)
+        sample_count = int(amount) * len(trial.time)
+        time = trial.time[0] + trial.interval * np.arange(sample_count)
+        # the readings are not used: the recorded rows are repeated to fill the longer record
+        longer_trial = trial.rows(np.arange(sample_count) % len(trial.time), time=time)
+        return _ChangedTrial(longer_trial, sample_count * trial.interval)
     if change == "place" and stations is not None:
         root, tip = stations
         station = round(root + amount * (tip - root), 3)

@@ -44,6 +44,7 @@ def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: Hypoth
 
     It is empty if there is none.
     """
+    # the most probable set of laws that contains all families of the best hypothesis and more
     families = family_place_pairs(best)
     least_score = comparison.score(best) - SEARCH.contender_range
     larger_hypothesis = None
@@ -55,6 +56,7 @@ def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: Hypoth
             break
     if larger_hypothesis is None:
         return ""
+    # it must explain notably more of the gap
     least_share = comparison.held_out_or_fitted_share(best).value + SEARCH.negligible_share
     if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
         return ""

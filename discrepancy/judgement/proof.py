@@ -62,30 +62,32 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     FitError
         If no sample is used.
     """
-    transforms = [fitted.residual / fitted.predictive_deviation for fitted in residuals.trials]
+    # residuals over their predictive deviations: standard normal if the predictions are right
+    standardised = [fitted.residual / fitted.predictive_deviation for fitted in residuals.trials]
     used = [fitted.used for fitted in residuals.trials]
-    used_transforms = np.concatenate(
-        [values[use] for values, use in zip(transforms, used, strict=True)]
+    used_standardised = np.concatenate(
+        [values[use] for values, use in zip(standardised, used, strict=True)]
     )
-    if used_transforms.size == 0:
+    if used_standardised.size == 0:
         raise FitError("Scores need at least one used sample, but there is none.")
-    densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
+    log_densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
-    white = residuals.whitened_residuals(np.random.default_rng(seed))
-    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(white)]
-    counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
+    whitened = residuals.whitened_residuals(np.random.default_rng(seed))
+    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(whitened)]
+    bin_counts, _ = np.histogram(stats.norm.cdf(used_standardised), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
         chi_square_per_sample=chi_square.per_sample,
-        log_score=float(np.concatenate(densities).mean()),
-        coverage_50=float(np.mean(np.abs(used_transforms) <= stats.norm.ppf(0.75))),
-        coverage_90=float(np.mean(np.abs(used_transforms) <= stats.norm.ppf(0.95))),
+        log_score=float(np.concatenate(log_densities).mean()),
+        coverage_50=float(np.mean(np.abs(used_standardised) <= stats.norm.ppf(0.75))),
+        coverage_90=float(np.mean(np.abs(used_standardised) <= stats.norm.ppf(0.95))),
+        # Bonferroni's correction: the least p-value times the number of series
         whiteness=min(1.0, len(p_values) * min(p_values)) if p_values else nan,
-        sample_count=int(used_transforms.size),
+        sample_count=int(used_standardised.size),
         chi_square_expected=chi_square.expected,
         chi_square_deviation=chi_square.deviation,
-        pit=tuple(float(share) for share in counts / used_transforms.size),
-        pit_p_value=_uniformity_p_value(transforms, used, counts),
+        pit=tuple(float(share) for share in bin_counts / used_standardised.size),
+        pit_p_value=_uniformity_p_value(standardised, used, bin_counts),
     )
 
 
@@ -154,6 +156,7 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     expected = float(np.concatenate(variances).mean())
     # Channels may share their record or not. The worst case is assumed: all share the poorest one.
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
+    # relative variance of a mean square of n degrees of freedom: 2 / n, for residuals and record
     deviation = expected * sqrt(2.0 / freedom + 2.0 / noise_freedom)
     return ChiSquare(float(np.concatenate(squares).mean()), expected, deviation)
 
@@ -169,9 +172,10 @@ def correlation_time(series: FloatArray) -> float:
     sum_of_squares = float(centred @ centred)
     if count < 4 or sum_of_squares == 0.0:
         return 1.0
-    rho = lag_products(centred, count - 1)[0] / sum_of_squares
-    pair_sums = rho[0 : count - 1 : 2] + rho[1:count:2]
+    autocorrelation = lag_products(centred, count - 1)[0] / sum_of_squares
+    pair_sums = autocorrelation[0 : count - 1 : 2] + autocorrelation[1:count:2]
     nonpositive = np.flatnonzero(pair_sums <= 0.0)
+    # autocorrelation[0] = 1, so that 1 + 2 (sum over k >= 1) = 2 (sum over k >= 0) - 1
     positive_count = int(nonpositive[0]) if nonpositive.size else pair_sums.size
     return max(1.0, 2.0 * float(pair_sums[:positive_count].sum()) - 1.0)
 
@@ -192,8 +196,8 @@ def _uniformity_p_value(
     counts : (bins,) array of int
         The samples in each bin.
     """
-    total = 0
-    effective = 0.0
+    sample_count = 0
+    independent_count = 0.0
     for values, use in zip(transforms, used, strict=True):
         for column in range(values.shape[1]):
             series = values[use[:, column], column]
@@ -201,12 +205,17 @@ def _uniformity_p_value(
                 samples_per_independent = max(
                     correlation_time(series), correlation_time(np.abs(series))
                 )
-                total += series.size
-                effective += series.size / samples_per_independent
-    if effective < PIT_BINS:
+                sample_count += series.size
+                independent_count += series.size / samples_per_independent
+    if independent_count < PIT_BINS:
         return nan
-    expected = total / PIT_BINS
-    statistic = float(np.sum((counts - expected) ** 2) / expected) * effective / total
+    expected_per_bin = sample_count / PIT_BINS
+    # Pearson's statistic of n dependent samples is too large by n / (number of independent ones)
+    statistic = (
+        float(np.sum((counts - expected_per_bin) ** 2) / expected_per_bin)
+        * independent_count
+        / sample_count
+    )
     return float(stats.chi2.sf(statistic, PIT_BINS - 1))
 
 
@@ -222,30 +231,32 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
     before, after : ResidualSet
         The same trials without and with the effect.
     """
-    sums = []
-    counts = []
+    trial_sums = []
+    trial_counts = []
     variance_within = 0.0
     for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
         used = without_effect.used
-        # densities are in units of the noise, which differs where none is recorded
+        # densities are in units of the noise deviation, which differs for channels without a record
         noise_ratio = np.log(without_effect.noise_deviation / with_effect.noise_deviation)
         gain = log_density(with_effect) - log_density(without_effect) + noise_ratio
         gain = np.where(used, gain, 0.0)
-        sums.append(float(gain.sum()))
-        counts.append(int(used.sum()))
+        trial_sums.append(float(gain.sum()))
+        trial_counts.append(int(used.sum()))
         variance_within += _variance_of_sum(gain.sum(axis=1))
-    total = sum(counts)
-    mean = sum(sums) / total
-    error_within = sqrt(variance_within) / total
-    if len(sums) == 1:
-        return mean, error_within
-    scatter = sum(
-        (trial_sum - mean * count) ** 2 for trial_sum, count in zip(sums, counts, strict=True)
+    sample_count = sum(trial_counts)
+    mean_gain = sum(trial_sums) / sample_count
+    error_within = sqrt(variance_within) / sample_count
+    if len(trial_sums) == 1:
+        return mean_gain, error_within
+    squared_scatter = sum(
+        (trial_sum - mean_gain * count) ** 2
+        for trial_sum, count in zip(trial_sums, trial_counts, strict=True)
     )
-    error_between = sqrt(len(sums) / (len(sums) - 1) * scatter) / total
-    if len(sums) >= ENOUGH_TRIALS:
-        return mean, error_between
-    return mean, max(error_between, error_within)
+    # standard error of a ratio estimate over clusters, with trials as clusters
+    error_between = sqrt(len(trial_sums) / (len(trial_sums) - 1) * squared_scatter) / sample_count
+    if len(trial_sums) >= ENOUGH_TRIALS:
+        return mean_gain, error_between
+    return mean_gain, max(error_between, error_within)
 
 
 def _variance_of_sum(series: FloatArray) -> float:
@@ -254,11 +265,12 @@ def _variance_of_sum(series: FloatArray) -> float:
     Differences of neighbouring sums are used, because the expected value changes slowly along a
     record as the motion decays. A difference has twice the variance of a sum.
     """
-    parts = np.array_split(series, min(PARTS_OF_RECORD, series.size))
-    sums = np.array([part_of_series.sum() for part_of_series in parts])
-    if sums.size < 2:
+    series_parts = np.array_split(series, min(PARTS_OF_RECORD, series.size))
+    part_sums = np.array([part_of_series.sum() for part_of_series in series_parts])
+    if part_sums.size < 2:
         return 0.0
-    return float(0.5 * np.sum(np.diff(sums) ** 2) * sums.size / (sums.size - 1))
+    # half the mean squared difference is the variance of one part's sum; times the number of parts
+    return float(0.5 * np.sum(np.diff(part_sums) ** 2) * part_sums.size / (part_sums.size - 1))
 
 
 # ---------------------------------------------------------------- the test on held-out trials
@@ -376,6 +388,7 @@ def prove_effects(
     FitError
         If no sample of the fitted or of the held-out trials is used.
     """
+    # the same noise deviation for both, so that errors and scores can be compared
     after = residuals_with_noise_of(after, before)
     held_out_before = _held_out_scores(before, seed)
     held_out_after = _held_out_scores(after, seed)

@@ -18,7 +18,7 @@ from reporting.words import listing
 # ---------------------------------------------------------------- when there is a gap
 
 KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-"""Kinds of verdicts by which the model stands as it is."""
+"""Kinds of verdicts after which the model remains unchanged: no gap was detected."""
 MOST_MENTIONED = 3
 """Windows, or effects that were not tested, that a sentence mentions one by one."""
 
@@ -173,6 +173,7 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     """
     if verdict.kind is not VerdictKind.NAMED:
         return None
+    # similar effects that were compared, and those that were not
     named = {effect.identifier: effect.name for effect in verdict.effects}
     compared_by_identifier = {effect.identifier: effect for effect in compared}
     similar = _similar_effects(set(named), compared_by_identifier)
@@ -202,13 +203,13 @@ def _similar_effects(named: set[str], compared: Mapping[str, Effect]) -> set[str
 
     The catalogue declares this for either of the two effects (`Effect.confusable`).
     """
-    likenesses = set()
+    similar_identifiers = set()
     for identifier, effect in compared.items():
         if not named.isdisjoint(effect.confusable):
-            likenesses.add(identifier)
+            similar_identifiers.add(identifier)
     for identifier in named & compared.keys():
-        likenesses.update(compared[identifier].confusable)
-    return likenesses - named
+        similar_identifiers.update(compared[identifier].confusable)
+    return similar_identifiers - named
 
 
 def _was_or_were(names: Sequence[str]) -> str:

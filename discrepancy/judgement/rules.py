@@ -268,7 +268,7 @@ class VerdictCase:
         )
 
     def _no_group_verdict(self, most_probable: FittedEffectSet, count: int) -> VerdictOutcome:
-        """Return the verdict of a gap if none of the probable sets passes the test, or too many do.
+        """Return the verdict of an unexplained gap if no set passes the test, or too many do.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ class VerdictCase:
     def _group_verdict(
         self, members: Sequence[FittedEffectSet], probability: float
     ) -> VerdictOutcome:
-        """Return the verdict that one of several sets is missing, which cannot be told apart.
+        """Return the verdict that one of several sets is missing and the data do not tell which.
 
         Parameters
         ----------
@@ -341,10 +341,12 @@ class VerdictCase:
 
     def failed_test_verdict(self) -> VerdictOutcome:
         """Return the verdict of an unexplained gap, as the set or its family fails a test."""
+        # the reason of the test that failed: absolute fit, or else consistency
         tested = self.tested_family_set or self.tested_set
         reason = tested.absolute_fit.reason
         if not tested.absolute_fit.has_failed and tested.consistency.has_failed:
             reason = tested.consistency.reason
+        # a law of free shape has no nearest effect to mention
         if self.leading_fit.candidate.has_free_shape:
             sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
             gates = (tested.absolute_fit, tested.consistency)

@@ -192,17 +192,21 @@ def compute_separability(
         if reason is not None:
             detectability.append(Detectability(effect, reason))
             continue
-        options = _all_changes(screen, effect)
-        best = _reference_change(screen, effect, options)
-        if best is None:
+        grid_changes = _all_changes(screen, effect)
+        reference = _reference_change(screen, effect, grid_changes)
+        if reference is None:
             reason = "The structure cannot carry it at any size that was tried."
             detectability.append(Detectability(effect, reason))
             continue
-        small = _SmallChange(*screen.shrink_change(best))
-        distance = min(best.squared_size, small.change.squared_size / small.factor**2)
-        detectability.append(_detectability(effect, best, distance))
-        if best.squared_size > VISIBILITY_DISTANCE:
-            visible.append(_VisibleEffect(effect.identifier, best, [best, *options]))
+        # A large change may saturate, for example if it shifts phases by more than a radian. The
+        # squared distance of the small change, scaled back to the reference, is taken if smaller.
+        small_reference = _SmallChange(*screen.shrink_change(reference))
+        distance = min(
+            reference.squared_size, small_reference.change.squared_size / small_reference.factor**2
+        )
+        detectability.append(_detectability(effect, reference, distance))
+        if reference.squared_size > VISIBILITY_DISTANCE:
+            visible.append(_VisibleEffect(effect.identifier, reference, [reference, *grid_changes]))
     identifiers = tuple(effect.identifier for effect in visible)
     distance_matrix = _distances(screen, visible)
     groups = _confusion_groups(identifiers, distance_matrix)
@@ -299,7 +303,7 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     """Return how well an effect can be detected.
 
     The squared distance grows with the square of the magnitude, so the least detectable magnitude
-    is typical * sqrt(DETECTED / distance).
+    is typical * sqrt(DETECTION_DISTANCE / distance).
 
     Parameters
     ----------

@@ -74,10 +74,10 @@ class SimulationComparison(Comparison[CandidateFit]):
         with_effect = self.residuals(hypothesis).trials
         trials_before = _trials_in_role(without_effect, held_out=held_out)
         trials_after = _trials_in_role(with_effect, held_out=held_out)
-        blocks: list[list[float]] = []
+        block_sums: list[list[float]] = []
         for before, after in zip(trials_before, trials_after, strict=True):
-            blocks += self._block_sums(before, after)
-        sums_before, sums_after, noise_sums = np.array(blocks).T
+            block_sums += self._block_sums(before, after)
+        sums_before, sums_after, noise_sums = np.array(block_sums).T
         return GapShare(
             squares_before=sums_before,
             squares_after=sums_after,

@@ -25,39 +25,55 @@ from .remarks import KINDS_WITHOUT_GAP
 VETO_NOISE_DEVIATIONS = 5.0
 """rms residual over the noise deviation above which a channel of a held-out trial is far off."""
 VETO_PREDICTIVE_DEVIATIONS = 3.0
-"""The same over the predictive deviation, since the uncertainty of the fit is no gap."""
+"""rms residual over the predictive deviation (noise and uncertainty of the fit together) that a
+channel must also exceed to be far off, since the uncertainty of the fit is no gap."""
 MOST_MENTIONED = 3
-"""Number of records that a sentence mentions."""
+"""Largest number of records (one channel in one trial each) that a sentence mentions."""
 WHITE_SECOND_DIFFERENCES = 6.0
-"""Variance of second differences of white noise over its own."""
+"""Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
 
 
 def check_against_trials(outcome: VerdictOutcome) -> VerdictOutcome:
-    """Return the verdict if the trials confirm it, or one that names nothing and gives the reason.
+    """Return the outcome if its verdict passes three checks; else a verdict of an unexplained gap.
+
+    The checks are made in this order, and the first one that fails gives the reason:
+
+    1. The fit of the verdict leaves residuals that are smaller than the signal in every fitted
+       trial in motion.
+    2. If the verdict has effects, the error of the trials is not larger with them than without.
+    3. If the verdict is that nothing is missing, no held-out trial is far off the prediction of the
+       model without effect.
 
     Parameters
     ----------
     outcome : VerdictOutcome
-        A verdict, its search, and the fit that represents it.
+        The verdict, its search, and the fit that represents it.
     """
     verdict, search, fit = outcome
     problem = search.problem
     no_effect = search.no_effect
-    before = residual_set(problem, no_effect, sensitivities=False)
-    after = before
+    residuals_without_effect = residual_set(problem, no_effect, sensitivities=False)
+    residuals_with_effect = residuals_without_effect
     if fit is not no_effect:
-        after = residual_set(problem, fit, sensitivities=False)
-    unfitted = unfitted_records(after)
+        residuals_with_effect = residual_set(problem, fit, sensitivities=False)
+    # check 1: residuals against the signal
+    unfitted = unfitted_records(residuals_with_effect)
     if unfitted:
         return VerdictOutcome(_unfitted_verdict(verdict, unfitted), search, no_effect)
+    # check 2: the error with and without the effects
     if fit.candidate.terms:
-        closed, _ = closed_share_or_reason(before, after)
+        closed, _ = closed_share_or_reason(residuals_without_effect, residuals_with_effect)
         if closed is not None and closed.has_grown:
-            sentence = _larger_error_sentence(verdict, closed_share_text(before, after, closed))
+            sentence = _larger_error_sentence(
+                verdict, closed_share_text(residuals_without_effect, residuals_with_effect, closed)
+            )
             return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
-    far_records = far_held_out_records(before) if verdict.kind in KINDS_WITHOUT_GAP else []
+    # check 3: held-out trials
+    far_records = (
+        far_held_out_records(residuals_without_effect) if verdict.kind in KINDS_WITHOUT_GAP else []
+    )
     if far_records:
-        sentence = _held_out_gap_sentence(before, far_records)
+        sentence = _held_out_gap_sentence(residuals_without_effect, far_records)
         return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
     return outcome
 
@@ -130,10 +146,14 @@ def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
             used = fitted.used[:, column]
             if not used.any():
                 continue
-            square = float(np.mean(fitted.standardised[used, column] ** 2))
-            expected = float(np.mean(fitted.expected_variance[used, column]))
-            if square > max(VETO_NOISE_DEVIATIONS**2, VETO_PREDICTIVE_DEVIATIONS**2 * expected):
-                far_records.append(FarRecord(fitted.trial.name, channel, float(np.sqrt(square))))
+            mean_square = float(np.mean(fitted.standardised[used, column] ** 2))
+            expected_mean_square = float(np.mean(fitted.expected_variance[used, column]))
+            if mean_square > max(
+                VETO_NOISE_DEVIATIONS**2, VETO_PREDICTIVE_DEVIATIONS**2 * expected_mean_square
+            ):
+                far_records.append(
+                    FarRecord(fitted.trial.name, channel, float(np.sqrt(mean_square)))
+                )
     return sorted(far_records, key=lambda record: -record.noise_deviations)
 
 
@@ -143,9 +163,9 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
     for record in far_records[:MOST_MENTIONED]:
         trials = [fitted for fitted in residuals.trials if fitted.trial.name == record.trial]
         rms = rms_by_channel(replace(residuals, trials=tuple(trials)))[record.channel]
-        size = _value_with_unit(residuals, record.channel, rms)
-        noises = f"{record.noise_deviations:.1f} times the noise"
-        parts.append(f"{record.channel} in {record.trial!r} by {size} (rms, {noises})")
+        rms_text = _value_with_unit(residuals, record.channel, rms)
+        noise_text = f"{record.noise_deviations:.1f} times the noise"
+        parts.append(f"{record.channel} in {record.trial!r} by {rms_text} (rms, {noise_text})")
     remaining = len(far_records) - MOST_MENTIONED
     if remaining > 0:
         parts.append(f"{remaining} more records")

@@ -23,8 +23,8 @@ from .linear_trials import LinearTrials
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
 FURTHER_PORT_FACTOR = 0.1
-"""Factor on the size of a further port's missing force, estimated alone, with which the search for
-all of them together begins."""
+"""Factor on the standard deviation of a missing force as estimated at its port alone. The search
+for the forces at all ports together begins with the product. At the best port the factor is one."""
 
 
 class MissingForces:
@@ -73,35 +73,43 @@ class MissingForces:
             last_processes = self.hypothesis_by_port[name].processes
             motions = linear_trials.smooth(last_processes).motions
             along_motion = self.column_builder.trials_along_motions(linear_trials, motions)
-            median = self.prior_processes((port,))
-            self.hypothesis_by_port[name] = fit_missing_forces(along_motion, median, last_processes)
+            prior_medians = self.prior_processes((port,))
+            self.hypothesis_by_port[name] = fit_missing_forces(
+                along_motion, prior_medians, last_processes
+            )
 
     # ---------------------------------------------------------------- where a force is missing
 
     @cached_property
     def hypothesis_of_all_ports(self) -> ForceHypothesis:
-        """The missing forces at all ports at once.
+        """The missing forces at several ports, estimated together.
 
-        If there are more than `MOST_PORTS` ports, those with the most evidence are taken.
+        These are all ports of the model, or the `MOST_PORTS` ports with the largest evidence if
+        there are more. With a single port the result is the estimate at that port.
         """
-        best = self.hypothesis_of_best_port()
-        best_ports = sorted(
+        best_alone = self.hypothesis_of_best_port()
+        hypotheses_alone = sorted(
             self.hypothesis_by_port.values(), key=lambda at_port: -at_port.log_evidence
         )[:MOST_PORTS]
-        if len(best_ports) == 1:
-            return best
-        initial = dict(best.processes)
-        for at_port in best_ports[1:]:
-            initial |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
-        linear_trials = best.linear_trials
-        # twice: the second estimate is along the motion of the first one
+        if len(hypotheses_alone) == 1:
+            return best_alone
+        start_processes = dict(best_alone.processes)
+        for at_port in hypotheses_alone[1:]:
+            # alone, each port takes the whole gap: the further ports begin with a smaller force
+            # of the same correlation time
+            start_processes |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
+        linear_trials = best_alone.linear_trials
+        # The columns of the model's own laws depend on the motion, so forces and motion are
+        # estimated twice. The second search begins at the first result and needs no grid.
         for skip_grid in (False, True):
-            median = self.prior_processes(initial)
-            hypothesis = fit_missing_forces(linear_trials, median, initial, skip_grid=skip_grid)
+            prior_medians = self.prior_processes(start_processes)
+            hypothesis = fit_missing_forces(
+                linear_trials, prior_medians, start_processes, skip_grid=skip_grid
+            )
             linear_trials = self.column_builder.trials_along_motions(
                 linear_trials, hypothesis.motions
             )
-            initial = dict(hypothesis.processes)
+            start_processes = dict(hypothesis.processes)
         return hypothesis
 
     def hypothesis_of_best_port(self) -> ForceHypothesis:
@@ -125,6 +133,7 @@ class MissingForces:
         for port in ports:
             scale = scales.ports[self.ports[port]]
             rate = scale.angular_frequency or 1.0 / scales.duration
+            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
             processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 
@@ -167,10 +176,12 @@ class MissingForces:
             for _ in range(2):
                 motions = linear_trials.smooth(hypothesis.processes).motions
                 linear_trials = self.column_builder.trials_along_motions(linear_trials, motions)
-            initial = {}
+            start_processes = {}
             for port_number, process in hypothesis.processes.items():
-                initial[port_number] = replace(process, may_jump=True)
-            hypothesis = fit_missing_forces(linear_trials, self.prior_processes(initial), initial)
+                start_processes[port_number] = replace(process, may_jump=True)
+            hypothesis = fit_missing_forces(
+                linear_trials, self.prior_processes(start_processes), start_processes
+            )
         return hypothesis
 
     def point_with_effects(self, hypothesis: ForceHypothesis) -> Point:

@@ -26,7 +26,7 @@ def smoother_corrections(
     """Return the vector and matrix by which later readings correct the state at each sample.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
-    1085-1088), which inverts no covariance. In his letters the addition is r, the information N,
+    1085-1088), which inverts no covariance. In his letters the correction is r, the information N,
     the innovation divided by its variance v / F, and the gain K.
 
     Parameters
@@ -46,8 +46,10 @@ def smoother_corrections(
     Returns
     -------
     corrections, informations : (N, n), (N, n, n) ndarray
-        The smoothed state is the predicted one plus its covariance C times the addition. After the
-        readings of the sample the covariance C becomes C - C information C.
+        The vector r of each sample, from the readings at and after it: the smoothed state is the
+        state predicted before the readings of the sample, plus its covariance times r. The matrix N
+        of each sample, from the readings after it: with C the covariance of the state after the
+        readings of the sample, the covariance given all readings is C - C N C.
     """
     sample_count = len(step_of_sample)
     n = output_rows.shape[1]
@@ -57,7 +59,7 @@ def smoother_corrections(
     information = np.zeros((n, n))
     for k in range(sample_count - 1, -1, -1):
         informations[k] = information
-        # take in the readings of the sample, in reverse order
+        # readings of the sample, in reverse order
         for c in range(len(output_rows) - 1, -1, -1):
             if used[k, c]:
                 row = output_rows[c]
@@ -73,7 +75,7 @@ def smoother_corrections(
                     + innovation_information * np.outer(row, row)
                 )
         corrections[k] = correction
-        # carry both back over the step
+        # propagate both back over the step that leads to the sample
         transition = transitions[step_of_sample[k]]
         correction = transition.T @ correction
         information = transition.T @ information @ transition
@@ -140,7 +142,7 @@ def filter_backward(
     steady = False
     for k in range(sample_count - 1, -1, -1):
         reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
-        # take in the readings of the sample
+        # add the information of the readings of the sample
         for channel in range(len(output_rows)):
             if used[k, channel]:
                 h += np.outer(output_rows[channel], columns[k, channel])

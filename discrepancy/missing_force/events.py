@@ -108,20 +108,22 @@ class EventSearch(EventTrials):
         score : float
             The log evidence with the priors of the forces, minus the price of all changes [nat].
         """
-        scale = np.tile((self.process.standard_deviation, self.process.correlation_time), 2)
+        prior_medians = np.tile((self.process.standard_deviation, self.process.correlation_time), 2)
         initial_values = [
             value
             for force in initial
             for value in (force.standard_deviation, force.correlation_time)
         ]
-        initial_logarithms = np.log(np.array(initial_values) / scale)
+        initial_logarithms = np.log(np.array(initial_values) / prior_medians)
 
         def forces(moves: FloatArray) -> ForcePair:
             """Return both forces at moves (4,) of their logarithms in units of `SIMPLEX_STEPS`."""
             logs = np.clip(
                 initial_logarithms + moves * SIMPLEX_STEPS, -LARGEST_LOGARITHM, LARGEST_LOGARITHM
             )
-            event_size, event_time, steady_size, steady_time = (np.exp(logs) * scale).tolist()
+            event_size, event_time, steady_size, steady_time = (
+                np.exp(logs) * prior_medians
+            ).tolist()
             event = replace(
                 self.process, standard_deviation=event_size, correlation_time=event_time
             )
@@ -135,6 +137,7 @@ class EventSearch(EventTrials):
             )
             return minus_log_prior - float(self.log_evidence(self.products(forces(moves), paths)))
 
+        # Nelder-Mead search over four moves, one unit of which is the initial step of a logarithm
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": evaluations, "initial_simplex": simplex}
         fit = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
@@ -201,9 +204,13 @@ class Events:
         return SwitchedRecord(self.search, trial_index, self.forces, products_of_others, substeps)
 
     def change_times(self, trial_index: int) -> FloatArray:
-        """Return median and ends of the 90 % interval (C, 3) of the C changes in a trial [s]."""
+        """Return the times (C, 3) of the C changes in a trial: median and 90 % interval [s].
+
+        A change is the moment at which the force of events begins or ends.
+        """
         on = self.paths[trial_index]
         time = self.search.trials[trial_index].time
+        # divide the intervals of a short record, so that a change may lie between samples
         substeps = max(1, CHANGE_GRID_SIZE // len(on))
         record = self.switched_record(trial_index, substeps)
         fine_path = np.repeat(on, substeps)[: (len(on) - 1) * substeps + 1]
@@ -211,7 +218,8 @@ class Events:
         for change in range(len(times_of_changes)):
             samples, log_evidence = record.evidence_of_change_samples(fine_path, change)
             sample_times = np.interp(samples / substeps, np.arange(len(on)), time)
-            # the posterior density of the moment, integrated by the trapezoidal rule
+            # posterior density of the time of the change, integrated by the trapezoidal rule; its
+            # quantiles are found by inverse interpolation
             density = np.exp(log_evidence - log_evidence.max())
             probabilities = 0.5 * (density[1:] + density[:-1]) * np.diff(sample_times)
             distribution = np.r_[0.0, np.cumsum(probabilities)]
@@ -246,14 +254,14 @@ def find_events(
     sample_count = sum(len(trial.time) for trial in linear_trials.trials)
     stride = ceil(sample_count / MOST_SAMPLES)
     search = EventSearch(linear_trials, port, process, stride=stride)
-    never = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
-    steady = _steady_force_where_needed(search, never)
+    always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
+    steady = _steady_force_where_needed(search, always_off)
     # stretches with a large force that may jump, besides a small force throughout
     event_deviation = INITIAL_EVENT_DEVIATION * process.standard_deviation
     steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
     event_force = Process(event_deviation, process.correlation_time, may_jump=True)
     steady_force = replace(process, standard_deviation=steady_deviation)
-    best = _search_round(search, (event_force, steady_force), never, FIRST_EVALUATIONS)
+    best = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
     for _ in range(MOST_ROUNDS):
         next_events = _search_round(search, best.forces, best.paths, LATER_EVALUATIONS)
         if next_events.score < best.score + LEAST_GAIN:
@@ -289,13 +297,14 @@ def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
         np.repeat(on, stride)[: len(trial.time)]
         for on, trial in zip(coarse.paths, search.trials, strict=True)
     ]
-    events_of_all = Events(search, coarse.forces, paths, -np.inf)
-    # `events_of_all` refers to `paths`, so that each trial is placed given those before it
+    events_in_all_samples = Events(search, coarse.forces, paths, -np.inf)
+    # `events_in_all_samples` refers to `paths`, which is changed here: the changes of each trial
+    # are placed given the refined paths of the trials before it
     for trial_index in range(len(paths)):
-        record = events_of_all.switched_record(trial_index, 1)
+        record = events_in_all_samples.switched_record(trial_index, 1)
         paths[trial_index] = record.place_changes(paths[trial_index])
     log_evidence = float(search.log_evidence(search.products(coarse.forces, paths)))
-    return replace(events_of_all, score=log_evidence - price_of_changes(paths))
+    return replace(events_in_all_samples, score=log_evidence - price_of_changes(paths))
 
 
 def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) -> Events:
@@ -311,11 +320,12 @@ def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) 
     negligible_force = replace(
         search.process, standard_deviation=NEGLIGIBLE_DEVIATION * search.process.standard_deviation
     )
+    # the force of events, which is on in whole records, stands for the steady force
     paths = [~off for off in never]
-    (event, _), score = search.fit_forces(
+    (steady_force, _), score = search.fit_forces(
         (search.process, negligible_force), paths, FIRST_EVALUATIONS
     )
-    forces = (event, negligible_force)
+    forces = (steady_force, negligible_force)
     for trial_index, off in enumerate(never):
         paths_without = [*paths[:trial_index], off, *paths[trial_index + 1 :]]
         evidence_without = search.log_evidence(search.products(forces, paths_without))

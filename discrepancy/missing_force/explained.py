@@ -73,6 +73,7 @@ class ForceHypothesis:
         covariance = self.solution.covariance
         if not len(self.effect):
             return mean[:first_effect]
+        # conditional mean of a joint Gaussian: m_s + C_se C_ee^-1 (effect - m_e)
         residual = self.effect - mean[first_effect:]
         weighted_residual = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
         return np.asarray(
@@ -91,32 +92,34 @@ class ForceHypothesis:
         if not len(self.effect):
             return covariance
         first_effect = len(self.linear_trials.shared_precision)
-        hidden = self._covariance_of_hidden_force()
+        added_covariance = self._covariance_of_hidden_force()
         effect_covariance = covariance[first_effect:, first_effect:]
         # all unknowns follow the effect parameters by their regression on these
         regression = np.linalg.lstsq(effect_covariance, covariance[first_effect:], rcond=None)[0].T
-        return np.asarray(covariance + regression @ hidden @ regression.T)
+        return np.asarray(covariance + regression @ added_covariance @ regression.T)
 
     def _covariance_of_hidden_force(self) -> FloatArray:
         """Return the covariance (E, E) that a hidden force adds to the effect parameters."""
-        hidden = np.zeros((len(self.effect),) * 2)
+        added_covariance = np.zeros((len(self.effect),) * 2)
         for port, process in self.processes.items():
             forces_by_parameter = self._force_by_parameter(port)
-            acting = np.flatnonzero(forces_by_parameter.any(axis=1))
-            if not len(acting):
+            acting_parameters = np.flatnonzero(forces_by_parameter.any(axis=1))
+            if not len(acting_parameters):
                 continue
-            variance = (HIDDEN_SHARE * process.standard_deviation) ** 2
+            hidden_variance = (HIDDEN_SHARE * process.standard_deviation) ** 2
             mean_products = (
-                forces_by_parameter[acting]
-                @ forces_by_parameter[acting].T
+                forces_by_parameter[acting_parameters]
+                @ forces_by_parameter[acting_parameters].T
                 / forces_by_parameter.shape[1]
             )
             # With one parameter the added variance is (hidden variance) / (mean square force per
             # unit), that of a change whose force has the hidden rms. The hidden variance in the
             # denominator keeps it below the prior variance of one.
-            regularised = mean_products + variance * np.eye(len(acting))
-            hidden[np.ix_(acting, acting)] += variance * np.linalg.inv(regularised)
-        return hidden
+            regularised = mean_products + hidden_variance * np.eye(len(acting_parameters))
+            added_covariance[np.ix_(acting_parameters, acting_parameters)] += (
+                hidden_variance * np.linalg.inv(regularised)
+            )
+        return added_covariance
 
     def _force_by_parameter(self, port: int) -> FloatArray:
         """Return the forces (E, T) for a unit of each effect parameter at a port.

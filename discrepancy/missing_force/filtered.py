@@ -1,10 +1,10 @@
 """The Kalman filter of a trial with missing forces at ports: evidence, smoothed forces and states.
 
-A missing force is a Gaussian process in time with standard deviation `size` and correlation time
-`time`: Matern 3/2 with two states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning
-for Signal Processing), or Matern 1/2 with one state. The filter whitens the residuals and the
-columns, which are the derivatives of the readings by unknowns; the unknowns follow from a linear
-regression of the whitened residuals on the whitened columns.
+A missing force is a Gaussian process in time with a standard deviation and a correlation time:
+Matern 3/2 with two states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for
+Signal Processing), or Matern 1/2 with one state if it may jump. The filter whitens the residuals
+and the columns, which are the derivatives of the readings by unknowns; the unknowns follow from a
+linear regression of the whitened residuals on the whitened columns.
 """
 
 from collections.abc import Sequence
@@ -54,7 +54,10 @@ class Process:
 
     @property
     def intensity(self) -> float:
-        """Spectral density of the white noise that drives the last state."""
+        """Spectral density of the white noise that drives the last state [1/s].
+
+        With it the stationary variance of every state is one.
+        """
         return (
             2.0 / self.correlation_time
             if self.may_jump
@@ -513,12 +516,16 @@ def integrate_out_last(
     """
     if not len(precision):
         return products, half_log_determinants
+    # Gaussian integral over the last unknowns: with A their block of the products plus their prior
+    # precisions P, the log determinant of the covariance grows by ln det A - ln det P
     prior_precision = np.maximum(precision, LEAST_PRECISION)
     kept_count = products.shape[-1] - len(prior_precision)
     # Schur complement of the last columns
-    root = np.linalg.cholesky(products[..., kept_count:, kept_count:] + np.diag(prior_precision))
-    projected = np.asarray(np.linalg.solve(root, products[..., kept_count:, :kept_count]))
-    half_log_det_of_block = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
+    block_root = np.linalg.cholesky(
+        products[..., kept_count:, kept_count:] + np.diag(prior_precision)
+    )
+    projected = np.asarray(np.linalg.solve(block_root, products[..., kept_count:, :kept_count]))
+    half_log_det_of_block = np.log(np.diagonal(block_root, axis1=-2, axis2=-1)).sum(-1)
     remaining_half_log_dets = (
         half_log_determinants + half_log_det_of_block - 0.5 * np.log(prior_precision).sum()
     )
@@ -540,7 +547,7 @@ def sum_regressions(filters: Sequence[ForceFilter], rows: Sequence[FloatArray]) 
     groups: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
     for trial_filter, columns in zip(filters, rows, strict=True):
         groups.setdefault(trial_filter.filter_key, []).append((trial_filter, columns))
-    total: FloatArray | float = 0.0
+    sum_of_products: FloatArray | float = 0.0
     log_determinant = 0.0
     # trials of one group have the same gains: one pass of the filter whitens the columns of all
     for group in groups.values():
@@ -551,9 +558,9 @@ def sum_regressions(filters: Sequence[ForceFilter], rows: Sequence[FloatArray]) 
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
         for (trial_filter, _), (begin, end) in zip(group, pairwise(ends), strict=True):
             products_of_trial = products_of_group[begin:end, begin:end]
-            products, half_with_local_unknowns = integrate_out_last(
+            products, half_determinant_with_local = integrate_out_last(
                 products_of_trial, half_log_determinant, trial_filter.trial.local_precision
             )
-            total = total + products
-            log_determinant += float(half_with_local_unknowns)
-    return Regression(np.asarray(total), log_determinant)
+            sum_of_products = sum_of_products + products
+            log_determinant += float(half_determinant_with_local)
+    return Regression(np.asarray(sum_of_products), log_determinant)

@@ -91,18 +91,23 @@ class GapShare:
 
 
 def _share_of(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the share 1 - (after - noise) / (before - noise), element by element.
+    """Return the share of a gap that a hypothesis explains, element by element.
 
-    The numerator is at least zero. The share is zero if `before` is not larger than the noise: then
-    nothing is missing.
+    The share is 1 - (after - noise) / (before - noise), with after - noise at least zero. It is
+    zero if `before` is not larger than `noise`, as there is then no gap that could be explained.
 
     Parameters
     ----------
-    before, after, noise : array
-        The sums of squares without and with the hypothesis, and of noise alone.
+    before, after : array
+        The sums of squares of the gap without and with the hypothesis.
+    noise : array
+        The sums of squares that noise alone gives.
     """
-    gap = before - noise
+    gap_squares = before - noise
     remaining_ratio = np.divide(
-        np.maximum(after - noise, 0.0), gap, out=np.ones_like(gap), where=gap > 0.0
+        np.maximum(after - noise, 0.0),
+        gap_squares,
+        out=np.ones_like(gap_squares),
+        where=gap_squares > 0.0,
     )
     return 1.0 - remaining_ratio

@@ -1,7 +1,8 @@
 """Sets of effects as hypotheses on the missing force: priors, values to try, and columns.
 
-A column is the change of each trial for a unit of an unknown. The force of a law is evaluated along
-the estimated motion of its port, which is taken as known.
+A *column* contains, for each trial, the change of readings and state by an effect, or by a unit of
+an unknown. The force of a law is evaluated along the estimated motion of its port, which is taken
+as known.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -73,23 +74,26 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
     terms = candidate.terms
     if not terms:
         return log(SEARCH.prior_none)
+    # The number of effects has a prior probability, which is divided equally among the sets of this
+    # number, and among the places of each effect.
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
-    shape_price = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
+    shape_penalty = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
     probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_probabilities[len(terms) - 1]
-    number_of_sets = comb(max(effect_count, len(terms)), len(terms))
-    return log(probability_of_length / number_of_sets) - log_places - shape_price
+    set_count = comb(max(effect_count, len(terms)), len(terms))
+    return log(probability_of_length / set_count) - log_places - shape_penalty
 
 
 def values_to_try(term: EffectTerm) -> list[FloatArray]:
     """Return sets of standard normal parameter values (E,) at which an effect is tried."""
-    shape_parameters = [
+    shape_indices = [
         number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
     ]
-    levels = SHAPE_VALUES if len(shape_parameters) < 2 else SHAPE_VALUES[::3]
+    # with several such parameters, only the lowest and the highest value of each
+    levels = SHAPE_VALUES if len(shape_indices) < 2 else SHAPE_VALUES[::3]
     combinations = []
-    for shape_values in list(product(levels, repeat=len(shape_parameters)))[:MOST_COMBINATIONS]:
+    for shape_values in list(product(levels, repeat=len(shape_indices)))[:MOST_COMBINATIONS]:
         values = np.full(len(term.parameters), MAGNITUDE_VALUE)
-        values[shape_parameters] = shape_values
+        values[shape_indices] = shape_values
         combinations.append(values)
     return combinations
 
@@ -319,7 +323,7 @@ class ColumnBuilder:
         patch: ModelPatch,
         acts_on: frozenset[TrialKind] = frozenset(TrialKind),
     ) -> EffectColumn | None:
-        """Return the column of a change of the model along motions.
+        """Return how a change of the model alters each trial, along the estimated motions.
 
         Parameters
         ----------
@@ -330,27 +334,29 @@ class ColumnBuilder:
         patch : ModelPatch
             The change of the model.
         acts_on : frozenset of TrialKind
-            The kinds of trials that it changes.
+            The kinds of trials in which the patch acts; it leaves all others unchanged.
 
         Returns
         -------
         EffectColumn or None
-            The change of each trial; None if the patch is invalid or gives numbers that are not
-            finite.
+            The column: the changes of readings and state in each trial. None if the patch is
+            invalid, or if the changes of the readings are not finite.
         """
-        changes = []
+        trial_columns = []
         try:
             for trial, motion, trial_index in zip(
                 linear_trials.trials, motions, self.trial_indices, strict=True
             ):
                 patch_in_trial = patch.in_trial(trial.name)
-                changes.append(
+                trial_columns.append(
                     self.column_in_trial(trial, motion, trial_index, patch_in_trial, acts_on)
                 )
         except (DiscrepancyError, InvalidPatchError):
             return None
-        is_finite = all(np.all(np.isfinite(change.readings)) for change in changes)
-        return changes if is_finite else None
+        is_finite = all(
+            np.all(np.isfinite(trial_column.readings)) for trial_column in trial_columns
+        )
+        return trial_columns if is_finite else None
 
     def column_in_trial(
         self,
@@ -405,6 +411,7 @@ class ColumnBuilder:
         """
         added_state = np.zeros_like(motion.added_state)
         readings = np.zeros_like(trial.residual)
+        # sum over all laws: the force along the motion, and what it adds to state and readings
         forces: dict[int, FloatArray] = {}
         for law in self.problem.model.forces_at_ports(laws):
             if not isinstance(law, PortForce):
@@ -419,6 +426,7 @@ class ColumnBuilder:
                 0.0 if deviations is None else deviations.speed,
                 motion.forces.get(port, 0.0),
             )
+            # response of the linear system to the force
             added_by_law = trial.state_under_force(port, force)
             added_state += added_by_law
             readings += trial.readings_of_state(added_by_law, {port: force})

@@ -3,7 +3,7 @@
 The forward filter gives the state at a moment by the readings before it, the backward filter the
 information on that state by the readings after it (Fraser and Potter 1969, IEEE Transactions on
 Automatic Control 14, 387-390). Together they give the evidence of all readings, and the state at
-that moment. Readings are taken in one at a time, so that the forward filter inverts no matrix.
+that moment. Readings are processed one at a time, so that the forward filter inverts no matrix.
 Covariance and information are updated in Joseph form; once they have converged they are kept.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
@@ -84,9 +84,10 @@ def discretise(
 
 @callable_when_compiled
 def update_covariance(covariance: FloatArray, row: FloatArray, gain: FloatArray) -> float:
-    """Take a reading into a covariance (n, n) in place, and return the variance of its innovation.
+    """Update a covariance (n, n) in place by one reading, and return the innovation's variance.
 
-    The gain (n,) of the reading is filled; `row` (n,) is the reading for a unit of each state.
+    `row` (n,) is the reading for a unit of each state; its noise has variance one. `gain` (n,) is
+    filled with the Kalman gain.
     """
     covariance_row = covariance @ row
     variance = row @ covariance_row + 1.0
@@ -160,7 +161,7 @@ def filter_forward(
     output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     first : int
-        The first sample whose readings are taken in.
+        The first sample whose readings are processed.
     covariance, mean : (n, n), (n, W) ndarray
         The state after the sample before `first`; for the first sample of a record, the state at
         that sample before its readings.
@@ -221,7 +222,7 @@ def filter_forward(
             if not steady:
                 covariance = transition @ covariance @ transition.T + noises[step_of_sample[k]]
                 covariance = 0.5 * (covariance + covariance.T)
-        # take in the readings one at a time
+        # update by the readings of the sample, one at a time
         for c in range(channel_count):
             if not used[k, c]:
                 continue
@@ -293,7 +294,7 @@ def simulate_inputs(
 
 
 class FilterState(NamedTuple):
-    """What the readings up to a moment say of the state, and their part of the evidence.
+    """The state given the readings before a moment, and the contribution of these to the evidence.
 
     Attributes
     ----------
@@ -314,7 +315,9 @@ class FilterState(NamedTuple):
 
 
 class StateInformation(NamedTuple):
-    """What the readings from a moment on say of the state; see `filter_backward` for the density.
+    """The information on the state at a moment from the readings since then.
+
+    `filter_backward` gives the density.
 
     Attributes
     ----------
@@ -384,7 +387,7 @@ class RecordFilter:
         step_of_sample : (N,) array
             The step that leads to each sample.
         first : int
-            The first sample whose readings are taken in.
+            The first sample whose readings are processed.
         state : FilterState
             The state of the filter before that sample.
         query_samples : (B,) array

@@ -180,15 +180,15 @@ class LinearTrials:
         model's response is in `PortedTrial.shared_derivatives`.
         """
         # without a motion (no entry in `motions`) nothing is added that parameters could change
-        by_trial = [
+        columns_by_trial = [
             _columns_along_motion(trial, motion)
             for trial, motion in zip(self.trials, self.motions, strict=False)
         ]
-        by_trial += [{} for _ in range(len(self.trials) - len(by_trial))]
+        columns_by_trial += [{} for _ in range(len(self.trials) - len(columns_by_trial))]
         for unknown, column in enumerate(self.effect_columns, start=len(self.shared_precision)):
-            for change, columns in zip(column, by_trial, strict=True):
+            for change, columns in zip(column, columns_by_trial, strict=True):
                 columns[unknown] = UnknownColumn(change, 0.0)
-        return by_trial
+        return columns_by_trial
 
     @cached_property
     def regression_rows(self) -> list[FloatArray]:
@@ -197,12 +197,13 @@ class LinearTrials:
         Row 0 is the residual at zero unknowns. The K shared unknowns and those of effects follow,
         then the L unknowns of the trial alone. All are divided by the noise deviations.
         """
-        by_trial = []
+        rows_by_trial = []
         first_local = 1 + len(self.prior_precision)
         for trial_index, trial in enumerate(self.trials):
             row_count = first_local + len(trial.local_derivatives)
             # the rows of one reading lie side by side in memory, as the filter needs them
             rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
+            # changes without an unknown are subtracted from the residual
             readings_without_unknown = [
                 column[trial_index].readings
                 for column in (self.constant_column, self.model_laws_column)
@@ -216,8 +217,8 @@ class LinearTrials:
                 # the change is proportional to (unknown - zero_value): refer the residual to an
                 # unknown of zero
                 rows[0] += zero_value * change.readings
-            by_trial.append(rows)
-        return by_trial
+            rows_by_trial.append(rows)
+        return rows_by_trial
 
     def force_filters(self, processes: Processes) -> list[ForceFilter]:
         """Return the Kalman filter of each trial with given missing forces."""
@@ -344,10 +345,12 @@ class LinearTrials:
         if self.constant_column is not None:
             hypothesis_change = hypothesis_change.plus(self.constant_column[trial_index], 1.0)
         # the model's own laws move the trial, but are not among the forces that the model lacks
-        whole_change = hypothesis_change
+        change_with_model_laws = hypothesis_change
         if self.model_laws_column is not None:
-            whole_change = whole_change.plus(self.model_laws_column[trial_index], 1.0)
-        added_state = whole_change.added_state
+            change_with_model_laws = change_with_model_laws.plus(
+                self.model_laws_column[trial_index], 1.0
+            )
+        added_state = change_with_model_laws.added_state
         assert added_state is not None
         unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
         positions, speeds = trial.port_motion(unknowns, added_state)
@@ -355,7 +358,8 @@ class LinearTrials:
         for port, force, speed in zip(
             processes, smoothed.force_deviations, smoothed.speed_deviations, strict=True
         ):
-            # the last samples have no later readings: their speeds are known less well than others
+            # The last samples have few later readings, so that their deviations are larger: take
+            # that of the sample `INFORMING_SAMPLES` before the end for the whole record.
             deviations[port] = PortDeviations(force, float(speed[-INFORMING_SAMPLES:][0]))
         return TrialMotion(
             added_state=added_state,
@@ -379,8 +383,8 @@ def _columns_along_motion(trial: PortedTrial, motion: TrialMotion) -> dict[int, 
     # gains change the readings of their channel
     readings = trial.readings_of_state(motion.added_state, motion.forces)
     for unknown, channel, scale in trial.gain_unknowns:
-        is_channel = np.eye(readings.shape[1])[channel]
-        change = TrialColumn(readings * scale * is_channel)
+        channel_mask = np.eye(readings.shape[1])[channel]
+        change = TrialColumn(readings * scale * channel_mask)
         columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
     return columns
 

@@ -55,7 +55,8 @@ LONGEST_STEP = 1.5
 CONVERGED_STEP = 0.05
 """Step of a parameter below which the iteration ends, in prior standard deviations."""
 LEAST_DAMPING = 0.2
-"""Least fraction of a step that is taken if successive steps have opposite directions."""
+"""Least fraction of a step that is taken. The fraction is reduced while successive steps have
+opposite directions."""
 HALF_DIFFERENCE = 0.05
 """Half the difference of a standard normal parameter in derivatives of an effect."""
 
@@ -103,7 +104,7 @@ class _WeighedStart(NamedTuple):
 class ForceSearch(MissingForces):
     """The search for the effects that explain the missing forces of a problem."""
 
-    # ---------------------------------------------------------------- what the force is
+    # ---------------------------------------------------------------- ranking of hypotheses
 
     def rank_hypotheses(
         self,
@@ -361,6 +362,7 @@ class ForceSearch(MissingForces):
             else:
                 effect_rms = _rms([change.readings for change in column])
                 gap_rms = gap_of_readings
+            # precision = 1 / (FACTOR_DEVIATION * gap / effect)^2
             precisions.append(min(effect_rms / (FACTOR_DEVIATION * gap_rms), LARGEST_RATIO) ** 2)
         return precisions
 
@@ -390,7 +392,7 @@ class ForceSearch(MissingForces):
         processes = base.processes
         motions = base.motions
         has_converged = False
-        damping = 1.0
+        step_fraction = 1.0
         last_step = np.zeros(len(effect))
         best_hypothesis: ForceHypothesis | None = None
         for step_number in range(MOST_ITERATIONS):
@@ -423,11 +425,11 @@ class ForceSearch(MissingForces):
                 best_hypothesis = hypothesis
             # shorter steps if the direction reverses, longer ones again if not
             if step @ last_step < -0.5 * (last_step @ last_step):
-                damping = max(0.5 * damping, LEAST_DAMPING)
+                step_fraction = max(0.5 * step_fraction, LEAST_DAMPING)
             else:
-                damping = min(1.0, 1.5 * damping)
-            damped_step = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = candidate.add_step(effect, damped_step)
+                step_fraction = min(1.0, 1.5 * step_fraction)
+            shortened_step = step_fraction * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            effect = candidate.add_step(effect, shortened_step)
             effect = np.clip(effect, -LARGEST_EFFECT, LARGEST_EFFECT)
             has_converged = step_number > 0 and _has_converged(step, last_step)
             processes = hypothesis.processes
@@ -513,27 +515,28 @@ def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) ->
     step : (E,) array
         The step from its effect parameters to the solution.
     """
-    unreached = np.where(np.abs(step) > CONVERGED_STEP, step, 0.0)
-    if not unreached.any():
+    # entries of the step that the parameters have not taken yet
+    remaining_step = np.where(np.abs(step) > CONVERGED_STEP, step, 0.0)
+    if not remaining_step.any():
         return hypothesis
-    weighted = np.linalg.lstsq(hypothesis.effect_covariance, unreached, rcond=None)[0]
-    loss = 0.5 * float(unreached @ weighted)
+    weighted_step = np.linalg.lstsq(hypothesis.effect_covariance, remaining_step, rcond=None)[0]
+    loss = 0.5 * float(remaining_step @ weighted_step)
     return replace(hypothesis, log_evidence=hypothesis.log_evidence - loss)
 
 
 def _has_converged(step: FloatArray, last_step: FloatArray) -> bool:
     """Return whether a step of the effect parameters is so short that the iteration may end.
 
-    The limit is ten times lower if the step is not half as long as the previous one, since after
-    slow convergence the sum of the steps that remain is large.
+    The limit is `CONVERGED_STEP`. It is ten times lower if the step is longer than half of the
+    previous one: convergence is then slow, and the sum of all further steps would be large.
 
     Parameters
     ----------
     step, last_step : (E,) array
         The present step, and the previous one.
     """
-    size = float(np.abs(step).max(initial=0.0))
-    last_size = float(np.abs(last_step).max(initial=0.0))
-    if size < 0.5 * last_size:
-        return size < CONVERGED_STEP
-    return size < CONVERGED_STEP * 0.1
+    largest_step = float(np.abs(step).max(initial=0.0))
+    previous_largest_step = float(np.abs(last_step).max(initial=0.0))
+    if largest_step < 0.5 * previous_largest_step:
+        return largest_step < CONVERGED_STEP
+    return largest_step < CONVERGED_STEP * 0.1

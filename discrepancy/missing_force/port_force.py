@@ -77,6 +77,7 @@ def ordering_variables(
         The variables whose share is at least `LEAST_ORDER`, and within `TIED_SHARE` of the largest
         one.
     """
+    # unit standard deviations, so that position and speed of a harmonic motion form a circle
     scaled_position = position / max(float(np.std(position)), 1e-300)
     scaled_speed = speed / max(float(np.std(speed)), 1e-300)
     # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
@@ -125,7 +126,7 @@ class TrialForce:
 
     @property
     def left(self) -> FloatArray:
-        """The part (N,) of the missing force that the law does not explain."""
+        """The part (N,) of the force that the law does not explain; all of it without a law."""
         return self.force if self.law is None else self.force - self.law
 
 
@@ -336,7 +337,7 @@ def missing_force_of_verdict(
     if len({law.place for law in laws}) > 1:
         names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
         at_port = replace(at_port, law=" and ".join(names_at_ports))
-    # without the shares, the force is returned as it is
+    # if the shares cannot be computed, the force is returned without them
     with suppress(*ESTIMATION_ERRORS):
         shares = ForceShares(search)
         held_out = None

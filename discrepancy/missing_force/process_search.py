@@ -17,12 +17,13 @@ Processes = Mapping[int, Process]
 """Missing forces as processes, by the numbers of their ports."""
 
 PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
-"""Prior standard deviations of the logarithms of size and correlation time of a process."""
+"""Prior standard deviations of the logarithms of size and correlation time of a process. They allow
+factors of about 20 in size and 3 in time."""
 PRIOR_LOG_DEVIATIONS = np.array((PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME))
 """Both of these deviations, as an array."""
 START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
 """Logarithms of the factors on size and time that make the grid around the given processes. Small
-sizes are in it because a law leaves only a part of the force that was missing without it."""
+sizes are in it, as only a part of the force remains missing if a law explains the rest."""
 LARGEST_DISTANCE = 5.0
 """Bound of the search, in prior standard deviations from the median."""
 DIFFERENCE = 0.02
@@ -103,9 +104,9 @@ class ProcessSearch:
         time_range : (float, float)
             The shortest and the longest correlation time that the records can show [s].
         """
-        center = logarithms({port: median[port] for port in initial})
-        low = center - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
-        high = center + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
+        log_medians = logarithms({port: median[port] for port in initial})
+        low = log_medians - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
+        high = log_medians + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         shortest, longest = np.log(time_range)
         low[:, 1] = np.clip(low[:, 1], shortest, longest)
         high[:, 1] = np.clip(high[:, 1], shortest, longest)
@@ -142,7 +143,10 @@ class ProcessSearch:
         return self.processes(logs), value
 
     def _best_of_grid(self, logs: FloatArray) -> FloatArray:
-        """Return the best logarithms (P, 2) of a grid, one port after the other."""
+        """Return the best logarithms (P, 2) of a grid about given ones (P, 2).
+
+        The grid of each port is searched in turn, with the other ports at their best values so far.
+        """
         for port in range(len(logs)):
             candidates = []
             for factors in START_FACTORS:
@@ -186,6 +190,8 @@ class ProcessSearch:
     ) -> FloatArray:
         """Return the second differences (2 P, 2 P) of the value, by all pairs of logarithms.
 
+        They are the second derivatives, multiplied by `DIFFERENCE` squared.
+
         Parameters
         ----------
         logs : (P, 2) array
@@ -195,11 +201,13 @@ class ProcessSearch:
         values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
-        offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
-        # central differences on the diagonal, forward ones of both logarithms off it
+        logarithm_steps = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        # on the diagonal: central differences; off the diagonal: forward differences in both
         curvature = np.diag(values_above + values_below - 2.0 * value)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            value_with_both_larger = self.log_posterior(logs + offsets[i] + offsets[k])
+            value_with_both_larger = self.log_posterior(
+                logs + logarithm_steps[i] + logarithm_steps[k]
+            )
             curvature[i, k] = value_with_both_larger - values_above[i] - values_above[k] + value
             curvature[k, i] = curvature[i, k]
         return curvature
@@ -228,8 +236,8 @@ class ProcessSearch:
         step[free_axes] = eigenvectors @ (
             eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), 1e-300)
         )
-        shortening = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        return np.asarray(step.reshape(logs.shape) / shortening)
+        length_ratio = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
+        return np.asarray(step.reshape(logs.shape) / length_ratio)
 
     def _backtrack(
         self, logs: FloatArray, value: float, step: FloatArray

@@ -93,7 +93,7 @@ class ForceShares:
         remaining_rms = _largest_rms([motion.unexplained_forces for motion in motions], ports)
         total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
         law_rms = _largest_rms([motion.law_forces for motion in motions], ports)
-        # in trials where the force of the law is small, its share says nothing about it
+        # trials in which the force of the law is small do not test the law
         is_tested = not law_ports or law_rms**2 > LEAST_FORCE_RATIO * total_rms**2
         of_forces, of_predictions = self._block_sums(
             hypothesis, linear_trials, motions, motions_without
@@ -192,12 +192,16 @@ class ForceShares:
         explain a part of the missing force.
         """
         if held_out not in self._without_effect:
-            whole = self.search.hypothesis_of_all_ports
-            # an unknown without a prior has no bound
-            bound = np.where(whole.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
-            mean = np.clip(whole.solution.mean, -bound, bound)
-            bounded = replace(whole, solution=replace(whole.solution, mean=mean))
-            self._without_effect[held_out] = self.smooth_trials(bounded, held_out=held_out)
+            hypothesis = self.search.hypothesis_of_all_ports
+            # an unknown with a flat prior has no bound
+            bound = np.where(hypothesis.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
+            mean = np.clip(hypothesis.solution.mean, -bound, bound)
+            bounded_hypothesis = replace(
+                hypothesis, solution=replace(hypothesis.solution, mean=mean)
+            )
+            self._without_effect[held_out] = self.smooth_trials(
+                bounded_hypothesis, held_out=held_out
+            )
         return self._without_effect[held_out]
 
     def smooth_trials(
@@ -206,7 +210,7 @@ class ForceShares:
         """Return the trials, and the motion and unexplained force of each with a hypothesis.
 
         The unexplained force has the standard deviation of the force that is missing without any
-        effect, so that it can take up all that the hypothesis does not explain.
+        effect, so that it can describe all that the hypothesis does not explain.
 
         Parameters
         ----------
@@ -223,6 +227,7 @@ class ForceShares:
         builder, linear_trials = self._held_out
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
         motions = linear_trials.smooth(processes, solution).motions
+        # the laws act along the motion, which in turn depends on their force: iterate
         for _ in range(SMOOTHING_ROUNDS):
             effects_column = None
             if len(hypothesis.effect):

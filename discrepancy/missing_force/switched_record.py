@@ -19,8 +19,8 @@ from .kalman import FilterState, RecordFilter, StateInformation, discretise, joi
 from .linear_trials import LinearTrials
 
 CHANGE_PRICE = 4.0
-"""Log odds against a change of a path, besides the prior of the sample at which it lies [nat]. With
-4, one change in about 55 is believed without any evidence."""
+"""Log odds against a change of a path, in addition to the prior of its sample [nat]. With 4, the
+prior odds of a change are 1 to exp(4) = 55."""
 MOST_GRID_INTERVALS = 40
 """Largest number of intervals of the grid on which stretches begin and end."""
 MOST_FILTER_STEPS = 400_000
@@ -35,7 +35,7 @@ ForcePair = tuple[Process, Process]
 
 
 class TrialProducts(NamedTuple):
-    """What a trial says of the K shared unknowns: the inner products of its whitened columns.
+    """The information of a trial on the K shared unknowns: products of its whitened columns.
 
     Attributes
     ----------

@@ -6,7 +6,7 @@ parameter changes the response of the model (`shared_derivatives`) and the motio
 forces add to it (`system_derivatives`); both together are exact along the actual motion.
 
 Terms and shapes: a port is a place where a force can act. An interval between two of the N samples
-is divided into `parts` substeps; their ends are the F = (N - 1) parts + 1 fine stamps. The added
+is divided into substeps; their ends are the F = (N - 1) substeps + 1 fine stamps. The added
 state (F, n) is the state of the linear system that forces at ports add to the model's response. A
 column is the change of the readings (N, C) for a unit of one unknown.
 """
@@ -43,7 +43,7 @@ HALF_DIFFERENCE = 1e-3
 """Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
-"""Forces by port of a trial without any."""
+"""The forces by port of a trial in which no force acts: an empty mapping."""
 
 
 class ColouredNoise(NamedTuple):
@@ -318,7 +318,7 @@ class PortedTrial:
         start = np.zeros(len(system_derivative.generator))
         if self.begins_at_rest:
             start = -np.linalg.lstsq(self.system.generator, inputs[0], rcond=1e-12)[0]
-        # only these states have an input: the others need no column in `_moved`
+        # all other states have no input and are left out
         driven_states = np.flatnonzero(np.any(inputs, axis=0))
         state_derivative = self._state_under_inputs(
             start, np.eye(len(start))[:, driven_states], inputs[:, driven_states]
@@ -453,15 +453,15 @@ def correlated_noise_part(
         [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_CORRELATION)]
     )
     # up to a common factor, the autocovariances at lags of 0, 1 and 2 samples
-    covariances = [
+    autocovariances = [
         float(impulse_response[: len(impulse_response) - lag] @ impulse_response[lag:])
         for lag in range(3)
     ]
-    if not 0.0 < covariances[2] < covariances[1]:
+    if not 0.0 < autocovariances[2] < autocovariances[1]:
         return None
     # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
-    decay = covariances[2] / covariances[1]
-    share = covariances[1] / decay / covariances[0]
+    decay = autocovariances[2] / autocovariances[1]
+    share = autocovariances[1] / decay / autocovariances[0]
     return ColouredNoise(
         channel=channel,
         share=min(share, 1.0 - LEAST_WHITE_SHARE),
@@ -483,10 +483,12 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     """
     data = problem.trials[trial_index]
     trial = data.trial
+    # linear system with ports, at the point
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
     system, system_derivatives = _ported_system(problem, trial, point.shared)
     system = _with_gains(system, gains)
     substeps = _substep_count(system, trial.time)
+    # response of the model, about which the missing forces are added
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
     residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
     deviation = trial.noise_factor * np.array(
@@ -580,10 +582,10 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[Ga
 
 def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[ColouredNoise]:
     """Return the parts of the channels' noises that are correlated in time."""
-    parts = [
+    noise_parts = [
         correlated_noise_part(channel, noise, interval) for channel, noise in enumerate(noises)
     ]
-    return [part for part in parts if part is not None]
+    return [noise_part for noise_part in noise_parts if noise_part is not None]
 
 
 def _substep_count(system: PortedSystem, time: FloatArray) -> int:
@@ -634,15 +636,17 @@ def _port_motion(
         return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, substeps))
 
     local = point.local[trial_index]
-    at_point = motion(point.shared, local)
+    motion_at_point = motion(point.shared, local)
     by_unknowns = {}
     for k in range(shared.parameter_count):
-        by_unknowns[k] = (motion(with_step(point.shared, k), local) - at_point) / PARAMETER_STEP
+        by_unknowns[k] = (
+            motion(with_step(point.shared, k), local) - motion_at_point
+        ) / PARAMETER_STEP
     # the first unknowns of a trial are the zeros of its channels, which do not move the ports
     for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
         stepped_motion = motion(point.shared, with_step(local, k))
-        by_unknowns[shared.unknown_count + k] = (stepped_motion - at_point) / PARAMETER_STEP
-    return at_point, by_unknowns
+        by_unknowns[shared.unknown_count + k] = (stepped_motion - motion_at_point) / PARAMETER_STEP
+    return motion_at_point, by_unknowns
 
 
 def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:

@@ -68,7 +68,7 @@ def gap_windows(
         return windows_of_residuals(residuals, seed=seed)
     try:
         windows = _windows_of_missing_force(problem.with_trials(dynamic_trials), fit)
-    # the windows are an addition to the verdict: if they cannot be computed, the residuals serve
+    # windows are an addition to the verdict: if the force cannot be estimated, use the residuals
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):
         return windows_of_residuals(residuals, seed=seed)
     flight = frozenset({TrialKind.FLIGHT})
@@ -92,14 +92,16 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
         search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence
     )
     evidence_of_law = _evidence_of_law(search, port, fit)
-    channels = [data.trial.channels for data in problem.trials]
+    channels_by_trial = [data.trial.channels for data in problem.trials]
     port_number, hypothesis = _port_or_channel_error(
-        search.ports.index(port), search.hypothesis_with_jumps(port), channels
+        search.ports.index(port), search.hypothesis_with_jumps(port), channels_by_trial
     )
+    # no windows without a missing force
     if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
         return ()
     process = hypothesis.processes[port_number]
     best_events = find_events(hypothesis.linear_trials, port_number, process, evidence_of_law)
+    # the part of the readings that the force causes gives the size of each window
     readings_by_force = []
     for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
         force = motion.forces[port_number]
@@ -108,7 +110,7 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
                 trial.state_under_force(port_number, force), {port_number: force}
             )
         )
-    return _windows_of_events(best_events, channels, readings_by_force, with_effect=False)
+    return _windows_of_events(best_events, channels_by_trial, readings_by_force, with_effect=False)
 
 
 def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float:

@@ -145,7 +145,10 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
 
 
 def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[ChannelFit, ...]:
-    """Return the rms residuals of each channel at the prior means and at the optimum."""
+    """Return the rms residuals of each channel at the prior means and at the optimum.
+
+    They are in noise deviations; nan for a channel without a noise record.
+    """
     marginal = posterior.marginal
     optimum = posterior.optima[0].point.shared[marginal.parameter_indices]
     prior_mean = np.zeros_like(optimum)
@@ -157,14 +160,19 @@ def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[Chan
         at_prior_mean = marginal.fit_nuisances(prior_mean, problem_of_role)
         at_optimum = marginal.fit_nuisances(optimum, problem_of_role)
         for index, name in enumerate(problem_of_role.channel_names):
-            count = int(problem_of_role.sample_counts[index])
-            if not count:
+            sample_count = int(problem_of_role.sample_counts[index])
+            if not sample_count:
                 continue
-            before = after = np.nan
+            # without a noise record, residuals have no noise deviation to be compared with
+            rms_at_prior_mean = rms_at_optimum = np.nan
             if problem_of_role.record_freedom[index] > 0.0:
-                before = float(np.sqrt(at_prior_mean.squares_by_channel[index] / count))
-                after = float(np.sqrt(at_optimum.squares_by_channel[index] / count))
-            channel_fits.append(ChannelFit(name, role, count, before, after))
+                rms_at_prior_mean = float(
+                    np.sqrt(at_prior_mean.squares_by_channel[index] / sample_count)
+                )
+                rms_at_optimum = float(np.sqrt(at_optimum.squares_by_channel[index] / sample_count))
+            channel_fits.append(
+                ChannelFit(name, role, sample_count, rms_at_prior_mean, rms_at_optimum)
+            )
     return tuple(channel_fits)
 
 
@@ -258,6 +266,7 @@ def _range_findings(
     optimum = posterior.optima[0]
     fitted_parameters = optimum.point.shared[marginal.parameter_indices]
     deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.parameter_indices]), 1e-12)
+    # probability of the Gaussian posterior that lies outside of the range before it is truncated
     probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
     probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
     is_determined = remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
@@ -269,6 +278,7 @@ def _range_findings(
                 f"{prior.high:g}, and is cut off there: widen the range if the model holds beyond "
                 "it."
             )
+    # failures of the model within the range, near the optimum
     refusals = [
         refusal
         for refusal in marginal.refusals
@@ -292,8 +302,8 @@ def _optimum_findings(
     optima = posterior.optima
     if len(optima) > 1:
         evidence = np.array([optimum.log_evidence for optimum in optima])
-        weight = np.exp(evidence - evidence.max())
-        probabilities = (weight / weight.sum()).tolist()
+        relative_evidence = np.exp(evidence - evidence.max())
+        probabilities = (relative_evidence / relative_evidence.sum()).tolist()
         phrases = []
         for optimum, probability in zip(optima, probabilities, strict=True):
             values = marginal.physical_values(optimum.point.shared[marginal.parameter_indices])
@@ -331,7 +341,7 @@ def _undetermined_findings(
 
 
 def _distance_from_optimum(posterior: ParameterPosterior, u: FloatArray) -> float:
-    """Return the distance of scaled parameters from the best optimum [standard deviations].
+    """Return the Mahalanobis distance of parameters from the best optimum [standard deviations].
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class TruncatedGaussian:
     def tilt(self) -> FloatArray:
         """Shift (P,) of the standard normal variables of draws towards the mode within the range.
 
-        Draws without a shift would be rare near the mode if the mean is outside the range
+        If the mean is outside the range, draws without a shift would rarely be near the mode
         (exponential tilting, Botev 2017, J. R. Statist. Soc. B 79 (1)).
         """
         inverse_factor = np.linalg.inv(self.factor)
@@ -52,6 +52,9 @@ class TruncatedGaussian:
         # mode within the range: least (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2
         mode = lsq_linear(inverse_factor, inverse_factor @ self.mean, bounds, method="bvls").x
         normal_at_mode = inverse_factor @ (mode - self.mean)
+        # The mode is x = L^T l, with the Lagrange multipliers l of the ends of the range: x_i is
+        # the sum of L_ji l_j over j >= i. The truncation of parameter i itself moves a draw by
+        # L_ii l_i. The shift is the remaining part, which anticipates the later parameters.
         return np.asarray(
             normal_at_mode - np.diag(self.factor) * (inverse_factor.T @ normal_at_mode)
         )
@@ -138,9 +141,9 @@ class TruncatedGaussian:
         """
         uniform = generator.random((CANDIDATES_PER_DRAW * count, len(self.mean)))
         candidates, log_weight = self.weighted_draws(self.mean, uniform)
-        cumulative = np.cumsum(softmax(log_weight))
-        chosen = np.searchsorted(cumulative, stratified(generator, count))
-        return np.asarray(candidates[np.minimum(chosen, len(candidates) - 1)])
+        cumulative_weights = np.cumsum(softmax(log_weight))
+        chosen_indices = np.searchsorted(cumulative_weights, stratified(generator, count))
+        return np.asarray(candidates[np.minimum(chosen_indices, len(candidates) - 1)])
 
     def draws_with_means(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return one draw (N, P) for each of several means, with the covariance of this Gaussian.
@@ -160,8 +163,8 @@ class TruncatedGaussian:
         candidates, log_weight = self.weighted_draws(
             np.broadcast_to(means, shape), generator.random(shape)
         )
-        chosen = np.argmax(log_weight + generator.gumbel(size=log_weight.shape), axis=0)
-        return np.asarray(candidates[chosen, np.arange(len(means))])
+        chosen_indices = np.argmax(log_weight + generator.gumbel(size=log_weight.shape), axis=0)
+        return np.asarray(candidates[chosen_indices, np.arange(len(means))])
 
 
 MOMENT_DRAWS = 1024

@@ -143,7 +143,8 @@ class MarginalPosterior:
             fitted = self.fit_nuisances(u)
         except (FitError, ModelError):
             return np.inf
-        # the evidence of the fit does not contain the prior of the fixed parameters
+        # The evidence of the fit does not contain the prior of the fixed parameters, which are
+        # standard normal: -ln prior is |u|^2 / 2.
         return 0.5 * float(u @ u) - fitted.log_evidence
 
     def find_optima(self, seed: int) -> list[CandidateFit]:
@@ -181,9 +182,9 @@ class MarginalPosterior:
                 evidence = self.laplace_gaussian(fitted, all_fitted).log_evidence
                 optima.append(replace(fitted, log_evidence=evidence))
         optima.sort(key=lambda optimum: -optimum.log_evidence)
-        best = optima[0]
-        self._start_point = best.point
-        least_evidence = best.log_evidence - LARGEST_EVIDENCE_GAP
+        best_optimum = optima[0]
+        self._start_point = best_optimum.point
+        least_evidence = best_optimum.log_evidence - LARGEST_EVIDENCE_GAP
         return [optimum for optimum in optima if optimum.log_evidence > least_evidence]
 
     def _is_same_optimum(self, first: CandidateFit, second: CandidateFit) -> bool:
@@ -192,10 +193,10 @@ class MarginalPosterior:
         They are if their distance in posterior standard deviations (Mahalanobis) is below
         `OPTIMUM_DISTANCE`.
         """
-        free = self.parameter_indices
-        shift = first.point.shared[free] - second.point.shared[free]
-        covariance = first.covariance[np.ix_(free, free)]
-        return bool(shift @ np.linalg.solve(covariance, shift) < OPTIMUM_DISTANCE**2)
+        indices = self.parameter_indices
+        difference = first.point.shared[indices] - second.point.shared[indices]
+        covariance = first.covariance[np.ix_(indices, indices)]
+        return bool(difference @ np.linalg.solve(covariance, difference) < OPTIMUM_DISTANCE**2)
 
     def laplace_gaussian(
         self, fitted: CandidateFit, is_fitted: NDArray[np.bool_]

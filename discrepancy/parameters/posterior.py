@@ -69,11 +69,13 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     """Return draws of the posterior of a problem's parameters.
 
     There are three procedures. A single parameter is drawn by quadrature of its density. Several
-    parameters with one optimum are drawn from the Gaussian about it, truncated at the range, if the
-    energy along its principal axes is that of a Gaussian. If not, the parameter of the largest
+    parameters with one optimum are drawn from the Gaussian about it, truncated at the parameters'
+    ranges, if the energy (-ln of the density) along its principal axes is that of a Gaussian.
+    If not, the parameter of the largest
     variance is drawn by quadrature, and the others from a truncated Gaussian given its value (a
     nested Laplace approximation, Rue, Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)).
-    Several optima are drawn from one Gaussian each, weighted by their evidence.
+    If there are several optima, the draws are from a mixture of one Gaussian about each optimum,
+    weighted by evidence.
 
     Parameters
     ----------
@@ -112,11 +114,11 @@ def _draws_of_gaussians(
 ) -> FloatArray:
     """Return draws (count, P) from a mixture of Gaussians that are weighted by their evidence."""
     probabilities = softmax([gaussian.log_evidence for gaussian in gaussians])
-    chosen = generator.choice(len(gaussians), count, p=probabilities)
+    gaussian_of_draw = generator.choice(len(gaussians), count, p=probabilities)
     draws = np.empty((count, len(gaussians[0].mean)))
-    for index in np.unique(chosen):  # a Gaussian of a small weight may have no draw
-        is_of_gaussian = chosen == index
-        draws[is_of_gaussian] = gaussians[index].draws(int(np.sum(is_of_gaussian)), generator)
+    for index in np.unique(gaussian_of_draw):  # a Gaussian of a small weight may have no draw
+        is_from_gaussian = gaussian_of_draw == index
+        draws[is_from_gaussian] = gaussians[index].draws(int(np.sum(is_from_gaussian)), generator)
     return draws
 
 
@@ -138,10 +140,10 @@ def is_gaussian(marginal: MarginalPosterior, gaussian: TruncatedGaussian) -> boo
     axes = (directions * np.sqrt(np.maximum(variances, 0.0))).T
     energy_at_mean = marginal(mean) - gaussian.energy(mean)
     for axis, (distance, allowed_error), side in product(axes, GAUSSIAN_CHECKS, (-1.0, 1.0)):
-        step = side * distance * axis
-        distance_to_end = np.where(step > 0.0, gaussian.high - mean, mean - gaussian.low)
-        largest_step_fraction = distance_to_end / np.maximum(np.abs(step), 1e-300)
-        point = mean + min(1.0, largest_step_fraction.min()) * step
+        offset = side * distance * axis
+        distance_to_end = np.where(offset > 0.0, gaussian.high - mean, mean - gaussian.low)
+        largest_fraction = distance_to_end / np.maximum(np.abs(offset), 1e-300)
+        point = mean + min(1.0, largest_fraction.min()) * offset
         point = np.clip(point, gaussian.low, gaussian.high)
         error = marginal(point) - gaussian.energy(point) - energy_at_mean
         if not abs(error) < allowed_error:
@@ -181,32 +183,35 @@ def _draws_by_quadrature(
     """
     nodes = _QuadratureNodes(index, marginal, optima[0])
     initial_nodes = _initial_nodes(marginal, optima, index)
+    # first nodes, from the optimum outwards, as each fit begins at the nearest fitted node
     for node in sorted(initial_nodes, key=lambda node: abs(node - nodes.centre)):
         nodes.add_node(node)
-    points, distribution = _cumulative_distribution(nodes.energy)
+    distribution_points, distribution = _cumulative_distribution(nodes.energy)
+    # further nodes, in the middle of intervals with much probability
     while len(nodes.energy) < MOST_NODES:
         probabilities = np.diff(
             distribution[::INTERPOLATION_INTERVALS]
         )  # between neighbouring nodes
-        largest = int(np.argmax(probabilities))
-        if not probabilities[largest] > LARGEST_MASS:
+        interval = int(np.argmax(probabilities))
+        if not probabilities[interval] > LARGEST_MASS:
             break
-        left, right = sorted(nodes.energy)[largest : largest + 2]
-        nodes.add_node(0.5 * (left + right))
-        points, distribution = _cumulative_distribution(nodes.energy)
-    quadrature_values = np.interp(stratified(generator, count), distribution, points)
+        lower_node, upper_node = sorted(nodes.energy)[interval : interval + 2]
+        nodes.add_node(0.5 * (lower_node + upper_node))
+        distribution_points, distribution = _cumulative_distribution(nodes.energy)
+    # the parameter of the quadrature: inverse of its cumulative distribution
+    quadrature_values = np.interp(stratified(generator, count), distribution, distribution_points)
 
     # the other parameters: their mean interpolates those at the nodes, and their covariance is
     # that at the nearest node
     node_values = np.array(sorted(nodes.gaussians))
     gaussians = [nodes.gaussians[node] for node in node_values.tolist()]
     means = np.array([gaussian.mean for gaussian in gaussians])
-    inner_values = np.clip(quadrature_values, node_values[0], node_values[-1])
-    means_of_draws = Akima1DInterpolator(node_values, means)(inner_values)
+    values_within_nodes = np.clip(quadrature_values, node_values[0], node_values[-1])
+    means_of_draws = Akima1DInterpolator(node_values, means)(values_within_nodes)
     draws: FloatArray = np.insert(means_of_draws, index, quadrature_values, axis=1)
-    nearest = np.abs(quadrature_values[:, None] - node_values).argmin(axis=1)
+    nearest_node = np.abs(quadrature_values[:, None] - node_values).argmin(axis=1)
     for node_number, gaussian in enumerate(gaussians):
-        draws_at_node = np.flatnonzero(nearest == node_number)
+        draws_at_node = np.flatnonzero(nearest_node == node_number)
         entries_of_others = np.ix_(draws_at_node, ~nodes.is_of_quadrature)
         draws[entries_of_others] = gaussian.draws_with_means(draws[entries_of_others], generator)
     return draws
@@ -229,11 +234,12 @@ class _QuadratureNodes:
     centre : float
         The value of the parameter at the optimum.
     is_of_quadrature : (P,) ndarray of bool
-        True for the parameter of the quadrature.
+        A mask that is True for the parameter of the quadrature, and False for the others.
     energy : dict of float to float
-        The energy by node; infinite if the model cannot be evaluated there.
+        The energy (-ln of the posterior density) by node [nat]; infinite if the fit at the node
+        failed.
     gaussians : dict of float to TruncatedGaussian
-        The other parameters by node.
+        The Gaussian of the other parameters, by node.
     """
 
     def __init__(self, index: int, marginal: MarginalPosterior, best: CandidateFit) -> None:
@@ -245,19 +251,29 @@ class _QuadratureNodes:
         self._points = {self.centre: best.point}
 
     def add_node(self, node: float) -> None:
-        """Add a node with its energy; the fit there begins at the point of the nearest node."""
-        nearest = min(self._points, key=lambda visited: abs(visited - node))
+        """Fit the other parameters and the nuisances at a node, and store its energy and Gaussian.
+
+        The fit starts from the fitted point of the nearest node. If the fit fails, the energy of
+        the node is infinite, so that its density is zero, and no point or Gaussian is stored.
+
+        Parameters
+        ----------
+        node : float
+            The value of the parameter of the quadrature, in prior deviations from its prior mean.
+        """
+        nearest_node = min(self._points, key=lambda fitted_node: abs(fitted_node - node))
         self.energy[node] = np.inf
         with suppress(FitError, ModelError):
-            fitted = self._marginal.fit_nuisances(
+            fit_at_node = self._marginal.fit_nuisances(
                 np.where(self.is_of_quadrature, node, 0.0),
                 is_fixed=self.is_of_quadrature,
-                start_point=self._points[nearest],
+                start_point=self._points[nearest_node],
             )
-            gaussian = self._marginal.laplace_gaussian(fitted, ~self.is_of_quadrature)
-            self._points[node] = fitted.point
+            gaussian = self._marginal.laplace_gaussian(fit_at_node, ~self.is_of_quadrature)
+            self._points[node] = fit_at_node.point
             self.gaussians[node] = gaussian
-            # the evidence does not contain the prior of the parameter that is fixed at the node
+            # The evidence does not contain the prior of the parameter that is fixed at the node.
+            # The scaled parameter is standard normal, so that its -ln prior is node^2 / 2.
             self.energy[node] = 0.5 * node**2 - gaussian.log_evidence
 
 
@@ -281,14 +297,14 @@ def _initial_nodes(
         np.linspace(max(low, -QUADRATURE_RANGE), min(high, QUADRATURE_RANGE), NODES_OF_PRIOR)
     ]
     for optimum in optima:
-        deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
-        about_optimum = optimum.point.shared[shared_index] + deviation * np.linspace(
+        posterior_deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
+        about_optimum = optimum.point.shared[shared_index] + posterior_deviation * np.linspace(
             -3.0, 3.0, NODES_PER_OPTIMUM
         )
         node_grids.append(np.clip(about_optimum, low, high))
     nodes = np.unique(np.concatenate(node_grids))
-    is_apart = np.diff(nodes, prepend=-np.inf) > LEAST_NODE_DISTANCE * (nodes[-1] - nodes[0])
-    return [float(node) for node in nodes[is_apart]]
+    is_separate = np.diff(nodes, prepend=-np.inf) > LEAST_NODE_DISTANCE * (nodes[-1] - nodes[0])
+    return [float(node) for node in nodes[is_separate]]
 
 
 def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
@@ -311,6 +327,7 @@ def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray,
     nodes = np.array(sorted(energy))
     energies = np.array([energy[node] for node in nodes.tolist()])
     energies = np.minimum(energies - energies.min(), LARGEST_ENERGY)
+    # density at the nodes and at equally spaced points between them
     fractions = np.linspace(0.0, 1.0, INTERPOLATION_INTERVALS, endpoint=False)
     between_nodes = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
     points = np.append(between_nodes, nodes[-1])

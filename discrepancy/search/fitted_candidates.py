@@ -99,15 +99,21 @@ class FittedCandidates:
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
         """Return the probability of each set of effects over all places, in descending order."""
-        scores: dict[tuple[str, ...], list[float]] = {}
+        scores_by_set: dict[tuple[str, ...], list[float]] = {}
         for fit in self.compared_fits().values():
-            scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
+            scores_by_set.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
         log_weights = {
-            identifiers: float(logsumexp(values)) for identifiers, values in scores.items()
+            identifiers: float(logsumexp(set_scores))
+            for identifiers, set_scores in scores_by_set.items()
         }
         log_total = float(logsumexp(list(log_weights.values())))
-        ordered = sorted(log_weights.items(), key=lambda entry: -entry[1])
-        return {identifiers: min(exp(value - log_total), 1.0) for identifiers, value in ordered}
+        sets_by_probability = sorted(
+            log_weights.items(), key=lambda set_and_weight: -set_and_weight[1]
+        )
+        return {
+            identifiers: min(exp(log_weight - log_total), 1.0)
+            for identifiers, log_weight in sets_by_probability
+        }
 
     def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
         """Record a fit if its evidence is above that of an earlier fit of the same candidate."""

@@ -21,7 +21,8 @@ def canonical_relatives(
 ) -> list[ForceHypothesis]:
     """Return the hypotheses of one effect with the family and place of a leading effect.
 
-    Only effects with a magnitude and with their canonical shape are returned.
+    They are fitted again from other magnitudes, so only effects with a magnitude are returned, and
+    of these only the ones with a canonical shape.
 
     Parameters
     ----------

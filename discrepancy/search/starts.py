@@ -106,14 +106,16 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     places = effect.places(setting)
     has_few_places = len(places) <= SEARCH.few_places
     other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
-    count = SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
+    start_count = (
+        SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
+    )
     best_changes: list[ScreenedChange] = []
     for place in places:
         best_of_place: list[ScreenedChange] = []
         for change in screen.changes_on_grid(
             EffectTerm(effect, place), with_small_magnitude=has_few_places
         ):
-            changes = [change]
+            tried_changes = [change]
             is_nonlinear = change.squared_size > SEARCH.first_order_change and changes_structure(
                 effect, setting
             )
@@ -121,13 +123,13 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
             if has_few_places and is_nonlinear:
                 with suppress(DiscrepancyError):
                     small_change, _ = screen.shrink_change(change)
-                    changes.append(small_change)
-            nonzero_changes = [change for change in changes if change.squared_size > 0.0]
+                    tried_changes.append(small_change)
+            nonzero_changes = [change for change in tried_changes if change.squared_size > 0.0]
             best_of_place = sorted(
                 [*best_of_place, *nonzero_changes], key=_expected_objective_change
-            )[:count]
+            )[:start_count]
         best_changes.extend(best_of_place)
-    return sorted(best_changes, key=_expected_objective_change)[:count]
+    return sorted(best_changes, key=_expected_objective_change)[:start_count]
 
 
 def _expected_objective_change(change: ScreenedChange) -> float:
@@ -167,13 +169,14 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         that are projections on nuisances count negative, as they are subtracted from those of
         readings.
     """
-    best: dict[tuple[str, str], ScreenedPair] = {}
+    best_by_effects: dict[tuple[str, str], ScreenedPair] = {}
     for first, second in combinations(changes, 2):
-        key = (first.term.effect.identifier, second.term.effect.identifier)
+        effect_names = (first.term.effect.identifier, second.term.effect.identifier)
         inner_product = float(first.vector * sign @ second.vector)
         gram = np.array([[first.squared_size, inner_product], [inner_product, second.squared_size]])
         overlap = np.array([first.overlap, second.overlap])
-        if key[0] == key[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
+        # no pair: the same effect twice, or two effects of parallel changes
+        if effect_names[0] == effect_names[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
         # least misfit F(s) = F(0) - b^T s + s^T G s / 2: s = G^-1 b, F(s) - F(0) = -b^T s / 2
         best_scales = np.linalg.solve(gram, overlap)
@@ -182,14 +185,17 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
             for factor, change in zip(best_scales, (first, second), strict=True)
         ]
         misfit_change = -0.5 * float(overlap @ best_scales)
-        is_best_of_effects = key not in best or misfit_change < best[key].misfit
+        is_best_of_effects = (
+            effect_names not in best_by_effects
+            or misfit_change < best_by_effects[effect_names].misfit
+        )
         if all(has_possible_sign) and is_best_of_effects:
-            best[key] = ScreenedPair(
+            best_by_effects[effect_names] = ScreenedPair(
                 misfit_change,
                 _with_scale(first, best_scales[0]),
                 _with_scale(second, best_scales[1]),
             )
-    return sorted(best.values(), key=lambda pair: pair.misfit)
+    return sorted(best_by_effects.values(), key=lambda pair: pair.misfit)
 
 
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
@@ -240,12 +246,12 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
         parameter_count = len(term.parameters)
         level_counts = SEARCH.grid_levels_far_from_data
         level_count = level_counts[min(parameter_count, len(level_counts) - 1)]
-        # quantiles of the prior
+        # medians of intervals of equal prior probability
         levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
         for values in product(levels, repeat=parameter_count):
             start = start_with_added_effect(base, term, np.array(values))
             with suppress(DiscrepancyError):  # the effect is larger than the model allows
-                value = objective(problem, start.candidate, start.point)
-                valued_starts.append((value, start))
+                start_objective = objective(problem, start.candidate, start.point)
+                valued_starts.append((start_objective, start))
     valued_starts.sort(key=lambda valued_start: valued_start[0])
     return [start for _, start in valued_starts[: SEARCH.starts_far_from_data]]

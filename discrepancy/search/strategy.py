@@ -106,6 +106,7 @@ class Search(FittedCandidates):
         if self._has_large_residuals(base):
             screened = tuple(effect for effect in effects if not changes_structure(effect, setting))
         fits = self._fit_from_screen(base, screened)
+        # far from the truth: also from the best points of a grid
         is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
         if self._has_large_residuals(base) or (self._is_far_from_truth(base) and not is_explained):
             unbiased_base = self._with_unbiased_nuisances(base)
@@ -115,6 +116,7 @@ class Search(FittedCandidates):
                     starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
             starts_by_effect = [starts for starts in starts_by_effect if starts]
             fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
+        # in ascending order of score, so that the best fit of each set replaces the others
         best_by_effects: dict[tuple[str, ...], CandidateFit] = {}
         for fit in sorted(fits, key=self.score):
             self.record_fit(fit, exact=False)
@@ -122,7 +124,7 @@ class Search(FittedCandidates):
         return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
 
     def _has_large_residuals(self, base: CandidateFit) -> bool:
-        """Return whether χ² per sample of a fit is above `SEARCH.far`: much more than noise."""
+        """Return whether χ² per sample of a fit is above `SEARCH.far_chi_square`."""
         return base.chi_square > SEARCH.far_chi_square * float(self.problem.sample_counts.sum())
 
     def _is_far_from_truth(self, base: CandidateFit) -> bool:
@@ -154,6 +156,7 @@ class Search(FittedCandidates):
         """
         has_effects = bool(base.candidate.terms)
         least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
+        # screen all effects
         screen = Screen(self.problem, base)
         changes_by_effect = []
         for effect in report_each(
@@ -167,6 +170,7 @@ class Search(FittedCandidates):
         changes_by_effect.sort(
             key=lambda changes: -max((change.gain for change in changes), default=0.0)
         )
+        # fit the promising ones
         starts_by_effect = []
         for changes in changes_by_effect:
             if changes:
@@ -180,7 +184,7 @@ class Search(FittedCandidates):
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
         """Return a base whose nuisances are not distorted by the errors of the model.
 
-        The nuisances of a wrong model take up part of its error, which makes them a bad start. They
+        The nuisances of a wrong model compensate a part of its error, and are a bad start. They
         are taken from a fit that includes a free missing force. If a trial is at rest, or no force
         can be estimated, they are set to their prior means.
         """
@@ -212,7 +216,9 @@ class Search(FittedCandidates):
             The decrease of the objective below that of the base which a fit must reach [nat].
         """
         best_fits = []
-        give_up = base.objective - least_gain
+        # a fit ends early if it is not expected to come below this objective, which falls with the
+        # best fit so far
+        objective_limit = base.objective - least_gain
         for starts in report_each(
             self.on_progress,
             starts_by_effect,
@@ -226,11 +232,13 @@ class Search(FittedCandidates):
                     start.point,
                     nearby_derivatives=base.trial_derivatives or None,
                     iterations=SEARCH.rough_fit_iterations,
-                    objective_limit=give_up,
+                    objective_limit=objective_limit,
                 )
                 if rough is not None:  # None if the effect is larger than the model allows
                     fits.append(rough)
-                    give_up = min(give_up, rough.objective + SEARCH.largest_rough_deficit)
+                    objective_limit = min(
+                        objective_limit, rough.objective + SEARCH.largest_rough_deficit
+                    )
             if fits:
                 best_fits.append(max(fits, key=self.score))
         return best_fits
@@ -253,13 +261,17 @@ class Search(FittedCandidates):
         # far from the truth, the scores after few steps are only roughly in order
         margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor))
         least_score = max(best_score - margin, floor)
-        chosen = [fit for fit in rough[: SEARCH.most_exact_fits] if self.score(fit) > least_score]
-        exact = []
+        promising_fits = [
+            fit for fit in rough[: SEARCH.most_exact_fits] if self.score(fit) > least_score
+        ]
+        exact_fits = []
         for fit in report_each(
-            self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
+            self.on_progress,
+            promising_fits,
+            lambda fit: f"fitting {fit.candidate.description} to the end",
         ):
-            exact.append(self.fit_exactly(fit))
-        return sorted(exact, key=lambda fit: -self.score(fit))
+            exact_fits.append(self.fit_exactly(fit))
+        return sorted(exact_fits, key=lambda fit: -self.score(fit))
 
     def refine_time_steps(self) -> None:
         """Halve the time steps until their error in the best candidate is small against the noise.
@@ -315,10 +327,11 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        named = force_search.rank_hypotheses(self.effects, self.on_progress)
+        ranked_hypotheses = force_search.rank_hypotheses(self.effects, self.on_progress)
         self.force_hypotheses = refine_hypotheses(
-            force_search, named, len(self.effects), self.on_progress
+            force_search, ranked_hypotheses, len(self.effects), self.on_progress
         )
+        # fit the most probable sets to the readings, each from its estimate by the missing force
         eligible = []
         for hypothesis in self.force_hypotheses:
             candidate = hypothesis.candidate
@@ -326,13 +339,13 @@ class Search(FittedCandidates):
             is_family_in_set = candidate.has_free_shape and len(candidate.terms) > 1
             if candidate.terms and not is_family_in_set:
                 eligible.append(hypothesis)
-        leading = []
+        probable_hypotheses = []
         for hypothesis in eligible:
             if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.force_fit_range:
-                leading.append(hypothesis)
+                probable_hypotheses.append(hypothesis)
         for hypothesis in report_each(
             self.on_progress,
-            leading[: SEARCH.most_far_fits],
+            probable_hypotheses[: SEARCH.most_far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
             start = force_search.point_with_effects(hypothesis)
@@ -380,7 +393,7 @@ class Search(FittedCandidates):
         current = self.best()
         while 0 < len(current.candidate.terms) < SEARCH.largest_set:
             if len(current.candidate.terms) > 1 and self._is_far_from_truth(current):
-                break  # a third effect is looked for only where two nearly explain the data
+                break  # a third effect is added only if two effects nearly explain the data
             current_score = self.score(current)
             present = {term.effect.identifier for term in current.candidate.terms}
             others = [effect for effect in self.effects if effect.identifier not in present]
@@ -398,11 +411,11 @@ class Search(FittedCandidates):
         """
         best = self.best()
         while len(best.candidate.terms) > 1 and self.is_unexplained():
-            give_up = best.objective + SEARCH.largest_rough_deficit
+            objective_limit = best.objective + SEARCH.largest_rough_deficit
             for candidate in sets_at_other_places(best.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
-                fit = try_fit(self.problem, candidate, best.point, objective_limit=give_up)
+                fit = try_fit(self.problem, candidate, best.point, objective_limit=objective_limit)
                 if fit is not None:
                     self.record_fit(fit, exact=True)
             if self.best() is best:
@@ -412,18 +425,18 @@ class Search(FittedCandidates):
     def drop_effects(self) -> None:
         """Drop one effect at a time from the best set, as long as the score rises.
 
-        An effect may have been added before the right one was found, or while the right one was at
-        a wrong place. It may be of no use any more.
+        An effect may have become superfluous: it was added before the right one was found, or while
+        the right one was at a wrong place.
         """
         best = self.best()
         while len(best.candidate.terms) > 1:
-            give_up = best.objective + SEARCH.largest_rough_deficit
+            objective_limit = best.objective + SEARCH.largest_rough_deficit
             numbers = range(len(best.candidate.terms))
             for dropped in numbers:
                 remaining = [number for number in numbers if number != dropped]
                 candidate, effect = best.candidate.subset_of_terms(remaining, best.effect)
                 start = replace(best.point, effect=effect)
-                fit = try_fit(self.problem, candidate, start, objective_limit=give_up)
+                fit = try_fit(self.problem, candidate, start, objective_limit=objective_limit)
                 if fit is not None:
                     self.record_fit(fit, exact=True)
             if self.best() is best:
@@ -465,10 +478,11 @@ class Search(FittedCandidates):
     def _single_fits_to_free(self) -> list[CandidateFit]:
         """Return the single effects that are to be fitted with a free shape, the best first.
 
-        If the best effect does not explain the data, these are the `SEARCH.exact_fits` best ones.
-        If it does, they are the effects that explain the data with a score near that of the best.
-        If it is the only such effect, or if the model without effect explains the data too, there
-        are none: the test of shape (`gates.check_shape`) examines the best effect later.
+        If the best effect does not explain the data, these are the best ones, at most
+        `SEARCH.most_exact_fits`. If it does, these are the effects that explain the data too, with
+        a score at most `SEARCH.family_fit_range` below that of the best. There are none if there is
+        only one such effect, or if the model without effect explains the data: the test of shape
+        (`gates.check_shape`) then examines the best effect later.
         """
         single_fits = []
         for fit in self.exact_fits.values():

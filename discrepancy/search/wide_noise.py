@@ -45,7 +45,7 @@ SECOND_DIFFERENCES = 6.0
 """Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
 
 
-# ---------------------------------------------------------------- what a fit leaves
+# ---------------------------------------------------------------- residual process of a fit
 
 
 @dataclass(frozen=True)
@@ -109,23 +109,26 @@ def _channel_process(
     residual_freedom = max(sample_count - fit.absorbed_freedom[channel], 1.0)
     has_record = problem.record_freedom[channel] > 0.0
     mean_square = _sum_of_squares(residual_series) / residual_freedom
-    interval = max(float(np.median(record.steps)) for record in records)
-    colour = _recorded_colour(problem, problem.channel_names[channel], records, interval)
+    sampling_interval = max(float(np.median(record.steps)) for record in records)
+    recorded_colour = _recorded_colour(
+        problem, problem.channel_names[channel], records, sampling_interval
+    )
     # compare the variance of the residuals with the noise record
     is_larger = False
     if has_record:
         p_value = noise_tests.variance_p_value(
             mean_square,
-            residual_freedom / colour.samples_per_independent,
-            problem.record_freedom[channel] / colour.samples_per_independent,
+            residual_freedom / recorded_colour.samples_per_independent,
+            problem.record_freedom[channel] / recorded_colour.samples_per_independent,
         )
         is_larger = p_value < LEAST_P_VALUE
+    # white noise of the recorded level: no process
     if not is_larger and whiteness_p_value(records) > LEAST_P_VALUE:
         return _ChannelProcess()
     # compare their correlation with that of the noise record
     autocorrelation, white_variance = noise_tests.autocorrelation(residual_series)
-    correlation_deviation = np.sqrt(1.0 / sample_count + colour.variance)
-    correlation_difference = abs(autocorrelation[0] - colour.correlation)
+    correlation_deviation = np.sqrt(1.0 / sample_count + recorded_colour.variance)
+    correlation_difference = abs(autocorrelation[0] - recorded_colour.correlation)
     has_record_colour = (
         correlation_difference < LARGEST_CORRELATION_DIFFERENCE * correlation_deviation
     )
@@ -146,7 +149,7 @@ def _channel_process(
     if is_recorded_colour or process_variance <= 0.0:
         return process
     return _add_correlation_in_time(
-        process, process_variance, autocorrelation, white_variance, interval
+        process, process_variance, autocorrelation, white_variance, sampling_interval
     )
 
 
@@ -257,35 +260,39 @@ def _recorded_colour(
     interval : float
         Their sampling interval [s].
     """
-    unknown = _RecordedColour(np.nan, 0.0, 1.0)
+    unknown_colour = _RecordedColour(np.nan, 0.0, 1.0)
     record = problem.campaign.channels[name].noise
-    noise = problem.noise_models[name]
+    noise_model = problem.noise_models[name]
     if record is None or record.samples is None or record.interval is None:
-        return unknown
+        return unknown_colour
     if not np.any(record.samples):
-        return unknown
+        return unknown_colour
     centred_record = record.samples - record.samples.mean()
     if abs(record.interval - interval) > LARGEST_INTERVAL_DIFFERENCE * interval:
-        return unknown
+        return unknown_colour
     colours = []
     for residuals in records:
         is_whitened = len(residuals.steps) == 1
         comparable_noise = (
-            noise.whiten(centred_record, record.interval) if is_whitened else centred_record
+            noise_model.whiten(centred_record, record.interval) if is_whitened else centred_record
         )
         autocorrelation, white_variance = noise_tests.autocorrelation([comparable_noise])
         if is_whitened:
             correlation = float(autocorrelation[0])
-            times_fewer = 1.0
+            samples_per_independent = 1.0
         else:
             # correlation of the record at the steps of the residuals
-            lags = np.arange(1 + len(autocorrelation))
-            at_steps = np.interp(
-                residuals.steps / record.interval, lags, np.r_[1.0, autocorrelation]
+            lag_numbers = np.arange(1 + len(autocorrelation))
+            correlation_at_steps = np.interp(
+                residuals.steps / record.interval, lag_numbers, np.r_[1.0, autocorrelation]
             )
-            correlation = float(np.mean(at_steps))
-            times_fewer = noise_tests.statistical_inefficiency(autocorrelation, white_variance)
-        colours.append(_RecordedColour(correlation, 1.0 / len(centred_record), times_fewer))
+            correlation = float(np.mean(correlation_at_steps))
+            samples_per_independent = noise_tests.statistical_inefficiency(
+                autocorrelation, white_variance
+            )
+        colours.append(
+            _RecordedColour(correlation, 1.0 / len(centred_record), samples_per_independent)
+        )
     return _RecordedColour(*np.mean(colours, axis=0).tolist())
 
 
@@ -322,14 +329,16 @@ def refit_under_wide_noise(
     Returns
     -------
     CandidateFit or None
-        None if the hypothesis cannot be fitted under the wider noise. Its evidence under the
-        recorded noise could not be compared with that of others under the wider noise.
+        The fit; the given one if both problems are the same. None if the hypothesis cannot be
+        fitted under the wider noise: its evidence under the recorded noise could not be compared
+        with that of others under the wider noise.
     """
     if wide_problem is problem:
         return fit
     wide_fit = try_fit(wide_problem, fit.candidate, fit.point, iterations=iterations)
     if wide_fit is None:
         return None
+    # without iterations: residuals at the same point, relative to the recorded noise
     recorded_fit = try_fit(problem, fit.candidate, wide_fit.point, iterations=0)
     if recorded_fit is None:
         return None
@@ -357,17 +366,17 @@ def compare_under_wide_noise(search: Search) -> None:
     score, which is computed from their present residuals. If another hypothesis is the best one
     under the wider noise, the noise is computed again from its residuals.
     """
-    best = search.best()
-    chosen = _most_probable_sets(search)
+    best_fit = search.best()
+    probable_fits = _most_probable_sets(search)
     for _ in range(MOST_ROUNDS):
-        process = estimate_residual_process(search.problem, best)
+        process = estimate_residual_process(search.problem, best_fit)
         search.wide_problem = with_wide_noise(search.problem, process)
         search.wide_fits = {}
-        wide_fits = _fit_under_wide_noise(search, search.wide_problem, chosen)
-        leading = max(wide_fits.values(), key=search.score)
-        if leading.candidate.key == best.candidate.key:
+        wide_fits = _fit_under_wide_noise(search, search.wide_problem, probable_fits)
+        best_wide_fit = max(wide_fits.values(), key=search.score)
+        if best_wide_fit.candidate.key == best_fit.candidate.key:
             break
-        best = leading
+        best_fit = best_wide_fit
     search.wide_fits = wide_fits
 
 
@@ -377,18 +386,19 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
     Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has
     the number of sets of each length.
     """
-    best: dict[tuple[str, ...], CandidateFit] = {}
+    best_by_set: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
         identifiers = fit.candidate.identifiers
         if identifiers and (
-            identifiers not in best or search.score(fit) > search.score(best[identifiers])
+            identifiers not in best_by_set
+            or search.score(fit) > search.score(best_by_set[identifiers])
         ):
-            best[identifiers] = fit
-    chosen: list[CandidateFit] = []
+            best_by_set[identifiers] = fit
+    probable_fits: list[CandidateFit] = []
     for length, count in enumerate(SEARCH.most_weighed_sets, start=1):
-        fits_of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
-        chosen += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
-    return chosen
+        fits_of_length = [fit for fit in best_by_set.values() if len(fit.candidate.terms) == length]
+        probable_fits += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
+    return probable_fits
 
 
 def _fit_under_wide_noise(
@@ -405,12 +415,14 @@ def _fit_under_wide_noise(
     chosen : sequence of CandidateFit
         The fits to choose from.
     """
+    # choose by the expected score under the wider noise
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
-    fits_with_scores.sort(key=lambda entry: entry[1], reverse=True)
-    least = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
+    fits_with_scores.sort(key=lambda fit_and_score: fit_and_score[1], reverse=True)
+    least_score = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
     promising = [
-        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least
+        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least_score
     ]
+    # fit the model without effect, and the chosen hypotheses
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in report_each(
@@ -419,7 +431,7 @@ def _fit_under_wide_noise(
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
         _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))
-    # the subsets of the leading set: each of its effects has to earn its place
+    # fit the subsets of the best set, to compare whether each of its effects is needed
     leading_names = set(max(wide_fits.values(), key=search.score).candidate.identifiers)
     for fit in list(search.compared_fits().values()):
         names = set(fit.candidate.identifiers)
@@ -434,9 +446,11 @@ def _add_wide_fit(
     wide_problem: Problem,
     fit: CandidateFit,
 ) -> None:
-    """Add the fit of a hypothesis under a wider noise, if it can be fitted under that noise.
+    """Fit a hypothesis under the wider noise, and add this fit to `wide_fits`.
 
-    The model without effect is always added, at its present point if it cannot be fitted.
+    A hypothesis that cannot be fitted under the wider noise is left out. The hypothesis without
+    effects (without terms) is evaluated at the point of `fit` instead, without any step of the
+    iteration, since all others are compared with it.
     """
     wide_fit = refit_under_wide_noise(search.problem, wide_problem, fit)
     if wide_fit is None and not fit.candidate.terms:
@@ -446,15 +460,17 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score that a fit would have under a wider noise at its present point [nat].
+    """Return the score that a fit would have under a wider noise, without fitting it again [nat].
 
-    The score is ln (evidence times prior). Of its parts, only the misfit is computed again.
+    The score is ln (evidence times prior). Only the misfit of the residuals is computed for the
+    wider noise; the other terms of the score are those under the recorded noise.
     """
     problem = search.problem
     scaled_residuals = []
     for data, wide_data, residual in zip(
         problem.trials, wide_problem.trials, fit.residuals, strict=True
     ):
+        # residuals are in recorded noise deviations: convert them to deviations of the wider noise
         scaled_residuals.append(data.deviation / wide_data.deviation * residual)
     wide_sums = problem.squares_by_channel(scaled_residuals)
     return (
