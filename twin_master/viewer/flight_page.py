@@ -121,7 +121,11 @@ class FlightPage:
         return html
 
     def _sensor_range(self) -> tuple[float, float]:
-        """Return the lowest and the highest reading on the axis of the sensors."""
+        """Return the lowest and the highest reading on the axis of the sensors, as printed.
+
+        They bound the mean readings of all states and controls. Readings that are shown as
+        standard deviations get an axis with 95 % of a normal distribution.
+        """
         if self._shows_deviations:
             return -NORMAL_95, NORMAL_95
         readings = self._sensors.scale * self._flight.knowledge.sensor_model.mean
@@ -140,7 +144,10 @@ class FlightPage:
         self._open_requests.pop(send, None)
 
     def update(self) -> None:
-        """Read what is new in the flight, and answer the viewers that wait for it."""
+        """Read new lines of the journal, and answer the viewers that wait for them.
+
+        If the journal cannot be read, all viewers get the error, now and later.
+        """
         try:
             if self._error or not self._flight.update():
                 return
@@ -163,7 +170,10 @@ class FlightPage:
             send(answer)
 
     def answer(self, request: Request) -> str | None:
-        """Return the answer to a request as JSON; None if there is nothing new to say.
+        """Return the answer to a request as JSON; None if there is nothing new for the viewer.
+
+        The answer has the past steps that the viewer lacks (`past`), and, if another step is shown
+        than before, the prediction after it (`ahead`).
 
         Parameters
         ----------
@@ -203,7 +213,10 @@ class FlightPage:
         return json.dumps(plain(answer), allow_nan=False)  # NaN becomes null
 
     def _drawing_at(self, step: int) -> dict[str, str] | None:
-        """Return the last drawing of a missing force at a step: its address, and the verdict."""
+        """Return the address of the last drawing of a missing force up to a step, and its verdict.
+
+        None is returned if no verdict up to this step has a drawing.
+        """
         numbers = []
         for number, drawing in enumerate(self._flight.drawings):
             if drawing.step <= step:
@@ -217,7 +230,7 @@ class FlightPage:
         }
 
     def _past_values(self, records: Sequence[StepRecord]) -> dict[str, object]:
-        """Return what the page shows of steps that were flown, a row for each step."""
+        """Return the values that the page plots of past steps, each with a row for each step."""
         flight = self._flight
         beliefs = flight.beliefs_in(records)
         values = self._plotted_values(beliefs, flight.observations_in(records))
@@ -228,14 +241,19 @@ class FlightPage:
         return values
 
     def _sentences_in(self, record: StepRecord) -> list[str]:
-        """Return the sentences of the notices of a step, with the folder of the flight."""
+        """Return the sentences of the notices of a step.
+
+        Commands in them name the folder as DIR, which is replaced by the folder of the flight.
+        """
         folder = f" {self._flight.folder}"
         return [notice["sentence"].replace(" DIR", folder) for notice in record["notices"]]
 
     def _plotted_values(
         self, beliefs: StepBeliefs, observations: Float | None
     ) -> dict[str, object]:
-        """Return the values of figures in printed units, a row for each step.
+        """Return the values that the figures plot, in printed units, with a row for each step.
+
+        Rewards and sensors have a central 95 % interval; that of a sensor includes its noise.
 
         Parameters
         ----------
@@ -252,6 +270,7 @@ class FlightPage:
         expected = beliefs.expected
         reward_margin = NORMAL_95 * expected.reward_standard_deviation
         sensor_mean = expected.mean
+        # The uncertain state and the noise are independent: their variances add up
         deviation = np.hypot(expected.standard_deviation, expected.noise)
         if self._shows_deviations:
             if observations is not None:
@@ -275,9 +294,11 @@ class FlightPage:
         return values
 
     def _state_values(self, beliefs: StepBeliefs) -> dict[str, Float]:
-        """Return mean, interval and standard deviation of each factor of the state (n, K).
+        """Return mean, interval and standard deviation of each state factor in printed units.
 
-        The interval is two standard deviations to either side, within the levels of the factor.
+        The interval is the mean plus and minus two standard deviations, clipped to the range of the
+        levels of the factor. All arrays have a row for each step and a column for each factor; they
+        are NaN in steps in which no state is believed.
         """
         scales = self._factor_scales
         lowest = np.array([factor.levels[0] for factor in self._factors])
@@ -290,6 +311,7 @@ class FlightPage:
             "state": mean,
             "state_lower": np.clip(mean - margin, lowest, highest),
             "state_upper": np.clip(mean + margin, lowest, highest),
+            # The margin is two standard deviations
             "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * margin),
         }
 
@@ -301,7 +323,10 @@ def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
 
 
 def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:
-    """Return the first step to be sent, so that the viewer has all that the page shows at once.
+    """Return the first step that must be sent to a viewer.
+
+    The page shows a window of `WINDOW_STEPS` steps. If the viewer has the first part of the window,
+    only the rest is sent; else the whole window.
 
     Parameters
     ----------

@@ -76,11 +76,11 @@ class _StepsSocket(WebSocketHandler):
             self.close(_INVALID_MESSAGE, str(error)[:100])
 
     def on_close(self) -> None:
-        """Forget the viewer, who has left."""
+        """Forget the viewer, whose connection is closed."""
         self._page.forget(self.send)
 
     def send(self, text: str) -> None:
-        """Send an answer; forget the viewer if it has left."""
+        """Send an answer; forget the viewer if its connection is closed."""
         try:
             self.write_message(text)
         except WebSocketClosedError:
@@ -131,11 +131,11 @@ def package_text(package: str, name: str, media_type: str) -> ServedText:
 
 
 def _do_nothing() -> None:
-    """Stand for what is done every few milliseconds if nothing is to be done."""
+    """Do nothing; the default for `poll`."""
 
 
 def _is_always_wanted() -> bool:
-    """Say that a server goes on until its process is interrupted."""
+    """Return True; the default for `is_wanted`, with which a server runs until interrupted."""
     return True
 
 
@@ -147,7 +147,7 @@ def serve_texts(
     handlers: Sequence[Rule] = (),
     poll: Callable[[], None] = _do_nothing,
 ) -> None:
-    """Serve texts to browsers of this machine as long as they are wanted.
+    """Serve texts to browsers of this machine until `is_wanted` returns False.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class GivenPatch(NamedTuple):
 
 
 def _do_nothing() -> None:
-    """Stand for what is done between two steps if nothing is to be done."""
+    """Do nothing; the default for what is called between two steps."""
 
 
 class Watch:
@@ -155,7 +155,7 @@ class Watch:
         self._keep_knowledge(sibling)
 
     def _prepare_model(self) -> BelievedModel:
-        """Return the model of the beginning, calibrated and planned with."""
+        """Calibrate the model of the watch, plan with it, and return it as the first model."""
         with self.progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
         remark = calibration_sentence(
@@ -167,8 +167,11 @@ class Watch:
         return BelievedModel(0, knowledge, Path(patch) if patch else None)
 
     def _keep_knowledge(self, sibling: "Watch | None") -> None:
-        """Write the knowledge of all models into the folder, where viewers find it."""
-        # Without adopted patches both have the knowledge of the beginning
+        """Write the knowledge of all models into the folder, where viewers find it.
+
+        If this watch and its sibling have adopted no patch, both have the same knowledge, and the
+        file of the sibling is linked instead.
+        """
         has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
         if sibling is not None and has_same_knowledge:
             link_knowledge(sibling.folder, self.folder)
@@ -178,7 +181,10 @@ class Watch:
             save_knowledge(self.folder, model.knowledge, number)
 
     def update_from_journal(self) -> None:
-        """Read the state of teaching from the journal, and load the models adopted there."""
+        """Read the state of teaching from the journal, and load the models adopted in it.
+
+        Models that are loaded already are kept.
+        """
         check_header(self.journal_path, self._config_hash)
         notice = self.scenario.notice
         threshold = 1.0 if notice is None else notice.threshold  # without notices: of no effect
@@ -241,7 +247,9 @@ class Watch:
 
     @contextmanager
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
-        """Open the journal, and take up the twin as it is after the last line.
+        """Open the journal, and restore the twin and the intake after its last line.
+
+        This is a context manager. At its end the counts of the messages are written.
 
         Parameters
         ----------
@@ -272,16 +280,20 @@ class Watch:
             self._write_last_counts()
 
     def _write_last_counts(self) -> None:
-        """Write down the counts of the messages after the last step."""
+        """Write the counts of the messages that came after the last line into the journal.
+
+        If the disk is full the counts are lost, but no observation is.
+        """
         if self.intake.state()["counts"] == self._written_intake["counts"]:
             return
-        with suppress(FileNotWrittenError):  # no observation is lost
+        with suppress(FileNotWrittenError):
             self.write_event()
 
     def decisions(self) -> Iterator[JsonObject]:
-        """Yield the decision of each step, once it is in the journal, until no more comes.
+        """Yield the decision of each step, once it is in the journal, until the feed ends.
 
-        If the messages after a step are refused, its decision is given again with a notice.
+        If the messages after a step are refused, its decision is given again with a notice. If a
+        patched model is adopted between two steps, the loop goes on with the twin of this model.
         """
         while True:
             twin = self.twin
@@ -337,9 +349,10 @@ class Watch:
         return time.monotonic() - self._time_of_last_step
 
     def last_decision(self) -> JsonObject | None:
-        """Return the last decision in the journal; None without any.
+        """Return the last decision in the journal; None if there is none.
 
-        It has `told_again`, because a kill may have kept it from being sent, and nobody knows.
+        The decision is marked with `told_again`, because it may have been sent before: after a kill
+        that is not known.
         """
         for line, _, _ in records_backwards(self.journal_path):
             if "filtered" in line:
@@ -347,7 +360,11 @@ class Watch:
         return None
 
     def report_silence(self, send: Callable[[JsonObject], None]) -> None:
-        """Send the last decision with a notice, once no step has come for too long."""
+        """Send the last decision again, with a notice that no step has come for too long.
+
+        Nothing is sent before `watch.quiet_after_seconds` have passed, or if this silence was
+        reported already.
+        """
         longest_silence = self.scenario.watch.quiet_after_seconds
         if longest_silence is None or self.is_quiet or self.seconds_since_step < longest_silence:
             return
@@ -365,15 +382,21 @@ class Watch:
         send(decision)
 
     def _report_refusals(self) -> JsonObject:
-        """Write down that messages are refused; return the last decision with this notice."""
+        """Write a notice that messages are refused into the journal.
+
+        Returns
+        -------
+        dict
+            The last decision, with this notice.
+        """
         decision = self._last_decision_with(self.intake.stream.report_refusals(self.twin.steps))
         self.write_event(notices=decision["notices"], refused=decision)
         return decision
 
     def _last_decision_with(self, notice: Notice) -> JsonObject:
-        """Return the last decision with a notice in the place of its own ones.
+        """Return the last decision, its notices replaced by one notice.
 
-        Before the first step there is no decision: then it has the step -1 and no control.
+        If there is no decision yet, a record with the step -1 and without a control is returned.
         """
         decision = self.last_decision() or {"step": -1}
         return {**decision, "notices": [notice.as_record()]}
@@ -409,7 +432,13 @@ class Watch:
         )
 
     def _adopt_given(self, patch: GivenPatch) -> None:
-        """Adopt a patch that the user gives."""
+        """Adopt a patch that the user gives.
+
+        Raises
+        ------
+        MissionInputError
+            If its first step is neither one that was watched nor the next one.
+        """
         steps = self.twin.steps
         if not steps or not 0 <= patch.from_step <= steps:
             raise MissionInputError(
@@ -439,7 +468,7 @@ class Watch:
     def adopt(
         self, outcome: PatchOutcome, notice: JsonObject | None, verdict_folder: str = ""
     ) -> None:
-        """Believe a patched model, and go on with its twin.
+        """Adopt a patched model: filter the steps again with it, and go on with its twin.
 
         Parameters
         ----------
@@ -485,7 +514,7 @@ class Watch:
         self._show_adoption(record)
 
     def _show_adoption(self, model: ModelRecord) -> None:
-        """Show how well the patched model fits, beside the former one."""
+        """Tell the operator how well the patched model fits, beside the former one."""
         comparisons = []
         for name, value in model["before"].items():
             if value is not None:

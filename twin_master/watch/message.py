@@ -174,7 +174,9 @@ class MessageReader:
         self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
 
     def _find_column(self, name: str) -> SensorColumn | None:
-        """Return the sensor and the factor that a name stands for; None if it is no sensor.
+        """Return the sensor that a name means, with the factor to SI; None if it is no sensor.
+
+        The name is that of a sensor, alone or followed by a unit, in brackets or after `_`.
 
         Raises
         ------
@@ -201,7 +203,11 @@ class MessageReader:
         return SensorColumn(sensor, factors[unit or self._units[sensor]])
 
     def _unit_factors(self, sensor: int) -> dict[str, float]:
-        """Return the units in which a sensor is read, each with its factor to SI units."""
+        """Return the units in which a sensor may be sent, each with its factor to SI units.
+
+        They are the unit of the sensor with each SI prefix. In a unit with a power, such as m2,
+        the prefix has the power, too.
+        """
         unit = self._units[sensor]
         if unit == "1":
             return _FACTORS_WITHOUT_UNIT
@@ -216,15 +222,15 @@ class MessageReader:
         return matches[0] if matches else ""
 
     def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
-        """Return a sentence with names that are no sensor, and what to do.
+        """Return a sentence that says which names are no sensor, and what sensors are called.
 
         Parameters
         ----------
         names : sequence of str
             At least one unknown name.
         has_sensors : bool
-            Whether there are sensors beside them. If not, nothing is left when the names are
-            ignored, and the sentence does not advise it.
+            Whether the message also names sensors. Only then the sentence advises to ignore the
+            unknown names; without sensors nothing of the message would remain.
         """
         shown_names = [name[:_SHOWN_CHARACTERS] for name in names[:_SHOWN_NAMES]]
         quoted_names = listing(f"`{name}`" for name in shown_names)
@@ -350,7 +356,11 @@ class MessageReader:
         return self._controls.index(str(value))
 
     def _named_values(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-        """Yield the names and values of sensors; each value of a list gets that of its sensor."""
+        """Yield the name and the value of each sensor in a parsed message.
+
+        A list of all sensors, under the key of their role, is split into its sensors, each with the
+        name `ROLE_NUMBER_UNIT`. Keys that begin with `_` are left out.
+        """
         role = self._observation.role
         unit = record.get("unit", "")
         if not isinstance(unit, str):
@@ -366,7 +376,13 @@ class MessageReader:
                 yield name, value
 
     def _read_covariance(self, value: object) -> Float:
-        """Return the lower triangle of the covariance (count, count) of all values, SI."""
+        """Return the lower triangle, row by row, of the covariance matrix of all sensors, SI.
+
+        Raises
+        ------
+        Refused
+            If the value is not a symmetric, positive semidefinite matrix of the right size.
+        """
         count = self._observation.count
         try:
             matrix = np.array(value, dtype=np.float64)
@@ -376,8 +392,8 @@ class MessageReader:
             raise Refused(
                 f"`covariance` is {count} rows of {count} numbers, in SI units; null is none"
             )
-        # Correlations in the place of covariances, so that the tolerances hold for any unit.
-        # A correlation is at most 1. A value with a variance of zero is not scaled.
+        # Check correlations and not covariances, so that the tolerances hold for any unit. No
+        # correlation exceeds 1. A sensor with zero variance is left unscaled: divided by one.
         standard_deviation = np.sqrt(np.abs(np.diag(matrix)))
         standard_deviation[standard_deviation == 0.0] = 1.0
         with np.errstate(over="ignore"):
@@ -398,7 +414,20 @@ class MessageReader:
             return math.nan
 
     def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
-        """Return what came in the place of a reading, and how to give its unit if it lacks one."""
+        """Return, in words, the value that came in the place of a reading.
+
+        A strain that is too large and has no unit was probably sent in microstrain: then the text
+        says how to give the unit.
+
+        Parameters
+        ----------
+        value : object
+            The value in the message.
+        number : float
+            The value in SI units; NaN if it is no number.
+        column : SensorColumn
+            The sensor, with the factor to SI units.
+        """
         if not math.isfinite(number):
             return json.dumps(value)[:30]
         is_strain = self._largest_values[column.sensor] == LARGEST_STRAIN

@@ -225,7 +225,10 @@ class Session:
         reasons: "list[ReasonCode]",
         _properties: "Properties | None",
     ) -> None:
-        """Note that observations come now, and let all publishers begin."""
+        """Note that the broker sends observations from now on, and let all publishers send.
+
+        If the broker refuses the subscription, the connection is dropped later, with this cause.
+        """
         reason = reasons[0]
         if reason.is_failure:
             self._failure = (
@@ -269,7 +272,10 @@ class Session:
             publisher.note_answer(message_id, str(reason) if reason.is_failure else None)
 
     def _drop_connection(self, failure: str) -> None:
-        """Drop the connection, to try again later; the first time a failure ends the watch.
+        """Drop the connection, and plan when to try again.
+
+        A failure before the first subscription ends the watch with an error. Messages that were
+        not acknowledged are forgotten here: the broker sends them again.
 
         Parameters
         ----------
@@ -293,7 +299,9 @@ class Session:
         self._publisher_of_message.clear()
 
     def _exchange(self, wait: float) -> None:
-        """Exchange packets with the broker, or try to connect again.
+        """Exchange packets with the broker; if there is no connection, try to connect.
+
+        After an exchange, decisions that wait are sent, and the heartbeat if it is due.
 
         Parameters
         ----------
@@ -307,7 +315,7 @@ class Session:
             return
         count = len(self.unread)
         error = client.loop(wait)
-        # All that has arrived already
+        # Read all packets that have arrived already
         while not error and len(self.unread) > count:
             count = len(self.unread)
             error = client.loop(0.0)
@@ -393,7 +401,10 @@ class Session:
         return message.mid
 
     def close(self) -> None:
-        """Disconnect once the broker has the last decisions; the broker keeps the session."""
+        """Send the last decisions, and disconnect; the broker keeps the session.
+
+        This waits at most `_GOODBYE_SECONDS` for the broker to take the decisions.
+        """
         has_crashed = sys.exc_info()[0] is not None
         end = time.monotonic() + _GOODBYE_SECONDS
         while self._has_decisions_to_send and time.monotonic() < end:
@@ -414,7 +425,15 @@ class Session:
         return bool(self.publishers) or bool(self._publisher_of_message)
 
     def _say_goodbye(self, client: "Client", state: str) -> None:
-        """Publish the last heartbeat, and disconnect in order."""
+        """Publish the last heartbeat, and disconnect so that the broker sees an orderly end.
+
+        Parameters
+        ----------
+        client : Client
+            The client of the connection.
+        state : str
+            The state in the heartbeat: "ended", or "lost" after an error.
+        """
         connection = client.socket()
         if connection is None:
             return
