@@ -281,7 +281,7 @@ class GrowingFile(Lines):
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 
     def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
-        """Go on in the copy of a file that was cut to zero length (logrotate's `copytruncate`).
+        """Go on in the copy of a file that was cut, as logrotate does with `copytruncate`.
 
         If there is no copy, a refusal is yielded, and reading goes on at the beginning of the file.
         """
