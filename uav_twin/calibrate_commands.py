@@ -330,7 +330,8 @@ class RingDownRow(NamedTuple):
     figure, unit : str
         The name of the figure, and its unit.
     average : tuple of float
-        Mean, deviation between trials, and standard error of the mean.
+        The mean over the trials, the standard deviation between trials, and the standard error of
+        the mean.
     paper : float
         The published figure.
     """

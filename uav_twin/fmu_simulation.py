@@ -314,7 +314,7 @@ def _write_and_print_history(
 
 
 class HistoryColumn(NamedTuple):
-    """An output over time: its name, its unit, and its values (N,)."""
+    """An output over time: its name, its unit, and its value at each time of the history."""
 
     name: str
     unit: str

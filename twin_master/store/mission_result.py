@@ -88,7 +88,9 @@ def quantity_titles(name: str) -> QuantityTitles:
 
 @dataclass(frozen=True)
 class LearntQuantity:
-    """The posterior of a learnt quantity, of the whole asset or of each of its G sensors.
+    """The posterior of a learnt quantity after each of T steps.
+
+    The quantity belongs to the whole asset, or has a value for each of its G sensors.
 
     Attributes
     ----------
@@ -150,9 +152,10 @@ def _learnt_quantities(
         scenario.calibration.parameter: result.parameter_unit,
         "gauge_offset": result.observation_unit,
     }
-    # The moments of each quantity, the prior first: (1 + T, 4), or (1 + T, G, 4) by sensor.
+    # The four moments of each quantity, before the first and after each of T steps:
+    # (1 + T, 4) for the whole asset, (1 + T, G, 4) for G sensors
     moments_of: dict[str, Float] = {}
-    posteriors = result.flight.learnt.swapaxes(0, 1)  # (N, T, 4)
+    posteriors = result.flight.learnt.swapaxes(0, 1)  # (quantities of the estimator, T, 4)
     for full_name, posterior in zip(result.flight.learnt_names, posteriors, strict=True):
         moments = np.vstack((prior[full_name].figures, posterior))
         match = _NAME_WITH_SENSOR.fullmatch(full_name)
@@ -233,10 +236,10 @@ def _true_transition_factor(scenario: Scenario) -> Float | None:
     """
     if not scenario.truth.probability:
         return np.asarray(1.0)
-    true = _worsening_probabilities(scenario, scenario.truth.probability)
-    assumed = _worsening_probabilities(scenario, scenario.transition.probability)
-    factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
-    if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0):
+    true_probabilities = _worsening_probabilities(scenario, scenario.truth.probability)
+    assumed_probabilities = _worsening_probabilities(scenario, scenario.transition.probability)
+    factor = true_probabilities.sum() / max(assumed_probabilities.sum(), np.finfo(float).tiny)
+    if np.allclose(true_probabilities, factor * assumed_probabilities, rtol=1e-9, atol=0.0):
         return np.asarray(factor)
     return None
 

@@ -236,9 +236,11 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
     expected_parts = []
     control_probabilities = []
     for knowledge, span in result.spans:
-        part = replace(flight, steps=flight.steps[span])
-        expected_of_part, control_probability = expected_ahead(part, knowledge, predicted[span])
-        expected_parts.append(expected_of_part)
+        history_of_span = replace(flight, steps=flight.steps[span])
+        expected_in_span, control_probability = expected_ahead(
+            history_of_span, knowledge, predicted[span]
+        )
+        expected_parts.append(expected_in_span)
         control_probabilities.append(control_probability)
     values = _belief_variables(result, predicted, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
@@ -266,8 +268,10 @@ def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool)
     flight = result.flight
     expected_parts = []
     for knowledge, span in result.spans:
-        part = replace(flight, steps=flight.steps[span])
-        expected_parts.append(expected_in_steps(part, knowledge, belief[span], smoothed=smoothed))
+        history_of_span = replace(flight, steps=flight.steps[span])
+        expected_parts.append(
+            expected_in_steps(history_of_span, knowledge, belief[span], smoothed=smoothed)
+        )
     return concatenate_expectations(expected_parts)
 
 

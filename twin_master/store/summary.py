@@ -186,10 +186,10 @@ def find_policy_switch(
     ----------
     states : StateSpace
         The state space.
-    policy_index : (S,) array
+    policy_index : (states,) array
         The index of the control that the policy takes in each state.
     first_control : int
-        The index of the control.
+        The index of the first control.
     """
     leaves = (policy_index != first_control).reshape(states.shape)  # an axis for each factor
     for axis, factor in enumerate(states.factors):
@@ -225,7 +225,7 @@ def summarise(
     ----------
     result : MissionResult
         The mission.
-    reward_mean : (T, 3) array
+    reward_mean : (steps, 3) array
         The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
     misfit : (states, controls, sensors) array, optional
         The difference of the sensor values of the twin's model to those of the asset, relative to
@@ -330,13 +330,13 @@ def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
     flight = result.flight
     if not flight.suspicion:
         return
-    last = flight.suspicion[-1]
+    last_suspicion = flight.suspicion[-1]
     alarm_steps = [step for step, notice in flight.notices if notice.kind == "alarm"]
     values = [
         alarm_steps[0] if alarm_steps else None,
-        last.none_of_these,
-        last.gauge_off,
-        last.decided_by,
+        last_suspicion.none_of_these,
+        last_suspicion.gauge_off,
+        last_suspicion.decided_by,
     ]
     yield FigureGroup("notice", {"step": result.scenario.mission.step_name}, values)
 
@@ -350,8 +350,8 @@ def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
     draws = result.knowledge.draws
     title = parameter_title(draws.name)
     prior = [draws.mean, draws.standard_deviation]
-    learnt = [quantity for quantity in result.learnt if quantity.name == draws.name]
-    if not learnt:
+    learnt_parameters = [quantity for quantity in result.learnt if quantity.name == draws.name]
+    if not learnt_parameters:
         is_measured = result.scenario.calibration.source in ("static_test", "file")
         fields = {
             "parameter": draws.name,
@@ -360,10 +360,10 @@ def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
         }
         yield FigureGroup("parameter", fields, prior)
         return
-    parameter = learnt[0]
+    parameter = learnt_parameters[0]
     fields = {"parameter": draws.name, "label": title}
-    last = parameter.posterior[-1]
-    moments = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+    last_moments = parameter.posterior[-1]
+    moments = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
     yield FigureGroup("parameter_learnt", fields, [*moments, *prior])
     if parameter.truth is not None:
         yield FigureGroup("parameter_true", fields, [float(parameter.truth)])
@@ -381,8 +381,8 @@ def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
                 "title": quantity_titles(quantity.name).short,
                 "unit": unit,
             }
-            last = factor * quantity.posterior[-1]
-            values = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+            last_moments = factor * quantity.posterior[-1]
+            values = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
             yield FigureGroup("learnt", fields, values)
 
 
@@ -394,9 +394,10 @@ def _figures_of_sensors(result: MissionResult, quantity: LearntQuantity) -> Figu
     """
     observation = result.scenario.observation
     factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
-    last = factor * quantity.posterior[-1]  # (G, 4)
-    last_mean = last[:, _MEAN]
-    last_deviation = last[:, _STANDARD_DEVIATION]
+    # The moments after the last step, in printed units, with a row for each sensor
+    last_moments = factor * quantity.posterior[-1]
+    last_mean = last_moments[:, _MEAN]
+    last_deviation = last_moments[:, _STANDARD_DEVIATION]
     departure = np.abs(last_mean - factor * quantity.prior[:, _MEAN]) / last_deviation
     sensor = int(np.nanargmax(departure))
     mean_of_sensors: float | None = float(np.nanmean(last_mean))
@@ -467,7 +468,7 @@ def control_changes(
     ----------
     controls : sequence of str
         The names of the controls.
-    control_index : (T,) array
+    control_index : (steps,) array
         The index of the control flown in each step.
     step_name : str
         What a step is called.

@@ -143,7 +143,7 @@ def _root_attributes(
     """
     provenance = config["provenance"]
     mission = result.scenario.mission
-    draws = result.knowledge.draws
+    draws = result.knowledge.draws  # of the calibrated parameter
     return {
         "title": mission.title or mission.name,
         "scenario": mission.name,

@@ -96,7 +96,9 @@ class _JournalledKnowledge(NamedTuple):
 
 
 class Flight:
-    """A run or a watch with what the twin concluded in each step at the time of the step.
+    """A run or a watch, read from its journal, with the beliefs and decisions of each step.
+
+    Each step has the belief and the decision that the twin had at the time of the step.
 
     Parameters
     ----------
@@ -116,8 +118,8 @@ class Flight:
     drawings : list of ForceDrawing
         The drawings of missing forces, in the order of their verdicts.
     number : int
-        Grows when steps were removed, as by a resumed run, or changed, as by an observation that
-        came late. What viewers have of the steps is void then.
+        A number that grows when earlier steps are removed, as by a resumed run, or changed, as by
+        an observation that came late. The steps that viewers have loaded are then out of date.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -309,9 +311,13 @@ class Flight:
         """
         parts = []
         # Groups of successive steps with the same knowledge
-        for _, group in groupby(records, lambda record: id(self._knowledge_in(record))):
-            steps = list(group)
-            parts.append(self._beliefs_under(self._knowledge_in(steps[0]), steps))
+        for _, records_of_group in groupby(records, lambda record: id(self._knowledge_in(record))):
+            same_knowledge_records = list(records_of_group)
+            parts.append(
+                self._beliefs_under(
+                    self._knowledge_in(same_knowledge_records[0]), same_knowledge_records
+                )
+            )
         return StepBeliefs(
             probability=np.concatenate([part.probability for part in parts]),
             is_believed=np.concatenate([part.is_believed for part in parts]),
@@ -325,8 +331,8 @@ class Flight:
         controls = [record["control_index"] for record in records]
         joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
         if knowledge.expectation is None:
-            rows = np.array([array_from_json(record["observed"]) for record in records])
-            expected = _expectation_without_learning(knowledge, joint, rows)
+            observed_rows = np.array([array_from_json(record["observed"]) for record in records])
+            expected = _expectation_without_learning(knowledge, joint, observed_rows)
         else:
             expected = self._expectation_with_learning(knowledge.expectation, joint, records)
         return StepBeliefs(
@@ -418,7 +424,7 @@ def _expectation_without_learning(
 
 
 def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
-    """Return what the twin has learnt up to a step, by quantity."""
+    """Return the posterior of each quantity that the twin has learnt up to a step, by name."""
     return {name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()}
 
 

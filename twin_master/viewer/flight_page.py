@@ -66,7 +66,7 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
 
 
 SendText = Callable[[str], None]
-"""Sends an answer to one viewer, and stands for this viewer."""
+"""A function that sends an answer to one viewer; it also identifies this viewer."""
 
 
 class FlightPage:
@@ -132,9 +132,9 @@ class FlightPage:
         return readings.min(), readings.max()
 
     def ask(self, send: SendText, request: Request) -> None:
-        """Answer a viewer now, or as soon as there is something new.
+        """Answer the request of a viewer now, or as soon as there is something new.
 
-        A newer request of the viewer replaces an older one.
+        A request replaces an earlier one of the same viewer that was not answered yet.
         """
         self._open_requests[send] = request
         self._answer_viewer(send)
@@ -157,7 +157,10 @@ class FlightPage:
             self._answer_viewer(send)
 
     def _answer_viewer(self, send: SendText) -> None:
-        """Answer the open request of a viewer, if there is something new for it."""
+        """Answer the open request of a viewer, if there is something new for it.
+
+        An answered request is closed. After an error of the journal the viewer also gets the error.
+        """
         if self._error:
             send(json.dumps({"error": self._error}))
         # A viewer that could not be reached is forgotten meanwhile
@@ -260,7 +263,7 @@ class FlightPage:
         beliefs : StepBeliefs
             The beliefs of n steps.
         observations : (n, G) array or None
-            The readings of the sensors, SI; None for steps to come.
+            The readings of G sensors in n steps, SI; None for predicted steps.
 
         Returns
         -------

@@ -23,7 +23,7 @@ from twin_master.viewer.flight_page import FlightPage, Request
 
 ADDRESS = "127.0.0.1"
 POLL_SECONDS = 0.015
-"""Seconds between two looks at the run folder; a look takes some microseconds."""
+"""Seconds between two checks of the run folder for new lines; a check takes microseconds."""
 LONGEST_REQUEST = 4096
 """Greatest length of a request [bytes]."""
 _INVALID_MESSAGE = 1003
@@ -52,7 +52,8 @@ class ServedText(NamedTuple):
     Attributes
     ----------
     read : callable
-        Returns the text. It takes what the groups of its path match, as strings.
+        Returns the text. Its arguments are the parts of the requested path that the groups of the
+        regular expression match, as strings.
     media_type : str
         The type of the text, such as "text/html".
     """
@@ -65,7 +66,7 @@ class _StepsSocket(WebSocketHandler):
     """The connection of one open page."""
 
     def initialize(self, page: FlightPage) -> None:
-        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        """Set the page that answers; tornado calls this after the constructor."""
         self._page = page
 
     def on_message(self, message: str | bytes) -> None:
@@ -91,7 +92,7 @@ class _TextHandler(RequestHandler):
     """Answers requests for one text."""
 
     def initialize(self, text: ServedText) -> None:
-        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        """Set the text to be served; tornado calls this after the constructor."""
         self._text = text
 
     def set_default_headers(self) -> None:
@@ -105,7 +106,7 @@ class _TextHandler(RequestHandler):
         Parameters
         ----------
         *groups : str
-            What the groups of the path match.
+            The parts of the requested path that the groups of its regular expression match.
         """
         self.set_header("Content-Type", f"{self._text.media_type}; charset=utf-8")
         try:

@@ -85,7 +85,7 @@ def _do_nothing() -> None:
 
 
 class Watch:
-    """A watch whose folder this process holds.
+    """A watch of an asset, whose folder is locked by this process.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Watch:
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel
-        The model of the beginning, and the patched models that were adopted.
+        The first model, and the patched models that were adopted, in their order.
     teaching : Teaching
         The state of teaching after the last line of the journal.
     journal : JournalFile
@@ -116,8 +116,9 @@ class Watch:
         The messages that come, from `begin` on.
     twin : Twin
         The twin, from `begin` on. It is replaced when a patched model is adopted.
-    filtered : (S,) array or None
-        The belief after the last step; None before the first step of this process.
+    filtered : (states,) array or None
+        The filtered probability of each state after the last step; None before the first step of
+        this process.
     is_quiet : bool
         Whether the operator was told that no step comes any more.
     """
@@ -328,7 +329,13 @@ class Watch:
         return line
 
     def write_event(self, **fields: object) -> None:
-        """Write a line that is no step into the journal, such as a verdict or a model."""
+        """Write an event that is no step, such as a verdict, as a line into the journal.
+
+        Parameters
+        ----------
+        **fields : object
+            The entries of the line beside the last step, the next control and the intake.
+        """
         line = {
             "step": self.twin.steps - 1,
             "next_control": self.twin.proposed_control,
@@ -404,10 +411,10 @@ class Watch:
     def trial_of(
         self, patch: Path, from_step: int, compared: ComparedSteps = NO_STEPS
     ) -> Callable[..., PatchOutcome]:
-        """Return a function that computes the outcome of a patch; it takes `progress`.
+        """Return a function that computes the outcome of a patch.
 
-        The function uses the lines that the journal has now. So it may be called in a thread while
-        the watch goes on.
+        It reads the journal up to its present end, so that it may be called in a thread while the
+        watch goes on. Its only argument, `progress`, is optional.
 
         Parameters
         ----------
@@ -448,7 +455,9 @@ class Watch:
         self.adopt(outcome, None, self._copy_verdict_of(patch.file))
 
     def _copy_verdict_of(self, patch: Path) -> str:
-        """Copy the verdict beside a given patch, and its drawing of the missing force, for viewers.
+        """Copy the verdict in the folder of a given patch, with its drawing, for viewers.
+
+        The drawing shows the missing force that the verdict has found.
 
         Returns
         -------
@@ -506,7 +515,8 @@ class Watch:
         if verdict_folder:
             record["verdict"] = verdict_folder
 
-        # Before viewers read the line of the model: they show earlier steps with the old knowledge
+        # Save the knowledge before the line: viewers that read the line load both models, because
+        # they show earlier steps with the former one
         former_number = len(self.models) - 2
         save_knowledge(self.folder, self.models[former_number].knowledge, former_number)
         save_knowledge(self.folder, outcome.model.knowledge)

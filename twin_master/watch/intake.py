@@ -35,7 +35,7 @@ SNAPSHOT_STEPS = 32
 
 @dataclass
 class Counts:
-    """How many messages came, and what became of them.
+    """The counts of messages and steps of a watch, by what became of them.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Counts:
     late : int
         The messages that came late and were assimilated in their step.
     duplicates : int
-        The messages that said nothing new.
+        The messages about an earlier step that added nothing to it.
     rejected : int
         The messages that were refused.
     """
@@ -113,7 +113,8 @@ class Intake:
     has_ended : bool
         Whether the feed has ended. If not, more may come after `read` has returned None.
     on_poll : callable or None
-        Called now and then while nothing comes. Without it `read` does not wait.
+        Called again and again while no reading comes. If it is None, `read` does not wait for
+        messages.
     step_limit : int or None
         The number of steps after which the watch ends.
     end_is_requested : bool

@@ -16,7 +16,7 @@ from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 
 class Position(TypedDict):
-    """The position of a feed in a file, after a message, as a journal holds it.
+    """The position in a file up to which a feed has read it, as it is stored in a journal.
 
     Attributes
     ----------
@@ -62,14 +62,14 @@ def _number_of_suffix(suffix: str) -> int:
 
 
 def first_line(path: Path) -> bytes:
-    """Return the first line of a file, as far as it is written; empty if there is no file."""
+    """Return the first line of a file, perhaps still incomplete; empty if there is no file."""
     with suppress(FileNotFoundError), path.open("rb") as file:
         return file.readline(LARGEST_MESSAGE)
     return b""
 
 
 def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | None:
-    """Return the file that contains a position; None if there is none.
+    """Return the file, among a log and its rotated files, that contains a position, or None.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
 
 @lru_cache(1000)
 def _hash_of_beginning(beginning: bytes) -> str:
-    """Return the SHA-256 of the beginning of a file, by which the file is known again."""
+    """Return the SHA-256 of the beginning of a file, by which a renamed file is recognised."""
     return sha256(beginning).hexdigest()
 
 
@@ -235,7 +235,7 @@ class GrowingFile(Lines):
         return {"beginning": _hash_of_beginning(self._beginning[: self.end]), "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Yield the pieces of the file, and of those that take its place."""
+        """Yield the pieces of the file; if its name is followed, also of files that replace it."""
         try:
             if self._followed_path is None:
                 yield from self._pieces_to_end()
@@ -276,7 +276,7 @@ class GrowingFile(Lines):
             yield piece or None
 
     def _note_beginning(self, piece: bytes) -> None:
-        """Keep a piece, if it belongs to the beginning that identifies the file."""
+        """Add a piece to the beginning that identifies the file, until it is long enough."""
         if len(self._beginning) < _PIECE_BYTES:
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 

@@ -29,7 +29,7 @@ LARGEST_MESSAGE = 1_000_000
 LARGEST_STRAIN = 0.5
 """Largest strain; beyond it the publisher has forgotten the unit."""
 LARGEST_VALUE = 1e30
-"""Largest value of any other sensor, SI; it exceeds what exists, and its powers are finite."""
+"""Largest value of any other sensor, SI; no sensor reaches it, and its powers do not overflow."""
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
 """A unit whose first name has a power. The prefix has this power, too: a mm2 is 1e-6 m2."""
@@ -41,7 +41,7 @@ PRESENT_NAMES = {"turn": "step"}
 _UNITS_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """The length of a second in each unit of times."""
 _LEAST_SIMILARITY = 0.8
-"""Least ratio of `difflib` between a name and the known one that it was probably meant to be."""
+"""Least similarity (ratio of `difflib`) at which an unknown name counts as a misspelt known one."""
 _SHOWN_CHARACTERS = 60
 """Characters of an unknown name that a refusal shows."""
 _SHOWN_NAMES = 3
@@ -65,7 +65,7 @@ class Message(Reading):
     time : float or None
         The time [s] that the message names.
     assumed : bool
-        Whether its control was assumed when it was recorded, because no message had told it.
+        Whether its control was assumed when it was recorded, because no message had named it.
     ignored : dict of str to str
         The names in it that are no sensor. The value of a name is the known name that it was
         probably meant to be, in words; it is empty if there is none.
@@ -80,7 +80,7 @@ class Message(Reading):
 FeedItem = tuple[Message | Refused | None, str]
 """A message with the beginning of its text; None if no further message has come yet."""
 MessageContent = bytes | Mapping[str, object] | Message | Refused
-"""The content of a message: JSON, a parsed object, or what was already read or refused."""
+"""The content of a message: JSON text, a parsed object, or a message already read or refused."""
 
 
 class SensorColumn(NamedTuple):
@@ -105,7 +105,7 @@ class _SensorReadings:
     Attributes
     ----------
     observed : array of shape (G + I,)
-        The readings of the sensors and of the inspections, SI; NaN where none came.
+        The readings of G sensors, then those of I inspections, SI; NaN if none came.
     sensors : set of int
         The indices of the sensors that the message names.
     unreadable : dict of int to str
@@ -216,7 +216,7 @@ class MessageReader:
         return {prefix + unit: factor**power for prefix, factor in _PREFIXES.items()}
 
     def _find_likely_name(self, name: str) -> str:
-        """Return the known name that an unknown one was probably meant to be; empty if none."""
+        """Return the known name that an unknown one probably misspells; empty if there is none."""
         known_names = (*OTHER_KEYS, *self._sensor_of_name)
         matches = get_close_matches(name, known_names, 1, cutoff=_LEAST_SIMILARITY)
         return matches[0] if matches else ""

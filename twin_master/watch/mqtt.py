@@ -81,7 +81,11 @@ class Topic(Feed):
             yield self._read_payload(self.payloads.popleft() if self.payloads else None)
 
     def _read_payload(self, payload: bytes | None) -> FeedItem:
-        """Return the observation in a message, which must name its step or time."""
+        """Return the observation in a message, with the beginning of its text.
+
+        A message that names neither its step nor its time is refused: a broker may deliver it
+        twice, and the second one would count as another step.
+        """
         if payload is None:
             return None, ""
         message = self._reader.read(payload)
@@ -207,7 +211,7 @@ def _read_size(path: Path) -> int:
 
 
 class MqttFeed(Topic):
-    """The topic of one asset with a session of its own; see `Session` for the errors.
+    """The topic of one asset, with its own session at the broker; see `Session` for the errors.
 
     Parameters
     ----------
@@ -216,7 +220,7 @@ class MqttFeed(Topic):
     watch : Watch
         The watch of the asset; one that was begun before goes on with what the broker has kept.
     note : callable
-        Called with a sentence when the connection is lost or found.
+        Called with a sentence when the connection is lost or made.
     scenario : Scenario, optional
         The scenario by which messages are read; that of the watch if left out.
     """
@@ -248,7 +252,10 @@ class MqttFeed(Topic):
         }
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield what comes, without end; a message is acknowledged when it is in the journal."""
+        """Yield the messages as they come, without end; None while nothing comes.
+
+        A message is acknowledged once its step is in the journal.
+        """
         for message in self._session.receive(0.1):
             yield self._read_payload(None if message is None else bytes(message.payload))
 

@@ -43,7 +43,7 @@ _SESSION_SECONDS = 7 * 86_400
 """How long the broker keeps messages while the watch is away [s]."""
 _KEEPALIVE_SECONDS = 30
 _GOODBYE_SECONDS = 5.0
-"""How long the end waits for the broker to take the last decisions [s]."""
+"""Longest time that the end of a watch waits for the broker to take the last decisions [s]."""
 _PROPERTIES_BYTES = 10_000
 """Room for the topic and the properties of a message in its packet [bytes]."""
 
@@ -266,7 +266,7 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties",
     ) -> None:
-        """Hand the answer of the broker to the publisher of the message."""
+        """Hand the answer of the broker to the publisher that sent the message."""
         publisher = self._publisher_of_message.pop(message_id, None)
         if publisher is not None:
             publisher.note_answer(message_id, str(reason) if reason.is_failure else None)

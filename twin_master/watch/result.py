@@ -129,7 +129,7 @@ def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Figu
 
     Those of a patch are the root mean square residuals without and with it.
     """
-    words = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
+    template_fields = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
     message_counts = [
         step_count,
         counts.missing,
@@ -137,9 +137,9 @@ def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Figu
         counts.duplicates,
         counts.rejected,
     ]
-    figures = [FigureGroup("watch", words, message_counts)]
+    figures = [FigureGroup("watch", template_fields, message_counts)]
     for model in watch.teaching.adopted_models:
         residuals = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-        fields = words | {"first": model["from_step"]}
-        figures.append(FigureGroup("patch", fields, residuals))
+        patch_fields = template_fields | {"first": model["from_step"]}
+        figures.append(FigureGroup("patch", patch_fields, residuals))
     return figures

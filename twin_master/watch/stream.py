@@ -8,11 +8,11 @@ from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.watch.records import JsonObject
 
 REFUSALS_IN_A_ROW = 3
-"""Refused messages without an accepted one between them after which the operator is told."""
+"""Number of messages refused in a row after which the operator gets a notice."""
 TIME_UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 """Units of times, each a thousandth of the one before it, and their names."""
 _MOST_SLIPS = 24
-"""Largest number of ignored names in notices, so that a flood of them does not fill the journal."""
+"""Largest number of ignored names that a watch reports, so that they do not fill the journal."""
 
 
 def unit_advice(unit: str) -> str:

@@ -15,14 +15,14 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.records import JournalLine, JsonObject, ModelRecord, VerdictRecord
 
 SETTLE_STEPS = 10
-"""Steps that an alarm must hold before its cause is looked for; they also show what it is."""
+"""Number of steps after an alarm before its cause is searched; the search uses them as data."""
 CLEARLY = math.log(10.0)
 """Log evidence [nats] by which several gauges must explain an alarm better than one gauge.
 
 The alarm itself asks for the same.
 """
 CHECKED_BYTES = 250_000
-"""Least number of bytes at the end of a journal that are read, so that damage there is found."""
+"""Number of bytes at the end of a journal that are checked for damage when it is read."""
 
 _KEYS = {
     "threshold": "threshold",
@@ -223,7 +223,7 @@ class Teaching:
             self.verdict_on_trial = verdict
             return
         self.verdict_on_trial = None
-        # The next search has twice as many steps after the alarm, which may tell more.
+        # No patch is tried: search again once there are twice as many steps since the alarm
         if self._current_alarm is not None:
             alarm_step, _ = self._current_alarm
             last_searched = int(verdict["to_step"])

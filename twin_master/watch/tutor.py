@@ -143,7 +143,7 @@ class Tutor:
         self._watch.write_event(verdict=rejected)
 
     def close(self) -> None:
-        """End the search, if there is one; a watch that is taken up again begins it anew."""
+        """Stop the search, if one is running; a resumed watch starts it again."""
         if self._running_search is not None:
             self._running_search.stop()
         self._running_search = None
