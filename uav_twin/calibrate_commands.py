@@ -433,6 +433,7 @@ def calibrate_simulate(
         damping_alpha=alpha,
         damping_beta=beta,
     )
+    # Do the three experiments on the virtual wing
     if fmu is None:
         test_bench = _bench_of_reduced_model(wing_design, truth, frequency_error)
     else:

@@ -200,11 +200,13 @@ def import_files(
         "begins": begins,
         "held-out": [f"{name}=yes" for name in held_out or ()],
     }
+    # The options are answers to questions about columns and files
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
     understanding = _understand_files(files, answers, model)
     _print_understanding(understanding)
+    # Without a terminal, a question that is still open is an error of `campaign` below
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive:
         understanding = _ask_all_questions(understanding)

@@ -110,6 +110,8 @@ def run(
     check_verdict_folder(folder, replace_it=replace)
     catalogue = load_catalogue(effects or ())
     data, choice = _read_campaign_and_model(campaign, from_run, from_step, to_step, model)
+
+    # Record where the verdict comes from
     options_of_command = {
         "from-step": from_step,
         "to-step": to_step,
@@ -119,6 +121,8 @@ def run(
     }
     command = _repeatable_command(source, effects or [], from_run is not None, options_of_command)
     origin = _origin_of_verdict(data, choice, effects or [], command, seed)
+
+    # Search for the missing effect
     search_in_progress = SearchInProgress()
     with terminal.interruptible(lambda: _write_search_so_far(folder, search_in_progress, origin)):
         investigation = investigate(
@@ -127,6 +131,8 @@ def run(
     separability, self_calibration = _assess_campaign(
         investigation, choice, catalogue, calibrate, seed
     )
+
+    # Write and print the verdict; only a wing, which has a design, can be packed as a patched FMU
     pack = None if choice.design is None else partial(pack_beside_verdict, choice)
     content = ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack

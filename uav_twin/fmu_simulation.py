@@ -109,6 +109,7 @@ def simulate(
             "--interpolation says how inputs go on between the rows of --inputs: give these."
         )
     isolated = not in_process
+    # Without a binding: the default experiment of the FMU
     if binding is None:
         experiment = default_experiment(
             read_fmu(file),
@@ -121,7 +122,8 @@ def simulate(
         ) as asset:
             _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
         return
-    assert inputs is not None  # they go with a binding
+    # With a binding: the inputs over time from a file
+    assert inputs is not None  # checked above: both options are given or neither
     fmu_binding = _with_interpolation(load_binding(binding), interpolation)
     steps, histories = read_histories(inputs, fmu_binding)
     fmu_binding = ending_with_histories(fmu_binding, steps)

@@ -168,6 +168,7 @@ def verify(
         stage("CalculiX on the same mesh"),
     ):
         agreement = compare_with_calculix(structure_deck(structure), out or Path(scratch), modes)
+    # A check for each kind of response to each load, and one for all frequencies
     checks = []
     for load, differences in agreement.loads.items():
         for response, difference in differences.items():
@@ -391,6 +392,7 @@ def fmu(
         )
     source = find_structure(file)
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    # No further file may take the path of another one
     used_paths = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
     for option, path in (("--binding", binding), ("--rig", rig)):
         if path is None:

@@ -57,6 +57,7 @@ def wing(
         "design": wing_design.name,
         "design_hash": wing_design.hash,
         "structural_mass": mass_of_structure,
+        # The wing carries two servos and a pitot tube
         "mass": mass_of_structure + 2 * state.servo_mass + state.pitot_mass,
         "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
         "modes": [

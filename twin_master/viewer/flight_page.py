@@ -184,6 +184,7 @@ class FlightPage:
             The request of a viewer.
         """
         flight = self._flight
+        # The step to be shown
         count = flight.steps
         if not count:
             return None
@@ -191,6 +192,7 @@ class FlightPage:
         step = last_step
         if request.step != LATEST:
             step = min(max(request.step, 0), last_step)
+        # What the viewer has already
         has_same_flight = request.flight == flight.number
         shows_step = has_same_flight and request.shown == step
         if shows_step and request.count == count:

@@ -167,15 +167,18 @@ class Session:
             protocol=paho.MQTTv5,
             manual_ack=True,
         )
+        # Limits of the session
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = _SESSION_SECONDS
         properties.ReceiveMaximum = _UNREAD_MESSAGES
         properties.MaximumPacketSize = LARGEST_MESSAGE + _PROPERTIES_BYTES
+        # User and encryption
         broker = self._broker
         if broker.user is not None:
             client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
         if broker.tls:
             client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+        # The heartbeat that the broker publishes if the connection breaks
         last_will = json.dumps({"state": "lost"})
         client.will_set(self._heartbeat_topic, last_will, qos=1, retain=True)
         client.on_message = lambda _client, _data, message: self.unread.append(message)
