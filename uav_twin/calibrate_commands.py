@@ -121,7 +121,7 @@ def _print_posterior(result: "Calibration") -> None:
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:
-    """Return the calibration as plain data, for JSON."""
+    """Return the calibration as plain data for JSON: parameters, quantities, and their origin."""
     # Only a wing has a design. It is calibrated from a laboratory's folder, and every other model
     # from a campaign.
     name_of_source = "campaign" if result.design is None else "laboratory"

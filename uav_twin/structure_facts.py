@@ -155,7 +155,13 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
 
 
 def print_structure(record: Mapping[str, Any]) -> None:
-    """Print the facts about a structure, as `structure_record` returns them."""
+    """Print the facts about a structure: its content, parts, natural frequencies and loads.
+
+    Parameters
+    ----------
+    record : mapping of str to object
+        The facts, as `structure_record` returns them.
+    """
     rows = _mesh_rows(record) if "mesh" in record else _matrix_rows(record)
     terminal.print_table(("fact", "value", "unit"), rows)
     for remark in record["remarks"]:

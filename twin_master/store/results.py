@@ -149,7 +149,7 @@ class _GroupBuilder:
 
 
 def _coordinate_entries(result: MissionResult) -> list[Entry]:
-    """Return the coordinates of all axes, and the levels of each state factor by state."""
+    """Return the coordinates of all axes, and the value of each state factor in each state."""
     scenario = result.scenario
     flight = result.flight
     labels: dict[str, ArrayLike] = {

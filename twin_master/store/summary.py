@@ -492,7 +492,10 @@ def control_changes(
 
 
 def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
-    """Return the figures of a fallback: level, steps and delay, with their units."""
+    """Return the figures of a fallback: level, steps and delay, with their units.
+
+    A single figure says so if the policy depends on no state factor, or on several.
+    """
     state = fallback.switch_state
     level = fallback.switch_level
     if state is None or level is None:

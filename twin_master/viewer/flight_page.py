@@ -92,7 +92,11 @@ class FlightPage:
         self._error = ""
 
     def render_html(self) -> str:
-        """Return the page, whose script draws the figures from the answers."""
+        """Return the HTML of the page.
+
+        It contains all that does not change during a flight: names, units, axes and the planform of
+        a wing. The script of the page draws the figures from this and from the answers.
+        """
         flight = self._flight
         mission = flight.scenario.mission
         wing = planform_of(design_of(flight.folder), flight.scenario)

@@ -312,7 +312,10 @@ class Watch:
         return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
     def _write_step(self, step: MissionStep) -> JsonObject:
-        """Write a step into the journal; return its line."""
+        """Write a step into the journal, with the notices that were pending; return its line.
+
+        If the operator was told that no step comes any more, a notice says that they come again.
+        """
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)
         if self.is_quiet:

@@ -135,7 +135,10 @@ class Lines:
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[bytes | Refused | None]:
-        """Yield the lines, each with its line feed; None if no further line has come yet."""
+        """Yield the lines, each with its line feed; None while no further line has come.
+
+        A line that is too long is yielded as a refusal, once its end has come.
+        """
         line: bytes | Refused = b""
         for piece in self.pieces():
             if not isinstance(piece, bytes):

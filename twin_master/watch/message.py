@@ -274,7 +274,13 @@ class MessageReader:
         return record
 
     def _read_record(self, record: Mapping[str, object]) -> Message:
-        """Return the observation in a parsed message."""
+        """Return the observation in a parsed message.
+
+        Raises
+        ------
+        Refused
+            If a value is invalid, or if names of no sensor are not allowed.
+        """
         record = with_present_names(record, PRESENT_NAMES, "A message", Refused)
         readings = self._read_sensors(record)
         self._check_ignored_names(readings)
@@ -291,7 +297,11 @@ class MessageReader:
         )
 
     def _read_sensors(self, record: Mapping[str, object]) -> _SensorReadings:
-        """Return the readings of all sensors in a parsed message."""
+        """Return the readings of all sensors in a parsed message.
+
+        A value that is no number or too large leaves the sensor without a reading (`unreadable`).
+        Names of no sensor are collected in `ignored`, and refused later if they are not allowed.
+        """
         readings = _SensorReadings(np.full(self._width, np.nan))
         for name, value in self._named_values(record):
             if name == "covariance" and self._observation.modes is not None:

@@ -134,7 +134,11 @@ class Topic(Feed):
         self.publish()
 
     def publish(self) -> None:
-        """Send the decisions in the journal, as many as the session can take."""
+        """Send the decisions in the journal that were not sent yet, up to the limit of the session.
+
+        A decision that was already sent over a former connection is marked with `told_again`.
+        Nothing is sent during the pause after a refusal.
+        """
         if time.monotonic() < self._end_of_pause or self.watch is None:
             return
         with self._contained_errors():

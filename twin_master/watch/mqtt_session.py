@@ -147,7 +147,7 @@ class Session:
 
     @property
     def _is_connected(self) -> bool:
-        """Whether the broker has let the twin in, and the connection is not lost."""
+        """Whether the broker has accepted the connection, and it is not lost."""
         return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
@@ -203,7 +203,11 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties | None",
     ) -> None:
-        """Subscribe to the observations once the broker has let the twin in."""
+        """Subscribe to the observations once the broker has accepted the connection.
+
+        If the broker refuses it, the connection is dropped later, with this cause. A connection
+        that only discards the former session does not subscribe.
+        """
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
         if reason.is_failure:

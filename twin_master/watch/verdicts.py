@@ -165,7 +165,11 @@ def is_adopted(verdict: VerdictRecord, outcome: PatchOutcome) -> bool:
 
 
 def trial_sentence(verdict: VerdictRecord, outcome: PatchOutcome, step_name: str) -> str:
-    """Return the sentence for the operator at the end of the trial of a patch."""
+    """Return the message to the operator at the end of the trial of a patch.
+
+    It says how much evidence the patch gained, and whether it is adopted. If the alarm of many
+    gauges keeps it from being adopted, the message has the command to adopt it by hand.
+    """
     first_step = verdict["from_step"]
     comparison = (
         f"Beside the model for {TRIAL_STEPS} {step_name}s the patch gained "
