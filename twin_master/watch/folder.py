@@ -447,7 +447,7 @@ class Watch:
         Raises
         ------
         MissionInputError
-            If its first step is neither one that was watched nor the next one.
+            If no step was watched yet, or if `from_step` is neither one of them nor the next one.
         """
         steps = self.twin.steps
         if not steps or not 0 <= patch.from_step <= steps:
