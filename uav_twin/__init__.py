@@ -94,7 +94,7 @@ _HOMES = {
     "fly": "twin_master.workflow",
     "resume": "twin_master.workflow",
 }
-"""The public names, and the modules that they are imported from (a test compares both lists)."""
+"""The module of each public name; a test compares these names with the imports above."""
 
 __all__ = list(_HOMES)
 
@@ -106,7 +106,7 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # so that type checkers report names that do not exist
 
     def __getattr__(name: str) -> Any:
-        """Return a public name, imported now."""
+        """Return the object with a public name, importing its module at the first use."""
         if name not in _HOMES:
             raise AttributeError(
                 f"module 'uav_twin' has no attribute {name!r}; it has {', '.join(__all__)}"

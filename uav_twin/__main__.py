@@ -6,7 +6,7 @@ from uav_twin.shadowing import ShadowedPackageError, refuse_shadowing
 
 
 def main() -> None:
-    """Run the command line, once it is sure that it is made of this project's own packages."""
+    """Check that no other file hides a package of this project, and run the command line."""
     try:
         refuse_shadowing()
     except ShadowedPackageError as error:

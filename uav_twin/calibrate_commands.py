@@ -79,18 +79,18 @@ def calibrate_campaign(
 def print_calibration(
     result: "Calibration", written: Path | None, *, json: bool, report: bool
 ) -> None:
-    """Print the result of a calibration, and where it was written.
+    """Print the posterior of a calibration, and the files that were written.
 
     Parameters
     ----------
     result : Calibration
         The calibration.
     written : Path or None
-        Its file, if one was written.
+        The file of the calibration, if one was written.
     json : bool
         Whether to print JSON.
     report : bool
-        Whether a report stands beside the file.
+        Whether a report was written beside the file.
     """
     if json:
         file = None if written is None else str(written)
@@ -108,7 +108,7 @@ def print_calibration(
 
 
 def _print_posterior(result: "Calibration") -> None:
-    """Print the parameters of a calibration: what was known before, and what is known now."""
+    """Print prior and posterior of the parameters of a calibration, and their correlations."""
     from calibration.result import text
 
     terminal.show(
@@ -121,8 +121,9 @@ def _print_posterior(result: "Calibration") -> None:
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:
-    """Return the calibration as plain data, for JSON."""
-    # a wing, which has a design, is calibrated from a laboratory's folder, all else from a campaign
+    """Return the calibration as plain data for JSON: parameters, quantities, and their origin."""
+    # Only a wing has a design. It is calibrated from a laboratory's folder, and every other model
+    # from a campaign.
     name_of_source = "campaign" if result.design is None else "laboratory"
 
     def posterior(name: str) -> dict[str, Any]:
@@ -329,7 +330,8 @@ class RingDownRow(NamedTuple):
     figure, unit : str
         The name of the figure, and its unit.
     average : tuple of float
-        Mean, deviation between trials, and standard error of the mean.
+        The mean over the trials, the standard deviation between trials, and the standard error of
+        the mean.
     paper : float
         The published figure.
     """
@@ -431,6 +433,7 @@ def calibrate_simulate(
         damping_alpha=alpha,
         damping_beta=beta,
     )
+    # Do the three experiments on the virtual wing
     if fmu is None:
         test_bench = _bench_of_reduced_model(wing_design, truth, frequency_error)
     else:
@@ -456,7 +459,17 @@ def calibrate_simulate(
 def _bench_of_reduced_model(
     design: "WingDesign", truth: "DigitalState", frequency_error: tuple[float, float]
 ) -> "AbstractContextManager[TestBench]":
-    """Return a test bench with the reduced model of a wing, whose true frequencies may differ."""
+    """Return a test bench that measures the reduced model of a wing, as a context manager.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The design of the wing.
+    truth : DigitalState
+        The true parameters of the wing.
+    frequency_error : (float, float)
+        The relative differences of its first two natural frequencies from those of the model.
+    """
     from calibration.virtual_wing import VirtualWing
     from fe.reduction.model_cache import reduced_model
 
@@ -464,7 +477,7 @@ def _bench_of_reduced_model(
 
 
 def _bench_of_fmu(fmu: Path, truth: "DigitalState") -> "AbstractContextManager[TestBench]":
-    """Return a test bench with the FMU of a wing."""
+    """Return a test bench that measures the FMU of a wing, as a context manager."""
     from twin_master.assets.virtual_experiments import FmuTestBench
 
     return FmuTestBench(fmu, truth)
@@ -477,7 +490,7 @@ def _write_truth(
     seed: int,
     bench_name: str,
 ) -> None:
-    """Write the true state of a virtual wing, and how it was measured, as JSON."""
+    """Write the true parameters of a virtual wing, and how it was measured, as JSON."""
     record = asdict(truth.geometry) | {
         "young_modulus_factor": truth.young_modulus_factor,
         "servo_mass": truth.servo_mass,

@@ -41,12 +41,12 @@ class _SearchProcess:
 
 
 class DiscrepancySearch:
-    """Starts the workflow on discrepancies for an alarm; a `CauseSearch` of `twin_master`.
+    """Starts `uav-twin discrepancy run` for an alarm; it is a `CauseSearch` of `twin_master`.
 
     Parameters
     ----------
     command : sequence of str
-        The command that the options of the search are added to.
+        The words of the command, to which the options of the search are added.
     """
 
     def __init__(self, command: Sequence[str] = COMMAND) -> None:
@@ -55,7 +55,7 @@ class DiscrepancySearch:
     def start(self, request: SearchRequest) -> RunningSearch:
         """Start a search and return without waiting for its end.
 
-        The process has a session of its own, so that no key of the terminal ends it.
+        The process has a session of its own, so that Ctrl-C in the terminal does not end it.
         """
         options = {
             "--from-run": request.run_folder,
@@ -84,7 +84,13 @@ class DiscrepancySearch:
 def with_discrepancy_search(
     function: Callable[_Parameters, _Result],
 ) -> Callable[_Parameters, _Result]:
-    """Return a function of `twin_master` with a `DiscrepancySearch` as default `cause_search`."""
+    """Return a function whose argument `cause_search` is a `DiscrepancySearch` by default.
+
+    Parameters
+    ----------
+    function : callable
+        A function of `twin_master` with a keyword argument `cause_search`.
+    """
 
     @functools.wraps(function)
     def with_search(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:

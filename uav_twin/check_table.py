@@ -15,7 +15,7 @@ def print_checks(checks: Sequence[Check]) -> None:
 
 
 def _row(check: Check) -> tuple[str, ...]:
-    """Return the cells of a check; a figure without limit has no verdict."""
+    """Return the cells of a check; limit and verdict are left out if the check has no limit."""
     value = f"{check.value:,}" if isinstance(check.value, int) else f"{check.value:.3g}"
     figure = f"{value} {check.note}".rstrip()
     if check.limit is None:
@@ -25,7 +25,7 @@ def _row(check: Check) -> tuple[str, ...]:
 
 
 def exit_if_broken(checks: Sequence[Check]) -> None:
-    """End the command with exit code 1 if a limit is broken, with a sentence that says which."""
+    """End the command with exit code 1 if a check exceeds its limit; the message names all such."""
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
         raise terminal.error_exit(

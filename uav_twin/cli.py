@@ -43,14 +43,15 @@ def _common_options(
         ),
     ] = False,
 ) -> None:
-    """Take the options that belong to no command."""
+    """Accept the options that precede every command; `--version` acts by its callback."""
 
 
 def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function as the command that the name of a group calls, such as `calibrate`.
+    """Return a function as the command that runs if a group is called by its name alone.
 
-    Typer calls it before each command of the group, too. There it does nothing but refuse options
-    of its own, as in `calibrate --seed 3 simulate`: nothing would take them.
+    For example, `uav-twin calibrate` runs it, and `uav-twin calibrate simulate` does not. Typer
+    calls the function before each command of the group, too. Then it only refuses options that are
+    its own, as in `calibrate --seed 3 simulate`, because they would have no effect.
 
     Parameters
     ----------
@@ -69,7 +70,8 @@ def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
                 f"{context.info_name} {context.invoked_subcommand} ..."
             )
 
-    # Typer reads the options of a command from its signature
+    # Typer reads the options of a command from its signature: use that of the function, with the
+    # parameter of the context before the others
     command_of_group.__doc__ = function.__doc__
     context_parameter = inspect.signature(command_of_group).parameters["context"]
     signature = inspect.signature(function)
@@ -92,11 +94,11 @@ def _add_group(name: str, panel: str, text: str) -> typer.Typer:
     Parameters
     ----------
     name : str
-        The word that calls the group.
+        The name of the group on the command line.
     panel : str
-        The heading of the help under which it stands.
+        The heading in the help under which the group is listed.
     text : str
-        What the help says of it.
+        The description of the group in the help.
     """
     group = typer.Typer(no_args_is_help=True, help=text)
     app.add_typer(group, name=name, rich_help_panel=panel)
@@ -106,9 +108,19 @@ def _add_group(name: str, panel: str, text: str) -> typer.Typer:
 def _add_group_command(
     name: str, panel: str, text: str, function: Callable[..., None]
 ) -> typer.Typer:
-    """Add a group of commands whose name alone calls a command, too, and return the group.
+    """Add a group of commands that is also a command itself, and return the group.
 
-    The text stands in the list of commands; the help of the group is that of the function.
+    Parameters
+    ----------
+    name : str
+        The name of the group on the command line.
+    panel : str
+        The heading in the help under which the group is listed.
+    text : str
+        The description of the group in the list of commands. Its own help is the docstring of the
+        function.
+    function : callable
+        The command that runs if the group is called by its name alone.
     """
     group = typer.Typer()
     group.callback(invoke_without_command=True)(_command_of_group(function))

@@ -200,11 +200,13 @@ def import_files(
         "begins": begins,
         "held-out": [f"{name}=yes" for name in held_out or ()],
     }
+    # The options are answers to questions about columns and files
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
     understanding = _understand_files(files, answers, model)
     _print_understanding(understanding)
+    # Without a terminal, a question that is still open is an error of `campaign` below
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive:
         understanding = _ask_all_questions(understanding)
@@ -229,7 +231,14 @@ def _campaign_size(campaign: "Campaign") -> str:
 
 
 def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
-    """Return the values of an option, SUBJECT=VALUE or VALUE, by subject: a column or a file."""
+    """Return the values of an option by subject.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        The texts of the option, each SUBJECT=VALUE or VALUE. The subject is a column or a file; it
+        is the empty text for a value that holds for all of them.
+    """
     answers = {}
     for text in texts:
         subject, _, value = text.rpartition("=")
@@ -240,16 +249,19 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
 def _understand_files(
     files: list[Path], answers: dict[str, dict[str, str]], model: str | None
 ) -> "LaboratoryImport":
-    """Return how a laboratory's files are understood.
+    """Read a laboratory's files, and return their import with the answers of the user.
 
     Parameters
     ----------
     files : list of Path
         The files.
     answers : dict of str to (dict of str to str)
-        The answers of the user by option and by subject, a column or a file.
+        The values of the options, by the name of the option and then by its subject, which is a
+        column or a file.
     model : str or None
-        A model whose outputs name columns; its description is read after the files.
+        The name or the file of a model. Columns with the name of an output of the model are
+        understood as measurements of this output. The model is loaded only after the files were
+        read, so that their mistakes are found first.
     """
     from discrepancy.campaign.importing import LaboratoryImport
     from discrepancy.campaign.sheet import read_sheet
@@ -264,7 +276,11 @@ def _understand_files(
 
 
 def _ask_all_questions(understanding: "LaboratoryImport") -> "LaboratoryImport":
-    """Ask the user what the files do not say, and return the understanding with all answers."""
+    """Ask the user all open questions about the files; return the import with the answers.
+
+    Assumptions are defaults that the user may change; they are asked, too. If anything was asked,
+    the result is printed again.
+    """
     if not understanding.questions and not understanding.assumptions:
         return understanding
     while understanding.questions or understanding.assumptions:
@@ -274,11 +290,13 @@ def _ask_all_questions(understanding: "LaboratoryImport") -> "LaboratoryImport":
 
 
 def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
-    """Ask the user one question, and return the understanding with the answer.
+    """Ask the user the next question about the files, and return the import with the answer.
 
-    Questions that must be answered come first, then those with a default, which an empty line
-    takes. An answer that does not fit is refused, and changes nothing.
+    Questions without a default come first. The questions with a default are the assumptions of the
+    import; an empty line accepts the default. If an answer is invalid, an error is printed, and
+    the import is returned unchanged.
     """
+    # Questions and assumptions have the key (option, form of its value)
     if understanding.questions:
         option, expected = next(iter(understanding.questions))
         subject = understanding.questions[option, expected][0]
@@ -298,11 +316,15 @@ def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
 
 
 _DECIMAL_MARKS = {".": "points", ",": "commas"}
-"""What the marks before decimals are called."""
+"""The word for each decimal mark in the printed table."""
 
 
 def _print_understanding(understanding: "LaboratoryImport") -> None:
-    """Print how the columns of files are understood, each with a value that is not zero."""
+    """Print how each file and each column is understood.
+
+    The row of a column has an example: its first cell that is not zero, or its last cell, and the
+    value of this cell in SI units.
+    """
     for sheet in understanding.sheets:
         kind = understanding.kinds[sheet.name] or "?"
         decimal_mark = _DECIMAL_MARKS.get(understanding.decimals[sheet.name], "?")
@@ -313,6 +335,7 @@ def _print_understanding(understanding: "LaboratoryImport") -> None:
     for column in understanding.columns:
         sheet = column.sheet
         cells = sheet.columns[sheet.heads.index(column.head)]
+        # The decimal mark may be unknown, so that cells are texts: not zero means a digit 1 to 9
         nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
         row = nonzero_rows[0] if nonzero_rows else -1
         si_value = column.cells_in_si(understanding.decimals[sheet.name])[row]
@@ -365,7 +388,7 @@ def effects(
 
 
 def _print_effect(effect: "Effect") -> None:
-    """Print everything about an effect: facts, then parameters and exponents of its law."""
+    """Print the facts about an effect, and the parameters and exponents of its law."""
     from discrepancy.report.text import formula
 
     facts = (
@@ -401,7 +424,11 @@ def _parameter_row(parameter: "EffectParameter") -> tuple[str, ...]:
 
 
 def _exponent_row(exponent: "ShapeParameter") -> tuple[str, ...]:
-    """Return the cells of an exponent that is fixed in the named effect and free in its family."""
+    """Return the cells of an exponent of an effect's law.
+
+    The effect itself has a fixed exponent (`canonical`); it is a free parameter only if the search
+    tries other members of the family of the effect.
+    """
     prior = exponent.prior
     prior_text = f"{exponent.canonical:g}; freed: {prior.low:g} to {prior.high:g}"
     description = in_one_line(exponent.description)
@@ -474,8 +501,8 @@ def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> 
     Parameters
     ----------
     text : str
-        ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,...; parameters without a value have the
-        median of their prior.
+        The option: ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,... Parameters without a value
+        have the one of `_usual_values`. Without a place the effect acts at its first place.
     model : Model
         The model of the example.
     campaign : Campaign
@@ -509,10 +536,10 @@ def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> 
 
 
 def _usual_values(effect: "Effect") -> dict[str, float]:
-    """Return values of an effect's parameters by name: the medians of their priors.
+    """Return a typical value of each parameter of an effect: the median of its prior.
 
-    A magnitude of either sign has the median zero, which would hide nothing in an example. It has
-    the value one standard deviation above.
+    A magnitude that may have either sign has the median zero, with which the effect would be
+    absent. It gets the value one standard deviation above the median instead.
     """
     values = {}
     for parameter in effect.parameters:
@@ -565,7 +592,7 @@ def _parameter_values(
             raise CatalogueError(
                 f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
             )
-        values[name or names[position]] = value
+        values[name or names[position]] = value  # a value without a name belongs to its position
     return values
 
 

@@ -110,6 +110,8 @@ def run(
     check_verdict_folder(folder, replace_it=replace)
     catalogue = load_catalogue(effects or ())
     data, choice = _read_campaign_and_model(campaign, from_run, from_step, to_step, model)
+
+    # Record where the verdict comes from
     options_of_command = {
         "from-step": from_step,
         "to-step": to_step,
@@ -119,14 +121,18 @@ def run(
     }
     command = _repeatable_command(source, effects or [], from_run is not None, options_of_command)
     origin = _origin_of_verdict(data, choice, effects or [], command, seed)
-    in_progress = SearchInProgress()
-    with terminal.interruptible(lambda: _write_search_so_far(folder, in_progress, origin)):
+
+    # Search for the missing effect
+    search_in_progress = SearchInProgress()
+    with terminal.interruptible(lambda: _write_search_so_far(folder, search_in_progress, origin)):
         investigation = investigate(
-            data, choice.model, catalogue, seed=seed, on_search=in_progress.remember_search
+            data, choice.model, catalogue, seed=seed, on_search=search_in_progress.remember_search
         )
     separability, self_calibration = _assess_campaign(
         investigation, choice, catalogue, calibrate, seed
     )
+
+    # Write and print the verdict; only a wing, which has a design, can be packed as a patched FMU
     pack = None if choice.design is None else partial(pack_beside_verdict, choice)
     content = ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack
@@ -141,7 +147,7 @@ def run(
 def _origin_of_verdict(
     campaign: "Campaign", choice: "ModelChoice", effects: list[Path], command: str, seed: int
 ) -> "Origin":
-    """Return what a verdict rests on: campaign, model and further effects, with their hashes.
+    """Return the origin of a verdict: campaign, model and further effects, with their hashes.
 
     Parameters
     ----------
@@ -176,12 +182,13 @@ def _origin_of_verdict(
 def _refuse_unfit_sources(
     campaign: Path | None, from_run: Path | None, from_step: int | None, to_step: int | None
 ) -> None:
-    """Refuse both sources of records or none of them, and steps that are not those of a mission.
+    """Check that the options name one source of records, and steps only for a mission.
 
     Raises
     ------
     CampaignFileError
-        If the options do not fit together; the sentence says which.
+        If both a campaign and a mission are given or neither of them, if steps are given without a
+        mission, or if the last step lies before the first one.
     """
     if (campaign is None) == (from_run is None):
         raise CampaignFileError(
@@ -202,7 +209,9 @@ def _assess_campaign(
     calibrate: int | None,
     seed: int,
 ) -> tuple["Separability | None", "SelfCalibration | None"]:
-    """Return what a campaign can decide, and how often the workflow is right on simulated ones.
+    """Return which effects a campaign can decide on, and how reliable the workflow is for it.
+
+    The reliability is measured on simulated campaigns of the same geometry.
 
     Parameters
     ----------
@@ -220,8 +229,8 @@ def _assess_campaign(
     Returns
     -------
     Separability or None, SelfCalibration or None
-        Both are None if the records could not be compared with the model; the second is also None
-        if no number of simulated campaigns is given.
+        Both are None if the records could not be compared with the model. The self-calibration is
+        also None if `calibrate` is None.
     """
     from discrepancy.judgement.separability import compute_separability
     from discrepancy.model_choice import ModelKind
@@ -236,7 +245,7 @@ def _assess_campaign(
         )
     if calibrate is None:
         return separability, None
-    workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU is its own process
+    workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU already runs in its own process
     with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as progress:
         self_calibration = self_calibrate(
             tested_campaign,
@@ -251,9 +260,12 @@ def _assess_campaign(
 
 
 def _write_search_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin") -> str:
-    """Write the fits of an interrupted search, and return the sentence that says where.
+    """Write the hypotheses that an interrupted search has fitted so far.
 
-    The sentence is empty if there are none yet.
+    Returns
+    -------
+    str
+        The message to the user that names the file; empty if no hypothesis was fitted yet.
     """
     from discrepancy.verdict_so_far import write_so_far
 
@@ -264,16 +276,19 @@ def _write_search_so_far(folder: Path, in_progress: "SearchInProgress", origin: 
 def _print_conclusion(
     content: "ReportInput", folder: Path, report: Path | None, *, json: bool
 ) -> None:
-    """Print the conclusion of an investigation; faulty data end the command with exit code 1.
+    """Print the verdict of an investigation, where it is stored, and the next command.
+
+    If the verdict is that the data are faulty, the faults are printed to the error stream instead,
+    and the command ends with exit code 1.
 
     Parameters
     ----------
     content : ReportInput
         The investigation.
     folder : Path
-        The folder of its verdict.
+        The folder of the verdict.
     report : Path or None
-        Its report, if one was written.
+        The file of the report, if one was written.
     json : bool
         Whether to print JSON.
     """
@@ -285,9 +300,9 @@ def _print_conclusion(
     verdict = investigation.verdict
     has_faulty_data = verdict.kind is VerdictKind.DATA_ERROR
     if json:
-        record = {"folder": str(folder), "report": None if report is None else str(report)}
-        stored = (folder / VERDICT_NAME).read_text(encoding="utf-8")
-        terminal.print_json(record | loads(stored))
+        locations = {"folder": str(folder), "report": None if report is None else str(report)}
+        verdict_text = (folder / VERDICT_NAME).read_text(encoding="utf-8")
+        terminal.print_json(locations | loads(verdict_text))
     if has_faulty_data:
         further_faults = [fault.sentence for fault in investigation.faults[1:]]
         for sentence in (verdict.sentence, *further_faults):
@@ -314,11 +329,12 @@ def _read_campaign_and_model(
     Parameters
     ----------
     campaign, from_run : Path or None
-        The folder of a campaign, or that of a mission's run; the other one is None.
+        The folder of a campaign, and that of a mission's run. Exactly one of them is given.
     first_step, last_step : int or None
         The first and the last step of the run that are compared; all steps by default.
     model : str or None
-        The model; by default that of the twin of the run.
+        The name or the file of the model. By default it is the model of the twin for a run, and
+        the shipped wing for a campaign.
     """
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choice_of_run, choose_model
@@ -334,17 +350,18 @@ def _read_campaign_and_model(
             if model is not None:
                 return data, choose_model(model)
             return data, dataclasses.replace(choice_of_run(folder), file=str(from_run.resolve()))
-        except DiscrepancyError as error:  # a watch is read from a copy that its user does not know
+        except DiscrepancyError as error:
+            # A watch is read from a temporary copy: name the folder that the user knows
             raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
 
 def use_one_thread() -> None:
-    """Hold the linear algebra of this process to one thread, for good.
+    """Limit the linear algebra of this process to one thread, until the process ends.
 
-    Its matrices are small: several threads would wait for each other, and the last bits of a sum
-    would depend on their number.
+    The matrices are small, so that several threads would only wait for each other. Moreover, the
+    rounding of sums would depend on the number of threads.
     """
-    import scipy.linalg  # noqa: F401 - a library that is not loaded yet cannot be held
+    import scipy.linalg  # noqa: F401 - only libraries that are loaded already are limited
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)
@@ -353,18 +370,19 @@ def use_one_thread() -> None:
 def _repeatable_command(
     source: Path, effects: list[Path], from_run: bool, values: Mapping[str, str | int | None]
 ) -> str:
-    """Return the command that does the same in any folder, with absolute paths.
+    """Return the command line that repeats the investigation from any working folder.
 
     Parameters
     ----------
     source : Path
         The folder of the campaign, or of the run.
     effects : list of Path
-        Files of further effects.
+        The files of further effects.
     from_run : bool
-        Whether the source is a run.
+        Whether the source is the folder of a run.
     values : mapping of str to (str, int or None)
-        Values of further options by name; None for an option that was not given.
+        The values of further options by the name of the option, without dashes. None stands for an
+        option that was not given.
     """
     words = ["uav-twin", "discrepancy", "run"]
     if from_run:
@@ -379,7 +397,10 @@ def _repeatable_command(
 
 
 def _print_verdict(content: "ReportInput", folder: Path) -> None:
-    """Print a verdict, with the intervals of its patch if there is one in the folder."""
+    """Print a verdict.
+
+    If its folder contains a patch, the intervals of the parameters are read from there.
+    """
     from discrepancy.files.verdict import PATCH_NAME, read_patch
     from discrepancy.report.page import template_values
     from discrepancy.report.text import WORDS
@@ -435,7 +456,10 @@ def _print_check(
     faults: "Sequence[DataFault]",
     separability: "Separability | None",
 ) -> None:
-    """Print the faults of a campaign, and what it can decide unless a fault prevents that."""
+    """Print the faults of a campaign's data, and which effects the campaign can decide on.
+
+    The latter is left out if it is None, because a fault is fatal.
+    """
     from discrepancy.report.decidability_text import (
         campaign_needs,
         confused_effects,
@@ -465,7 +489,7 @@ def _check_record(
     faults: "Sequence[DataFault]",
     separability: "Separability | None",
 ) -> dict[str, Any]:
-    """Return the faults of a campaign, and what it can decide, as plain data.
+    """Return the faults of a campaign, and which effects it can decide on, as plain data.
 
     Parameters
     ----------
@@ -476,8 +500,8 @@ def _check_record(
     faults : sequence of DataFault
         Faults of the data.
     separability : Separability or None
-        What the campaign can decide; None where faults leave nothing. A magnitude that is never
-        seen is null.
+        The detectability of each effect, and the groups of effects that the campaign cannot tell
+        apart; None if a fault is fatal. A magnitude that is detectable at no value is null.
     """
     detectability = () if separability is None else separability.detectability
     return {

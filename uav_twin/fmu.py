@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fmu_asset.ssp.check import SspCheck
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
-"""The switch of a missing effect among the variables of an FMU."""
+"""The name `effect.NAME.active` of the FMU variable that switches an effect of a patch on."""
 
 _COLOUR_OF_VERDICT = {"ok": "green", "warning": "yellow", "problem": "red", "skipped": "dim"}
 """Colours of the rows of `fmu check`."""
@@ -59,7 +59,8 @@ def bind(
     from fmu_asset.client.draft import draft_binding
 
     refuse_existing(out, replace=replace)
-    # nothing of 100,000 variables is garbage, and looking for it takes a third of the time
+    # The objects of up to 100,000 variables all stay in use: garbage collection would free nothing
+    # and take a third of the time
     gc.disable()
     try:
         text = draft_binding(read_fmu(file), step_size=step_size)
@@ -239,7 +240,17 @@ def build(
 
 
 def _build_script(script: str, target: Path, *, replace: bool) -> None:
-    """Pack a model script, a shipped one or a file, and print what was written."""
+    """Pack a model script as an FMU, and print the file that was written.
+
+    Parameters
+    ----------
+    script : str
+        The name of a shipped script, or the path of a script.
+    target : Path
+        The FMU to write.
+    replace : bool
+        Whether to replace an existing file.
+    """
     from fmu_asset.packing.script import build_script_fmu
 
     source = asset_scripts().get(script, Path(script))
@@ -259,9 +270,10 @@ def _build_wing(
     activate: bool,
     replace: bool,
 ) -> None:
-    """Pack a wing, and print what was written; the parameters are the options of `fmu build`.
+    """Pack a wing as an FMU, and print the file that was written.
 
-    Everything that can be refused is refused before the wing is reduced, which can take minutes.
+    The parameters are the options of `fmu build`. All options are checked before the reduced model
+    of the wing is computed, which can take minutes.
     """
     from calibration.result.file import load_calibration, tailoring
     from fe.wing.design import load_design
@@ -333,9 +345,15 @@ def info(
 
 
 def _fact_rows(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return name and value of each fact about an FMU, of the record that `describe_fmu` returns.
+    """Return the rows (name, value) of the table of facts about an FMU.
 
-    The platforms and the missing effects, each with its switch, come last.
+    They are the entries of the record that are single values, then the platforms, then the effects
+    that a patch has added to the FMU, each with "on" or "off" for its switch.
+
+    Parameters
+    ----------
+    record : mapping of str to object
+        The facts, as `describe_fmu` returns them.
     """
     rows = [
         (name.replace("_", " "), str(value))
@@ -357,7 +375,8 @@ def _fact_rows(record: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _variable_row(variable: "VariableInfo") -> list[str]:
     """Return the cells of a variable in the table of variables.
 
-    The items of an enumeration stand with its description.
+    The items of an enumeration are added to its description. A cell is empty if the FMU does not
+    give its value.
     """
     description = variable.description
     if variable.items:
@@ -413,7 +432,10 @@ def export(
 
 
 def _is_design(what: str) -> bool:
-    """Return whether a name or path is that of a wing design: a TOML file without a mission."""
+    """Return whether an argument names a wing design, and not a scenario.
+
+    It does if it is the name of the shipped design, or a TOML file with a table `planform`.
+    """
     from reporting.toml_file import read_toml
 
     try:
@@ -441,7 +463,10 @@ def check_system(file: SspArgument, *, json: JsonOption = False) -> None:
 
 
 def _print_system(file: Path, result: "SspCheck") -> None:
-    """Print warnings about a system of FMUs, and what is in it if no problem was found."""
+    """Print the warnings about a system of FMUs, and its content if no problem was found.
+
+    The content is the number of connections and parameters, and the order of evaluation.
+    """
     if result.left_out:
         terminal.say(f"warning: {result.left_out}")
     for loop in result.loops:

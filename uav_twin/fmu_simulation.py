@@ -109,6 +109,7 @@ def simulate(
             "--interpolation says how inputs go on between the rows of --inputs: give these."
         )
     isolated = not in_process
+    # Without a binding: the default experiment of the FMU
     if binding is None:
         experiment = default_experiment(
             read_fmu(file),
@@ -121,7 +122,8 @@ def simulate(
         ) as asset:
             _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
         return
-    assert inputs is not None  # they go with a binding
+    # With a binding: the inputs over time from a file
+    assert inputs is not None  # checked above: both options are given or neither
     fmu_binding = _with_interpolation(load_binding(binding), interpolation)
     steps, histories = read_histories(inputs, fmu_binding)
     fmu_binding = ending_with_histories(fmu_binding, steps)
@@ -220,7 +222,10 @@ def simulate_system(
 
 
 def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
-    """Refuse files that cannot be written, before anything is simulated."""
+    """Refuse result files of an unknown format, and existing ones that are not to be replaced.
+
+    This is checked before the simulation, so that its result is not lost.
+    """
     targets = (("--out", out, (".csv", ".nc")), ("--plot", plot, (".png", ".svg")))
     for option, path, suffixes in targets:
         if path is not None and path.suffix not in suffixes:
@@ -231,7 +236,10 @@ def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bo
 
 
 def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
-    """Return the values of `--set NAME=VALUE` by name, as texts that the variables interpret."""
+    """Return the values of `--set NAME=VALUE` by name.
+
+    They stay texts, because only the type of the variable says how its value is read.
+    """
     values: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -245,7 +253,15 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
-    """Return a binding whose inputs are interpolated as `--interpolation` says, if it is given."""
+    """Return a binding with the interpolation of inputs that the user chose.
+
+    Parameters
+    ----------
+    binding : Binding
+        The binding.
+    kind : str or None
+        The value of `--interpolation`; None leaves the binding as it is.
+    """
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
@@ -260,7 +276,10 @@ def _write_and_print_history(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Write and draw a simulated history, and print where it is; if nowhere, print its end.
+    """Write, draw and print a simulated history.
+
+    The files of `--out` and `--plot` are written. If neither is given, a table of the outputs is
+    printed instead.
 
     Parameters
     ----------
@@ -281,21 +300,23 @@ def _write_and_print_history(
     columns = _history_columns(asset, history)
     if plot is not None:
         _draw_history(plot, history, columns)
-    end = history.time[-1] if len(history.time) else asset.time
-    # the start may be a row of its own
+    end_time = history.time[-1] if len(history.time) else asset.time
+    # Each row is a step, but the first row may be the state at the start
     steps = int((history.time > asset.binding.binding.start_time).sum())
-    written = [str(path) for path in (out, plot) if path is not None]
-    files = ", ".join(written) or file
-    terminal.say(f"{files}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
+    written_files = [str(path) for path in (out, plot) if path is not None]
+    files = ", ".join(written_files) or file
+    terminal.say(
+        f"{files}: {steps} steps to t = {end_time:g} s, every {asset.binding.interval:g} s."
+    )
     if history.ended:
         terminal.say(history.ended)
-    if columns and not written:
+    if columns and not written_files:
         headings = ("output", "first", "least", "largest", "last", "unit")
         terminal.print_table(headings, [column.cells() for column in columns])
 
 
 class HistoryColumn(NamedTuple):
-    """An output over time: its name, its unit, and its values (N,)."""
+    """An output over time: its name, its unit, and its value at each time of the history."""
 
     name: str
     unit: str
@@ -309,7 +330,7 @@ class HistoryColumn(NamedTuple):
 
 
 def _history_columns(asset: "FmiAsset", history: "ObservationHistory") -> list[HistoryColumn]:
-    """Return the observed outputs of an asset over time, then what is recorded beside them."""
+    """Return a column for each observed output of an asset, then for each recorded variable."""
     binding = asset.binding
     units = [unit for vector in binding.observation.values() for unit in vector.units]
     columns = [
@@ -326,7 +347,11 @@ def _history_columns(asset: "FmiAsset", history: "ObservationHistory") -> list[H
 def _draw_history(
     path: Path, history: "ObservationHistory", columns: Sequence[HistoryColumn]
 ) -> None:
-    """Draw the outputs over time, those of one unit in one panel, and write the picture."""
+    """Draw the outputs over time, with one panel for each unit, and write the picture.
+
+    At most `_MOST_PANELS` panels with `_MOST_LINES` lines each are drawn; a legend says how many
+    lines are left out.
+    """
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
 
     columns_of_unit: dict[str, list[HistoryColumn]] = {}
@@ -334,6 +359,7 @@ def _draw_history(
         columns_of_unit.setdefault(column.unit, []).append(column)
     panels = list(columns_of_unit.items())[:_MOST_PANELS]
     with publication_style():
+        # Height [inch]: 1.5 for each panel, and 0.5 for the label of the time axis
         figure = new_figure(0.5 + 1.5 * len(panels), FULL_WIDTH)
         axes = figure.subplots(len(panels), squeeze=False, sharex=True).ravel()
         for panel_axes, (unit, lines) in zip(axes, panels, strict=True):
@@ -454,7 +480,11 @@ def sample(
 
 
 def _print_library(sampled: "SamplingOutcome") -> None:
-    """Print the file of an observation library, its shape, and what the sampling took."""
+    """Print the file of an observation library, its shape, and the effort of the sampling.
+
+    The effort is the number of processes, the time, and, after an interruption, the number of
+    blocks that were kept and not sampled again.
+    """
     library = sampled.library
     shape = " x ".join(map(str, library.values.shape))
     kept_blocks = ""

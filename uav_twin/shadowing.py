@@ -13,7 +13,7 @@ PACKAGES = (
     "scenarios",
     "twin_master",
 )
-"""The packages that `uav_twin` hands on from; they lie beside it."""
+"""The packages of this project from which `uav_twin` imports; their folders lie beside its own."""
 
 
 class ShadowedPackageError(ImportError):
@@ -22,12 +22,15 @@ class ShadowedPackageError(ImportError):
 
 @cache
 def refuse_shadowing() -> None:
-    """Make sure, once, that each package of this project is the one that will be imported.
+    """Check that Python imports the packages of this project, and not others of the same name.
+
+    The check is made once in a process.
 
     Raises
     ------
     ShadowedPackageError
-        If one is not: such a file lies beside the user's script, or was imported before.
+        If another file or folder would be imported: it lies beside the script of the user, or was
+        imported before.
     """
     project = Path(__file__).resolve().parent.parent
     for name in PACKAGES:
@@ -45,7 +48,7 @@ def _import_location(name: str) -> Path | None:
     """Return the file or folder that Python would import for a name; None if it finds nothing."""
     try:
         spec = find_spec(name)
-    except ValueError:  # a module that was made without a file
+    except ValueError:  # a module was imported that was not made from a file
         return None
     if spec is None:
         return None

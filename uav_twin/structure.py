@@ -42,14 +42,15 @@ FREQUENCY_LIMIT = 1e-6
 
 
 def find_structure(file: Path) -> Path:
-    """Return a structure file; that of a shipped structure if no file, but one of these is named.
+    """Return the path of a structure file, given as a path or as the name of a shipped structure.
 
-    If there is neither, the path is returned as it is; who reads it refuses it.
+    If the argument is neither, it is returned as it is, so that the reader of the file refuses it.
 
     Raises
     ------
     DesignFileError
-        If there is neither, but the name of a shipped structure is like the path.
+        If the argument is neither, but similar to the name of a shipped structure. The message
+        names this structure.
     """
     if file.exists():
         return file
@@ -78,7 +79,18 @@ def _in_bytes(gibibytes: float | None) -> float | None:
 def _assemble_mesh(
     file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False
 ) -> "Structure":
-    """Return the full model of a structure with a mesh."""
+    """Return the full finite element model of a structure with a mesh.
+
+    Parameters
+    ----------
+    file : Path
+        The structure file, or the name of a shipped structure.
+    memory_limit : float or None
+        The largest memory [GiB] that the model may take.
+    mass_as_stiffness : bool
+        Whether to integrate the mass matrix with the points of the stiffness matrix, as CalculiX
+        does.
+    """
     from fe.structure.operators import load_and_assemble
 
     with stage("Reading the mesh and assembling"):
@@ -88,7 +100,15 @@ def _assemble_mesh(
 
 
 def _assemble(file: Path, memory_limit: float | None) -> "AffineStructure":
-    """Return the full model of a structure with a mesh or with matrices."""
+    """Return the full model of a structure with a mesh or with matrices.
+
+    Parameters
+    ----------
+    file : Path
+        The structure file, or the name of a shipped structure.
+    memory_limit : float or None
+        The largest memory [GiB] that the model may take.
+    """
     from fe.structure.operators import assemble_structure
 
     with stage("Reading and assembling"):
@@ -148,6 +168,7 @@ def verify(
         stage("CalculiX on the same mesh"),
     ):
         agreement = compare_with_calculix(structure_deck(structure), out or Path(scratch), modes)
+    # A check for each kind of response to each load, and one for all frequencies
     checks = []
     for load, differences in agreement.loads.items():
         for response, difference in differences.items():
@@ -211,9 +232,9 @@ def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) 
     Parameters
     ----------
     texts : sequence of str
-        NAME=VALUE, each name once.
+        The options, each NAME=VALUE; a name may occur once.
     ranges : mapping of str to (float, float)
-        Least and largest value of each name.
+        The least and the largest value of each name.
 
     Raises
     ------
@@ -223,11 +244,11 @@ def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) 
     values: dict[str, float] = {}
     for text in texts:
         name, _, number = text.partition("=")
-        low, high = ranges.get(name, (inf, -inf))
+        low, high = ranges.get(name, (inf, -inf))  # an empty range for an unknown name
         try:
             value = float(number)
         except ValueError:
-            value = nan
+            value = nan  # outside every range
         if name in values or not low <= value <= high:
             known = [f"{name} from {low:g} to {high:g}" for name, (low, high) in ranges.items()]
             raise typer.BadParameter(
@@ -286,7 +307,7 @@ def reduce(
 
 
 def _print_reduced_model(model: "ReducedModel") -> None:
-    """Print the ranges of a reduced model's inputs, and how many vectors and outputs it has."""
+    """Print the ranges of a reduced model's inputs, and the sizes of its bases and outputs."""
     kinds = _input_kinds(model)
     rows = []
     for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
@@ -311,7 +332,10 @@ def _input_kinds(model: "ReducedModel") -> dict[str, str]:
 
 
 def _print_errors(errors: "MeasuredErrors") -> None:
-    """Print the largest errors of a reduced model; those of outputs that it lacks are left out."""
+    """Print the largest errors of a reduced model.
+
+    An error is NaN, and is left out, if the model has no such output.
+    """
     values = {
         "strains, of the largest": errors.strain,
         "displacements, of the largest": errors.displacement,
@@ -368,6 +392,7 @@ def fmu(
         )
     source = find_structure(file)
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    # No further file may take the path of another one
     used_paths = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
     for option, path in (("--binding", binding), ("--rig", rig)):
         if path is None:
@@ -378,7 +403,7 @@ def fmu(
             )
         used_paths[path.resolve()] = f"the file of {option}"
         refuse_existing(path, replace=replace, option=option)
-    # texts of further files, before anything is built or written
+    # Make the texts of the further files before anything is built or written, because this may fail
     design = load_structure(source)
     binding_text = structure_binding_text(design) if binding is not None else ""
     model_text = rig_text(design, relpath(target, rig.parent)) if rig is not None else ""

@@ -18,10 +18,17 @@ BYTES_OF_A_GIBIBYTE = 2**30
 
 
 def structure_record(structure: AffineStructure, modes: int) -> dict[str, Any]:
-    """Return the facts about a structure without damage, at nominal values, by name.
+    """Return the facts about an undamaged structure at its nominal values, by name.
 
-    Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in
-    SI units.
+    All values are in SI units, except for the lengths `centre_of_gravity`, `lower` and `upper`,
+    which are in the `length_unit` of the mesh.
+
+    Parameters
+    ----------
+    structure : AffineStructure
+        The structure, from a mesh or from matrices.
+    modes : int
+        The number of natural frequencies to compute. None is computed for a structure without mass.
     """
     design = structure.design
     if isinstance(structure, Structure):
@@ -46,7 +53,7 @@ def structure_record(structure: AffineStructure, modes: int) -> dict[str, Any]:
 
 
 def _load_facts(structure: AffineStructure, name: str, response: AffineResponse) -> dict[str, Any]:
-    """Return the facts about a load and the response to it alone, by name."""
+    """Return the facts about a load, and about the static response to this load alone."""
     strains = response.strain.tolist()
     displacements = response.output.tolist()
     return {
@@ -60,7 +67,7 @@ def _load_facts(structure: AffineStructure, name: str, response: AffineResponse)
 
 
 def _mesh_facts(structure: Structure) -> dict[str, Any]:
-    """Return the facts about a structure from a mesh, by name."""
+    """Return the facts that only a structure from a mesh has: mesh, mass, box and parts."""
     mesh = structure.mesh
     mass, centre = mass_and_centre(structure)
     return {
@@ -83,20 +90,20 @@ def _mesh_facts(structure: Structure) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StructurePart:
-    """A part of a structure, as it is listed.
+    """A row in the list of materials, supports, loads and other parts of a structure.
 
     Attributes
     ----------
     what : str
-        The kind of part.
+        The kind of part, such as "material".
     name : str
-        Its name.
+        The name of the part.
     set : str or None
-        The set of the mesh that it is on.
+        The set of elements or nodes of the mesh to which the part is assigned.
     count : int
-        How many elements, nodes or faces it has.
+        The number of elements, nodes, faces or places of the part.
     of : str
-        Which of these are counted.
+        What is counted, such as "elements".
     note : str
         A remark.
     """
@@ -142,13 +149,19 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
             yield StructurePart("port", port.name, port.set, count, "nodes")
     for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
         note = ""
-        if distance > 1e-6 * mesh.size:
+        if distance > 1e-6 * mesh.size:  # more than rounding
             note = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
         yield StructurePart("gauge", gauge.name, "", 1, "place", note)
 
 
 def print_structure(record: Mapping[str, Any]) -> None:
-    """Print the facts about a structure, as `structure_record` returns them."""
+    """Print the facts about a structure: its content, parts, natural frequencies and loads.
+
+    Parameters
+    ----------
+    record : mapping of str to object
+        The facts, as `structure_record` returns them.
+    """
     rows = _mesh_rows(record) if "mesh" in record else _matrix_rows(record)
     terminal.print_table(("fact", "value", "unit"), rows)
     for remark in record["remarks"]:
@@ -167,7 +180,7 @@ def print_structure(record: Mapping[str, Any]) -> None:
 
 
 def _matrix_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return the rows of the facts about a structure from matrices."""
+    """Return the rows (fact, value, unit) of the table of a structure from matrices."""
     return [
         ("name", record["name"]),
         ("matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"),
@@ -176,7 +189,7 @@ def _matrix_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _mesh_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return the rows of the facts about a structure from a mesh."""
+    """Return the rows (fact, value, unit) of the table of a structure from a mesh."""
     length_unit = record["length_unit"]
     elements = f"{record['elements']:,} {record['kind']}"
     rows: list[tuple[str, ...]] = [
@@ -209,13 +222,16 @@ def _point_text(point: list[float]) -> str:
 
 
 def _part_row(part: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the cells of a part of a structure, of which a dictionary has the attributes."""
+    """Return the cells of a part of a structure, given as the dictionary of a `StructurePart`."""
     contents = f"{part['count']:,} {part['of']}"
     return (part["what"], part["name"], str(part["set"]), contents, part["note"])
 
 
 def _print_load(load: Mapping[str, Any]) -> None:
-    """Print a load, its largest displacement, and the strains and displacements of sensors."""
+    """Print a load, its largest displacement [mm], and the response of all sensors to it.
+
+    Strains are printed in microstrain, displacements in mm.
+    """
     name = load["name"]
     if load["control"]:
         name = f"{name} at {load['control']} = {load['value']:g}"

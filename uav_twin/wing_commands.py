@@ -57,6 +57,7 @@ def wing(
         "design": wing_design.name,
         "design_hash": wing_design.hash,
         "structural_mass": mass_of_structure,
+        # The wing carries two servos and a pitot tube
         "mass": mass_of_structure + 2 * state.servo_mass + state.pitot_mass,
         "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
         "modes": [
@@ -78,7 +79,13 @@ def wing(
 def _write_wing_fields(
     path: Path, wing_design: "WingDesign", state: "DigitalState"
 ) -> tuple[Path, Path]:
-    """Write the fields of a wing in a 3 g turn, and its modes beside them; return both files."""
+    """Write the fields of a wing at a load factor of 3, and its modes, as two VTU files.
+
+    Returns
+    -------
+    (Path, Path)
+        The file of the fields, and that of the modes, which has the suffix `-modes` in its name.
+    """
     from fe.reduction.model_cache import wing_fields, write_modes_vtu, write_wing_vtu
 
     fields = wing_fields(wing_design)
@@ -90,7 +97,10 @@ def _write_wing_fields(
 
 
 def _print_wing(record: dict[str, Any]) -> None:
-    """Print the figures of a wing beside the published ones, and the files that were written."""
+    """Print masses, stiffness and frequencies of a wing beside the published ones.
+
+    The files that were written are printed, too.
+    """
     rows = [
         ("mass of the structure", f"{record['structural_mass']:.4f}", "", "kg"),
         ("mass with two servos and pitot", f"{record['mass']:.4f}", "", "kg"),

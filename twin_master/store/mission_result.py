@@ -38,7 +38,7 @@ SEVERAL_UNITS = "see sensor_unit"
 
 
 def variable_paths(role: str) -> list[str]:
-    """Return the variables that every run has, such as "filtered/mean".
+    """Return the paths in `run.nc` of the variables that every run has, such as "filtered/mean".
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def variable_paths(role: str) -> list[str]:
         variables = SCHEMA[group]
         if group in ("filtered", "smoothed", "predicted"):
             variables = SCHEMA["belief"] | variables
-        # A name with braces is that of the run; not every run has these variables.
+        # A name with braces is a template, such as "{input}": its variables differ between runs.
         paths += [f"{group}/{name}" for name in variables if "{" not in name]
     return paths
 
@@ -74,7 +74,11 @@ class QuantityTitles(NamedTuple):
 
 
 def quantity_titles(name: str) -> QuantityTitles:
-    """Return what a learnt quantity is called."""
+    """Return the titles of a learnt quantity.
+
+    They are those of the schema if it lists the quantity, and else follow from the name of the
+    parameter.
+    """
     if name in SCHEMA["quantities"]:
         stored, heading, short = SCHEMA["quantities"][name]
         return QuantityTitles(stored, heading, short)
@@ -84,7 +88,9 @@ def quantity_titles(name: str) -> QuantityTitles:
 
 @dataclass(frozen=True)
 class LearntQuantity:
-    """The posterior of a learnt quantity, of the whole asset or of each of its G sensors.
+    """The posterior of a learnt quantity after each of T steps.
+
+    The quantity belongs to the whole asset, or has a value for each of its G sensors.
 
     Attributes
     ----------
@@ -129,19 +135,27 @@ class LearntQuantity:
 def _learnt_quantities(
     result: "MissionResult", prior: Mapping[str, Learnt]
 ) -> tuple[LearntQuantity, ...]:
-    """Return the learnt quantities of a mission, given the prior of each by the estimator's names.
+    """Return the learnt quantities of a mission.
 
-    The estimator names the quantity of each sensor by itself, such as `noise_scale[3]`; these are
-    joined to one quantity.
+    The estimator has a separate quantity for each sensor, such as `noise_scale[3]`. Those that
+    differ only in the number of the sensor are joined into one quantity.
+
+    Parameters
+    ----------
+    result : MissionResult
+        The mission.
+    prior : mapping of str to Learnt
+        The prior of each quantity, by the name that the estimator gives it.
     """
     scenario = result.scenario
     units = {
         scenario.calibration.parameter: result.parameter_unit,
         "gauge_offset": result.observation_unit,
     }
-    # The moments of each quantity, the prior first: (1 + T, 4), or (1 + T, G, 4) by sensor.
+    # The four moments of each quantity, before the first and after each of T steps:
+    # (1 + T, 4) for the whole asset, (1 + T, G, 4) for G sensors
     moments_of: dict[str, Float] = {}
-    posteriors = result.flight.learnt.swapaxes(0, 1)  # (N, T, 4)
+    posteriors = result.flight.learnt.swapaxes(0, 1)  # (quantities of the estimator, T, 4)
     for full_name, posterior in zip(result.flight.learnt_names, posteriors, strict=True):
         moments = np.vstack((prior[full_name].figures, posterior))
         match = _NAME_WITH_SENSOR.fullmatch(full_name)
@@ -169,7 +183,10 @@ def _learnt_quantities(
 
 
 def _true_value(scenario: Scenario, name: str) -> Float | None:
-    """Return the true value of a learnt quantity, () or (G,); None if it is not given."""
+    """Return the true value of a learnt quantity, of shape () or (G,) for G sensors.
+
+    None is returned if the scenario does not determine it.
+    """
     parameter = scenario.asset.true_parameters.get(name)
     if parameter is not None:
         return np.asarray(parameter, dtype=np.float64)
@@ -185,9 +202,10 @@ def _true_value(scenario: Scenario, name: str) -> Float | None:
 
 
 def _true_noise_scale(scenario: Scenario) -> Float | None:
-    """Return the true over the assumed standard deviation of the noise of each sensor (G,).
+    """Return the true over the assumed standard deviation of the noise of each of G sensors.
 
-    Noise and model error are learnt as one scale. With a model error there is no true value of it.
+    None is returned if the scenario has a model error: noise and model error are learnt as one
+    scale, which then has no true value.
     """
     observation = scenario.observation
     if np.any(np.asarray(observation.model_error) > 0.0):
@@ -198,7 +216,11 @@ def _true_noise_scale(scenario: Scenario) -> Float | None:
 
 
 def _true_gauge_error(scenario: Scenario) -> Float:
-    """Return the true gain error or offset of each sensor (G,): zero, or NaN if it drifts."""
+    """Return the true gain error or offset of each of G sensors.
+
+    Both are zero, because asset and model agree; those of a sensor that drifts are NaN, because
+    they change during the flight.
+    """
     sensors = scenario.observation.count
     error = np.zeros(sensors)
     for fault in scenario.truth.sensor_faults:
@@ -208,16 +230,16 @@ def _true_gauge_error(scenario: Scenario) -> Float:
 
 
 def _true_transition_factor(scenario: Scenario) -> Float | None:
-    """Return the factor between the true and the assumed probabilities to worsen.
+    """Return the true over the assumed probability of a state to worsen.
 
-    None is returned if the two tables do not differ by one factor.
+    None is returned if this factor is not the same for all controls and state factors.
     """
     if not scenario.truth.probability:
         return np.asarray(1.0)
-    true = _worsening_probabilities(scenario, scenario.truth.probability)
-    assumed = _worsening_probabilities(scenario, scenario.transition.probability)
-    factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
-    if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0):
+    true_probabilities = _worsening_probabilities(scenario, scenario.truth.probability)
+    assumed_probabilities = _worsening_probabilities(scenario, scenario.transition.probability)
+    factor = true_probabilities.sum() / max(assumed_probabilities.sum(), np.finfo(float).tiny)
+    if np.allclose(true_probabilities, factor * assumed_probabilities, rtol=1e-9, atol=0.0):
         return np.asarray(factor)
     return None
 
@@ -225,7 +247,10 @@ def _true_transition_factor(scenario: Scenario) -> Float | None:
 def _worsening_probabilities(
     scenario: Scenario, table: Mapping[str, float | Mapping[str, float]]
 ) -> Float:
-    """Return the probability to worsen of each control and state factor, in one array (U F,)."""
+    """Return the probability that each state factor worsens under each control, in a vector.
+
+    The state factors of the first control come first, then those of the second one.
+    """
     probabilities = []
     for control in scenario.control_names:
         for state in scenario.state_names:
@@ -286,7 +311,7 @@ def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[s
 
 
 def _by_moment(moments: Float) -> dict[str, Float]:
-    """Return moments (..., 4) by their names."""
+    """Return the moments along the last axis of an array, each by its name in `MOMENTS`."""
     return {name: moments[..., index] for index, name in enumerate(MOMENTS)}
 
 

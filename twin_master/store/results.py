@@ -78,7 +78,7 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
 
 
 def _entries_of(values: Mapping[str, ArrayLike]) -> list[Entry]:
-    """Return the entries of variables whose names have no fields."""
+    """Return an entry for each variable; their names in the schema have no fields in braces."""
     return [Entry(name, np.asarray(array)) for name, array in values.items()]
 
 
@@ -98,9 +98,15 @@ class _GroupBuilder:
     def _variables(
         self, group: str, entries: Iterable[Entry], fields: SchemaFields
     ) -> Iterator[tuple[str, Variable]]:
-        """Yield each variable with its name, once the fields of its schema are filled in."""
+        """Yield the name and the variable of each entry.
+
+        The schema gives axes, unit and description of an entry as templates. Their fields are
+        filled with those of the mission, of the group, and of the entry; a later one replaces an
+        earlier one of the same name.
+        """
         schema = SCHEMA[group]
-        if "given" in fields:  # a group of a belief
+        # Groups of a belief share variables; only they say what their belief is given
+        if "given" in fields:
             schema = SCHEMA["belief"] | SCHEMA["noise"] | schema
         for entry in entries:
             all_fields = {**self._fields, **fields, **entry.fields}
@@ -117,7 +123,7 @@ class _GroupBuilder:
         fields: SchemaFields = _NO_FIELDS,
         attributes: SchemaFields = _NO_FIELDS,
     ) -> NetcdfGroup:
-        """Return a group of the schema.
+        """Return a group of variables, with the coordinates whose axes they have.
 
         Parameters
         ----------
@@ -131,6 +137,7 @@ class _GroupBuilder:
             The attributes of the group.
         """
         variables = dict(self._variables(name, entries, fields))
+        # Coordinates all of whose axes occur in this group
         axes: set[str] = set()
         for variable in variables.values():
             axes.update(variable.dims)
@@ -142,7 +149,7 @@ class _GroupBuilder:
 
 
 def _coordinate_entries(result: MissionResult) -> list[Entry]:
-    """Return the labels of all axes."""
+    """Return the coordinates of all axes, and the value of each state factor in each state."""
     scenario = result.scenario
     flight = result.flight
     labels: dict[str, ArrayLike] = {
@@ -159,7 +166,8 @@ def _coordinate_entries(result: MissionResult) -> list[Entry]:
     if scenario.observation.titles:
         labels["sensor_title"] = scenario.observation.titles
     entries = _entries_of(labels)
-    levels_of_states = result.knowledge.model.states.coordinates.T  # (F, S)
+    # A row for each state factor, a column for each state
+    levels_of_states = result.knowledge.model.states.coordinates.T
     for levels, factor in zip(levels_of_states, scenario.state, strict=True):
         fields = {"factor": factor.name, "factor_unit": factor.unit}
         entries.append(Entry("{factor}", levels, fields))
@@ -167,12 +175,13 @@ def _coordinate_entries(result: MissionResult) -> list[Entry]:
 
 
 def _observed_entries(result: MissionResult) -> Iterator[Entry]:
-    """Yield the variables of the group `observed`."""
+    """Yield the variables of the group `observed`: readings, controls and control inputs."""
     flight = result.flight
     scenario = result.scenario
     yield Entry("{role}", flight.observed)
     yield Entry("control_index", flight.control_index)
     if scenario.observation.modes is not None:
+        # For identified modes the readings beside the sensors are their covariance
         yield Entry("{role}_covariance", flight.readings)
     for index, (_control, state, name, _deviation) in enumerate(scenario.readings):
         fields = {"reading": name, "unit": scenario.state[state].unit}
@@ -184,7 +193,7 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
 
 
 def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
-    """Return the group of the filtered belief."""
+    """Return the group of the filtered belief, with decisions, evidence and residuals."""
     flight = result.flight
     expected = _expected_in_flight(result, flight.filtered, smoothed=False)
     values = _belief_variables(result, flight.filtered, expected)
@@ -193,6 +202,7 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     values["log_evidence"] = flight.log_evidence
     values["residual"] = (flight.observed - expected.mean) / expected.noise
     values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
+    # The belief on which the next control is decided; a plan over beliefs uses the predicted one
     decided_on = result.scenario.planner.decide_on
     if result.knowledge.plan.on_belief is not None:
         decided_on = "predicted"
@@ -216,15 +226,21 @@ def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
 
 
 def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
-    """Return the group of the predicted belief, whose leading axes are step and horizon."""
+    """Return the group of the predicted belief, whose leading axes are step and horizon.
+
+    A twin that adopts a patched model has different knowledge in different spans of its steps: the
+    expectations are computed for each span and concatenated.
+    """
     flight = result.flight
     predicted = flight.predicted
     expected_parts = []
     control_probabilities = []
     for knowledge, span in result.spans:
-        part = replace(flight, steps=flight.steps[span])
-        expected_of_part, control_probability = expected_ahead(part, knowledge, predicted[span])
-        expected_parts.append(expected_of_part)
+        history_of_span = replace(flight, steps=flight.steps[span])
+        expected_in_span, control_probability = expected_ahead(
+            history_of_span, knowledge, predicted[span]
+        )
+        expected_parts.append(expected_in_span)
         control_probabilities.append(control_probability)
     values = _belief_variables(result, predicted, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
@@ -236,19 +252,43 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool) -> Expectation:
-    """Return what is expected in all steps under a belief (T, S), by the believed models."""
+    """Return the sensors and rewards expected in each step of a flight.
+
+    Each step is evaluated with the model that the twin believed in it.
+
+    Parameters
+    ----------
+    result : MissionResult
+        The mission, of T steps.
+    belief : (T, states) array
+        The belief over states in each step.
+    smoothed : bool
+        Whether the belief is smoothed, and not filtered.
+    """
     flight = result.flight
     expected_parts = []
     for knowledge, span in result.spans:
-        part = replace(flight, steps=flight.steps[span])
-        expected_parts.append(expected_in_steps(part, knowledge, belief[span], smoothed=smoothed))
+        history_of_span = replace(flight, steps=flight.steps[span])
+        expected_parts.append(
+            expected_in_steps(history_of_span, knowledge, belief[span], smoothed=smoothed)
+        )
     return concatenate_expectations(expected_parts)
 
 
 def _belief_variables(
     result: MissionResult, belief: Float, expected: Expectation
 ) -> dict[str, ArrayLike]:
-    """Return the variables that all groups of a belief share."""
+    """Return the variables that the filtered, smoothed and predicted groups share.
+
+    Parameters
+    ----------
+    result : MissionResult
+        The mission.
+    belief : (..., states) array
+        The probability of each state.
+    expected : Expectation
+        The sensors and rewards expected under this belief.
+    """
     states = result.knowledge.model.states
     return {
         "probability": belief,
@@ -264,7 +304,7 @@ def _belief_variables(
 
 
 def _learnt_entries(result: MissionResult) -> Iterator[Entry]:
-    """Yield the variables of the group `learnt`."""
+    """Yield the moments of each learnt quantity, posterior and prior, for the group `learnt`."""
     for quantity in result.learnt:
         for index, (moment, title) in enumerate(zip(MOMENTS, _MOMENT_TITLES, strict=True)):
             fields = {**quantity.schema_fields, "moment": moment, "moment_title": title}
@@ -283,10 +323,10 @@ def _notice_entries(result: MissionResult) -> list[Entry]:
 
 
 def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:
-    """Yield the variables of the group `truth`."""
+    """Yield the variables of the group `truth`: states, sensors, learnt quantities, monitors."""
     flight = result.flight
     status = truth.status[: len(flight.steps)]  # the asset may have ended the mission early
-    if truth.in_asset:
+    if truth.in_asset:  # then only the missing readings show which sensors are lost
         is_lost = np.isnan(flight.observed)
         status = np.where(is_lost, SensorStatus.LOST, status).astype(status.dtype)
     yield Entry("state", flight.state)
@@ -339,7 +379,10 @@ class _TableMaker:
         return columns
 
     def health(self) -> Columns:
-        """Return the table of the state factors: true values, and moments of the beliefs."""
+        """Return the table of the state factors: true values, and moments of the beliefs.
+
+        The true values are left out if the run does not know them.
+        """
         variables = {}
         if "truth" in self.groups:
             variables["true"] = self.groups["truth"]["state"]
@@ -411,7 +454,17 @@ def csv_tables(
 
 
 def _columns(heading: str, names: Iterable[str], values: NDArray[Any]) -> Columns:
-    """Return the columns of values (T, N), each with the name in the braces of its heading."""
+    """Return the N columns of an array (T, N), each under its heading.
+
+    Parameters
+    ----------
+    heading : str
+        A template of the headings, with braces for the name of a column.
+    names : iterable of str
+        The N names.
+    values : (T, N) array
+        The values of the columns.
+    """
     return {heading.format(name): column for name, column in zip(names, values.T, strict=True)}
 
 

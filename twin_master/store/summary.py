@@ -118,7 +118,9 @@ def find_fallback(
     control_index: Index,
     true_state: Float,
 ) -> Fallback:
-    """Return how the control fell back.
+    """Return when the policy calls for another control than the first one, and when it was flown.
+
+    T is the number of steps, S that of states, F that of state factors.
 
     Parameters
     ----------
@@ -137,6 +139,7 @@ def find_fallback(
     if switch is None:
         return Fallback()
     factor = states.factors[switch.factor_index]
+    # `slack` lets a true value count as its level if it differs by rounding only
     is_called_for = true_state[:, switch.factor_index] >= switch.level - factor.slack
     called_for_step = _first_true(is_called_for)
     has_left = control_index != first_control
@@ -174,22 +177,23 @@ class PolicySwitch(NamedTuple):
 def find_policy_switch(
     states: StateSpace, policy_index: Index, first_control: int
 ) -> PolicySwitch | None:
-    """Return where a policy leaves its first control.
+    """Return the state factor and its level from which on a policy leaves its first control.
 
-    None is returned if the policy depends on several factors or on none, or if it returns to that
-    control at a higher level.
+    None is returned if the policy never leaves it, if it depends on several factors, or if it
+    returns to the first control at a higher level of the factor.
 
     Parameters
     ----------
     states : StateSpace
         The state space.
-    policy_index : (S,) array
+    policy_index : (states,) array
         The index of the control that the policy takes in each state.
     first_control : int
-        The index of the control.
+        The index of the first control.
     """
-    leaves = (policy_index != first_control).reshape(states.shape)
+    leaves = (policy_index != first_control).reshape(states.shape)  # an axis for each factor
     for axis, factor in enumerate(states.factors):
+        # The policy depends on this factor alone if at each of its levels all states agree
         other_axes = tuple(index for index in range(leaves.ndim) if index != axis)
         leaves_somewhere = leaves.any(axis=other_axes)
         leaves_everywhere = leaves.all(axis=other_axes)
@@ -201,7 +205,10 @@ def find_policy_switch(
 
 
 def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
-    """Return the root mean square error of the filtered mean of each factor (F,), SI."""
+    """Return the root mean square, over the steps, of the error of each filtered state factor.
+
+    The error is the filtered mean minus the true value, SI.
+    """
     error = model.states.mean(filtered) - true_state
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
@@ -218,11 +225,11 @@ def summarise(
     ----------
     result : MissionResult
         The mission.
-    reward_mean : (T, 3) array
+    reward_mean : (steps, 3) array
         The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
-    misfit : (S, U, G) array, optional
-        The difference of the twin's model to the asset, relative to what the asset shows; NaN if it
-        shows nothing. Given if asset and model are known to differ.
+    misfit : (states, controls, sensors) array, optional
+        The difference of the sensor values of the twin's model to those of the asset, relative to
+        the latter; NaN if these are zero. It is given if asset and model are known to differ.
     first_groups : iterable of FigureGroup
         Figures that come before all others.
     """
@@ -264,7 +271,10 @@ def _schema_of(group: FigureGroup) -> Iterator[_FigureSchema]:
 
 
 def _reward_figures(reward_mean: Float) -> Iterator[FigureGroup]:
-    """Yield the mean of each reward over the steps; None if no step has one."""
+    """Yield the mean of each reward over the steps, without those in which it is NaN.
+
+    The mean is None if the reward is NaN in all steps.
+    """
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         finite = rewards[np.isfinite(rewards)]
         mean = float(finite.mean()) if len(finite) else None
@@ -272,7 +282,10 @@ def _reward_figures(reward_mean: Float) -> Iterator[FigureGroup]:
 
 
 def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the share of lost observations, and the steps without any, if some were lost."""
+    """Yield the percentage of lost readings, and the steps without any reading.
+
+    Nothing is yielded if no reading was lost.
+    """
     flight = result.flight
     is_received = np.isfinite(flight.observed)
     if is_received.all():
@@ -285,7 +298,13 @@ def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
 
 
 def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
-    """Yield the root mean square of a misfit (S, U, G) and the largest one."""
+    """Yield the root mean square and the largest value of a misfit, in percent.
+
+    Parameters
+    ----------
+    misfit : (states, controls, sensors) array
+        The relative difference of the twin's model to the asset; NaN if it is not defined.
+    """
     is_known = np.isfinite(misfit)
     if not is_known.any():
         return
@@ -304,28 +323,35 @@ def _error_bound_figures(result: MissionResult) -> Iterator[FigureGroup]:
 
 
 def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the first alarm and the last suspicion, if the twin watches its model."""
+    """Yield the step of the first alarm, and the suspicion after the last step.
+
+    Nothing is yielded if the twin does not test its model (`notice` is off).
+    """
     flight = result.flight
     if not flight.suspicion:
         return
-    last = flight.suspicion[-1]
+    last_suspicion = flight.suspicion[-1]
     alarm_steps = [step for step, notice in flight.notices if notice.kind == "alarm"]
     values = [
         alarm_steps[0] if alarm_steps else None,
-        last.none_of_these,
-        last.gauge_off,
-        last.decided_by,
+        last_suspicion.none_of_these,
+        last_suspicion.gauge_off,
+        last_suspicion.decided_by,
     ]
     yield FigureGroup("notice", {"step": result.scenario.mission.step_name}, values)
 
 
 def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the calibrated parameter before the flight, and after it if it is learnt."""
+    """Yield mean and standard deviation of the calibrated parameter.
+
+    If the parameter is learnt in the flight, they are given after and before the flight, and the
+    true value is given if it is known; else only before the flight.
+    """
     draws = result.knowledge.draws
     title = parameter_title(draws.name)
     prior = [draws.mean, draws.standard_deviation]
-    learnt = [quantity for quantity in result.learnt if quantity.name == draws.name]
-    if not learnt:
+    learnt_parameters = [quantity for quantity in result.learnt if quantity.name == draws.name]
+    if not learnt_parameters:
         is_measured = result.scenario.calibration.source in ("static_test", "file")
         fields = {
             "parameter": draws.name,
@@ -334,17 +360,17 @@ def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
         }
         yield FigureGroup("parameter", fields, prior)
         return
-    parameter = learnt[0]
+    parameter = learnt_parameters[0]
     fields = {"parameter": draws.name, "label": title}
-    last = parameter.posterior[-1]
-    moments = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+    last_moments = parameter.posterior[-1]
+    moments = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
     yield FigureGroup("parameter_learnt", fields, [*moments, *prior])
     if parameter.truth is not None:
         yield FigureGroup("parameter_true", fields, [float(parameter.truth)])
 
 
 def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the learnt quantities beside the calibrated parameter."""
+    """Yield the figures of all learnt quantities other than the calibrated parameter."""
     for quantity in result.learnt:
         if quantity.is_per_sensor:
             yield _figures_of_sensors(result, quantity)
@@ -355,22 +381,23 @@ def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
                 "title": quantity_titles(quantity.name).short,
                 "unit": unit,
             }
-            last = factor * quantity.posterior[-1]
-            values = [float(last[_MEAN]), float(last[_STANDARD_DEVIATION])]
+            last_moments = factor * quantity.posterior[-1]
+            values = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
             yield FigureGroup("learnt", fields, values)
 
 
 def _figures_of_sensors(result: MissionResult, quantity: LearntQuantity) -> FigureGroup:
-    """Return the figures of a quantity that each sensor has.
+    """Return the figures of a learnt quantity with a value for each sensor.
 
-    They are the mean over the sensors, and the sensor that departs most from its prior, relative to
-    the standard deviation.
+    They are the mean over the sensors, and the value of the sensor whose posterior mean differs
+    most from its prior mean, in posterior standard deviations.
     """
     observation = result.scenario.observation
     factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
-    last = factor * quantity.posterior[-1]  # (G, 4)
-    last_mean = last[:, _MEAN]
-    last_deviation = last[:, _STANDARD_DEVIATION]
+    # The moments after the last step, in printed units, with a row for each sensor
+    last_moments = factor * quantity.posterior[-1]
+    last_mean = last_moments[:, _MEAN]
+    last_deviation = last_moments[:, _STANDARD_DEVIATION]
     departure = np.abs(last_mean - factor * quantity.prior[:, _MEAN]) / last_deviation
     sensor = int(np.nanargmax(departure))
     mean_of_sensors: float | None = float(np.nanmean(last_mean))
@@ -399,7 +426,7 @@ def notice_record(result: MissionResult) -> JsonObject:
 
 
 def _truth_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the figures that need the truth: the fallback, and errors of the estimate."""
+    """Yield the figures that need the true state: the fallback, and the error of each factor."""
     scenario = result.scenario
     flight = result.flight
     knowledge = result.knowledge
@@ -441,13 +468,14 @@ def control_changes(
     ----------
     controls : sequence of str
         The names of the controls.
-    control_index : (T,) array
+    control_index : (steps,) array
         The index of the control flown in each step.
     step_name : str
         What a step is called.
     first_step : int
         The number of the first step.
     """
+    # The steps whose control is not that of the step before
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
@@ -464,7 +492,10 @@ def control_changes(
 
 
 def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
-    """Return the figures that say how the control fell back."""
+    """Return the figures of a fallback: level, steps and delay, with their units.
+
+    A single figure says so if the policy depends on no state factor, or on several.
+    """
     state = fallback.switch_state
     level = fallback.switch_level
     if state is None or level is None:
@@ -492,7 +523,9 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
 def truth_mismatch(
     parameter: str, truth: float, mean: float, standard_deviation: float
 ) -> str | None:
-    """Return the sentence that the flown asset is not the calibrated one; None if it may be.
+    """Return a warning if the true parameter contradicts the calibration of the twin, else None.
+
+    It does if it differs from the calibrated mean by more than `TRUTH_IS_OFF` standard deviations.
 
     Parameters
     ----------

@@ -61,12 +61,15 @@ def write_run(
 
 
 def open_run(folder: Path | str) -> "DataTree":
-    """Return everything that a run has stored in `run.nc`, loaded into memory.
+    """Return the groups of `run.nc` in a run folder, loaded into memory.
+
+    A folder that was being replaced when its process was killed is restored first.
 
     Raises
     ------
     RunFolderError
-        If there is no ``run.nc``, or it is damaged.
+        If there is no ``run.nc``, or it is damaged. Then the run did not end: the message advises
+        to resume it or to fly it again.
     """
     restore_folder(Path(folder))
     path = Path(folder) / RUN_NAME
@@ -91,7 +94,9 @@ def store_flight(
     misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
 ) -> None:
-    """Write all files that a run or a watch leaves, except its report.
+    """Write the results of a run or a watch: `run.nc`, the CSV files, and the summary.
+
+    The summary is written last. The report is not written here.
 
     Parameters
     ----------
@@ -109,7 +114,7 @@ def store_flight(
         Figures of the summary that come before those of every mission.
     attributes : mapping of str to object, optional
         Further attributes of the root of `run.nc`.
-    misfit : (S, U, G) array, optional
+    misfit : (states, controls, sensors) array, optional
         The relative difference of the twin's model to the asset, see `summarise`.
     write_field : callable, optional
         Writes the VTU file of the last estimated field to a path.
@@ -131,10 +136,14 @@ def store_flight(
 def _root_attributes(
     config: JsonObject, result: MissionResult, origin: FlownAndBelieved
 ) -> dict[str, object]:
-    """Return the attributes of the root of `run.nc`."""
+    """Return the attributes of the root of `run.nc`.
+
+    They tell where the results come from: seed, hashes of the inputs and of the source code,
+    versions, the calibrated parameter, and the asset and the twin's model in words.
+    """
     provenance = config["provenance"]
     mission = result.scenario.mission
-    draws = result.knowledge.draws
+    draws = result.knowledge.draws  # of the calibrated parameter
     return {
         "title": mission.title or mission.name,
         "scenario": mission.name,
@@ -152,7 +161,11 @@ def _root_attributes(
 
 
 def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int) -> JsonObject:
-    """Return the summary without its figures."""
+    """Return the entries of the summary that precede its figures.
+
+    They are the mission, its control changes, what was flown and what the twin believed, what was
+    learnt, and the notices.
+    """
     scenario = result.scenario
     mission = scenario.mission
     flight = result.flight
@@ -239,7 +252,7 @@ def read_outcome(folder: Path) -> RunOutcome:
 
 
 def finished_run(folder: Path) -> RunOutcome | None:
-    """Return the outcome of a run; None if it is not finished, or its results are damaged."""
+    """Return the outcome of a run; None if the run has not ended, or its results are damaged."""
     try:
         open_run(folder)
         return read_outcome(folder)

@@ -40,20 +40,21 @@ StepRecord = dict[str, Any]
 
 
 class StepBeliefs(NamedTuple):
-    """What is believed in each of n steps.
+    """What is believed in each of n steps, over S states and U controls.
 
     Attributes
     ----------
     probability : (n, S) array
         The probability of each state.
     is_believed : (n,) array of bool
-        Whether a state is believed. It is not if no state explains the sensors.
+        Whether the probabilities of states are believed: false if the readings are probably those
+        of none of the states, see `is_state_believed`.
     expected : Expectation
         The expected sensors and rewards, without quantiles. The reward of the error is NaN if
         nothing was observed.
     control_probability : (n, U) array
-        The probability of each control: in a step that was flown, with which its next control was
-        chosen; in a predicted step, of the control in it.
+        The probability of each control. For a step that was flown it is that of the control of the
+        next step, from which the twin chose; for a predicted step, that of its own control.
     """
 
     probability: Float
@@ -80,12 +81,12 @@ class _StepLines:
 
 
 class _JournalledKnowledge(NamedTuple):
-    """What the twin knows in the lines of the journal from one on.
+    """The knowledge of the twin, and the line of the journal from which on it holds.
 
     Attributes
     ----------
     begin : int
-        Where the first of these lines begins [bytes].
+        Where this line begins in the journal [bytes].
     knowledge : Knowledge
         The model of the twin, with its plan.
     """
@@ -95,7 +96,9 @@ class _JournalledKnowledge(NamedTuple):
 
 
 class Flight:
-    """A run or a watch with what the twin concluded in each step at the time of the step.
+    """A run or a watch, read from its journal, with the beliefs and decisions of each step.
+
+    Each step has the belief and the decision that the twin had at the time of the step.
 
     Parameters
     ----------
@@ -115,8 +118,8 @@ class Flight:
     drawings : list of ForceDrawing
         The drawings of missing forces, in the order of their verdicts.
     number : int
-        Grows when steps were removed, as by a resumed run, or changed, as by an observation that
-        came late. What viewers have of the steps is void then.
+        A number that grows when earlier steps are removed, as by a resumed run, or changed, as by
+        an observation that came late. The steps that viewers have loaded are then out of date.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -127,7 +130,13 @@ class Flight:
         self._start_with_file(0)
 
     def _start_with_file(self, inode: int) -> None:
-        """Forget all steps, and begin with the file of an inode."""
+        """Forget all steps, and read the journal from its beginning on.
+
+        Parameters
+        ----------
+        inode : int
+            The inode of the file that is the journal now; 0 if there is no file yet.
+        """
         self._inode = inode
         self._end = 0  # of the lines that were read [bytes]
         self._models: list[_JournalledKnowledge] = []
@@ -139,17 +148,23 @@ class Flight:
         self.number += 1
 
     def _add_model(self, begin: int) -> None:
-        """Add the next model of the twin, which it believes from a byte of the journal on."""
+        """Load the next model that the twin believed, and add it to the list of models.
+
+        Parameters
+        ----------
+        begin : int
+            Where the first line of the journal begins that was written with this model [bytes].
+        """
         knowledge = load_knowledge(self.folder, self.scenario, len(self._models))
         self._models.append(_JournalledKnowledge(begin, knowledge))
 
     @property
     def knowledge(self) -> Knowledge:
-        """What the twin knows now."""
+        """The knowledge of the twin after the last line of the journal that was read."""
         return self._models[-1].knowledge
 
     def _knowledge_in(self, record: StepRecord) -> Knowledge:
-        """Return what the twin knew when it wrote the belief of a step."""
+        """Return the knowledge that the twin had when it wrote the belief of a step."""
         begin = self._lines_of_steps[record["step"]].belief
         return next(model.knowledge for model in reversed(self._models) if model.begin <= begin)
 
@@ -175,7 +190,7 @@ class Flight:
         RunFolderError
             If the journal was changed.
         """
-        before = (self.number, self._end)
+        state_before = (self.number, self._end)
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             status = os.fstat(file.fileno())
             if self._has_other_file(status):
@@ -184,10 +199,13 @@ class Flight:
             for record, begin, end in new_lines:
                 self._take_line(record, begin)
                 self._end = end
-        return (self.number, self._end) != before
+        return (self.number, self._end) != state_before
 
     def _take_line(self, record: StepRecord, begin: int) -> None:
-        """Take in a step, a late observation, or an event between two steps.
+        """Update the flight with a line: a new step, a late observation, or an event.
+
+        An event is a line that belongs to no step, such as a verdict. All but a new step change
+        what viewers have of earlier steps, so that `number` grows.
 
         Parameters
         ----------
@@ -207,7 +225,16 @@ class Flight:
         self.number += 1
 
     def _take_late_observation(self, record: StepRecord, begin: int) -> None:
-        """Take in the observation of an earlier step, which changes the belief of the last step."""
+        """Update the flight with an observation that came late.
+
+        The line has the late observation of an earlier step, and the belief of the last step, which
+        the twin has filtered again with it.
+
+        Raises
+        ------
+        RunFolderError
+            If the line does not belong to the last step, or observes a later one.
+        """
         last_step = self.steps - 1
         observed_step = int(record.get("observation_step", int(record["step"])))
         if not 0 <= observed_step <= record["step"] == last_step:
@@ -220,7 +247,11 @@ class Flight:
         self._lines_of_steps[observed_step].observation = begin
 
     def _take_event(self, record: StepRecord, begin: int) -> None:
-        """Take in a line that is no step: notices, a verdict, a patched model."""
+        """Update the flight with a line that is no step: notices, a verdict, or a patched model.
+
+        Its notices are shown with the last step before it. If its verdict has a drawing of the
+        missing force, the drawing is added.
+        """
         step = max(self.steps - 1, 0)
         self._later_notices[step] += record.get("notices", [])
         verdict_folder = record.get("verdict", {}).get("folder", "")
@@ -264,22 +295,29 @@ class Flight:
         return record
 
     def observations_in(self, records: Sequence[StepRecord]) -> Float:
-        """Return the readings of the sensors in n steps: (n, G), SI; NaN if lost."""
+        """Return the readings of G sensors in n steps, (n, G), SI; a lost reading is NaN."""
         count = self.scenario.observation.count
         return np.array([array_from_json(record["observed"][:count]) for record in records])
 
     def true_states_in(self, records: Sequence[StepRecord]) -> Float:
-        """Return the true state in n steps: (n, K), SI; NaN if nobody knows it."""
+        """Return the true values of K state factors in n steps, (n, K), SI; NaN if unknown."""
         unknown = [None] * len(self.scenario.state)
         return np.array([array_from_json(record.get("state", unknown)) for record in records])
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return what the twin believed in each of n steps when the step was flown."""
+        """Return what the twin believed in each of n steps at the time of the step.
+
+        Each step is evaluated with the knowledge that the twin had in it.
+        """
         parts = []
-        # Successive steps in which the twin knew the same
-        for _, group in groupby(records, lambda record: id(self._knowledge_in(record))):
-            steps = list(group)
-            parts.append(self._beliefs_under(self._knowledge_in(steps[0]), steps))
+        # Groups of successive steps with the same knowledge
+        for _, records_of_group in groupby(records, lambda record: id(self._knowledge_in(record))):
+            same_knowledge_records = list(records_of_group)
+            parts.append(
+                self._beliefs_under(
+                    self._knowledge_in(same_knowledge_records[0]), same_knowledge_records
+                )
+            )
         return StepBeliefs(
             probability=np.concatenate([part.probability for part in parts]),
             is_believed=np.concatenate([part.is_believed for part in parts]),
@@ -288,13 +326,13 @@ class Flight:
         )
 
     def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return what the twin believed in n steps in which it knew the same."""
+        """Return what the twin believed in n steps, in all of which it had the given knowledge."""
         filtered = np.array([record["filtered"] for record in records])
         controls = [record["control_index"] for record in records]
         joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
         if knowledge.expectation is None:
-            rows = np.array([array_from_json(record["observed"]) for record in records])
-            expected = _expectation_without_learning(knowledge, joint, rows)
+            observed_rows = np.array([array_from_json(record["observed"]) for record in records])
+            expected = _expectation_without_learning(knowledge, joint, observed_rows)
         else:
             expected = self._expectation_with_learning(knowledge.expectation, joint, records)
         return StepBeliefs(
@@ -331,7 +369,10 @@ class Flight:
         return concatenate_expectations(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
-        """Return what the twin expected after a step in each of the n steps to come."""
+        """Return what the twin predicted, after one step, for each of the n steps to come.
+
+        n is the number of steps that the scenario predicts (`mission.prediction_steps`).
+        """
         knowledge = self._knowledge_in(record)
         filtered = array_from_json(record["filtered"])
         control = record["control_index"]
@@ -340,6 +381,7 @@ class Flight:
             knowledge.model, filtered, control, knowledge.plan.policy, horizon
         ).predicted
         unexplained = _unexplained_probability(record)
+        # p(state, control) = p(state) p(control | state), for n steps, S states, U controls
         joint = predicted[..., None] * knowledge.policy_with_doubt(unexplained)  # (n, S, U)
         if knowledge.expectation is None:
             expected = _expectation_without_learning(knowledge, joint, None)
@@ -374,7 +416,7 @@ def _expectation_without_learning(
     joint : (n, S, U) array
         The beliefs over states and controls.
     rows : (n, G + I) array or None
-        The rows that were observed, SI; None for steps to come.
+        The readings of G sensors and of I inspections, SI; None for steps to come.
     """
     return expectation_of_draws(
         knowledge.sensor_model, knowledge.rewards, joint, rows, quantiles=False
@@ -382,7 +424,7 @@ def _expectation_without_learning(
 
 
 def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
-    """Return what the twin has learnt up to a step, by quantity."""
+    """Return the posterior of each quantity that the twin has learnt up to a step, by name."""
     return {name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()}
 
 

@@ -66,7 +66,7 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
 
 
 SendText = Callable[[str], None]
-"""Sends an answer to one viewer, and stands for this viewer."""
+"""A function that sends an answer to one viewer; it also identifies this viewer."""
 
 
 class FlightPage:
@@ -92,7 +92,11 @@ class FlightPage:
         self._error = ""
 
     def render_html(self) -> str:
-        """Return the page, whose script draws the figures from the answers."""
+        """Return the HTML of the page.
+
+        It contains all that does not change during a flight: names, units, axes and the planform of
+        a wing. The script of the page draws the figures from this and from the answers.
+        """
         flight = self._flight
         mission = flight.scenario.mission
         wing = planform_of(design_of(flight.folder), flight.scenario)
@@ -121,16 +125,20 @@ class FlightPage:
         return html
 
     def _sensor_range(self) -> tuple[float, float]:
-        """Return the lowest and the highest reading on the axis of the sensors."""
+        """Return the lowest and the highest reading on the axis of the sensors, as printed.
+
+        They bound the mean readings of all states and controls. Readings that are shown as
+        standard deviations get an axis with 95 % of a normal distribution.
+        """
         if self._shows_deviations:
             return -NORMAL_95, NORMAL_95
         readings = self._sensors.scale * self._flight.knowledge.sensor_model.mean
         return readings.min(), readings.max()
 
     def ask(self, send: SendText, request: Request) -> None:
-        """Answer a viewer now, or as soon as there is something new.
+        """Answer the request of a viewer now, or as soon as there is something new.
 
-        A newer request of the viewer replaces an older one.
+        A request replaces an earlier one of the same viewer that was not answered yet.
         """
         self._open_requests[send] = request
         self._answer_viewer(send)
@@ -140,7 +148,10 @@ class FlightPage:
         self._open_requests.pop(send, None)
 
     def update(self) -> None:
-        """Read what is new in the flight, and answer the viewers that wait for it."""
+        """Read new lines of the journal, and answer the viewers that wait for them.
+
+        If the journal cannot be read, all viewers get the error, now and later.
+        """
         try:
             if self._error or not self._flight.update():
                 return
@@ -150,7 +161,10 @@ class FlightPage:
             self._answer_viewer(send)
 
     def _answer_viewer(self, send: SendText) -> None:
-        """Answer the open request of a viewer, if there is something new for it."""
+        """Answer the open request of a viewer, if there is something new for it.
+
+        An answered request is closed. After an error of the journal the viewer also gets the error.
+        """
         if self._error:
             send(json.dumps({"error": self._error}))
         # A viewer that could not be reached is forgotten meanwhile
@@ -163,7 +177,10 @@ class FlightPage:
             send(answer)
 
     def answer(self, request: Request) -> str | None:
-        """Return the answer to a request as JSON; None if there is nothing new to say.
+        """Return the answer to a request as JSON; None if there is nothing new for the viewer.
+
+        The answer has the past steps that the viewer lacks (`past`), and, if another step is shown
+        than before, the prediction after it (`ahead`).
 
         Parameters
         ----------
@@ -171,6 +188,7 @@ class FlightPage:
             The request of a viewer.
         """
         flight = self._flight
+        # The step to be shown
         count = flight.steps
         if not count:
             return None
@@ -178,6 +196,7 @@ class FlightPage:
         step = last_step
         if request.step != LATEST:
             step = min(max(request.step, 0), last_step)
+        # What the viewer has already
         has_same_flight = request.flight == flight.number
         shows_step = has_same_flight and request.shown == step
         if shows_step and request.count == count:
@@ -203,7 +222,10 @@ class FlightPage:
         return json.dumps(plain(answer), allow_nan=False)  # NaN becomes null
 
     def _drawing_at(self, step: int) -> dict[str, str] | None:
-        """Return the last drawing of a missing force at a step: its address, and the verdict."""
+        """Return the address of the last drawing of a missing force up to a step, and its verdict.
+
+        None is returned if no verdict up to this step has a drawing.
+        """
         numbers = []
         for number, drawing in enumerate(self._flight.drawings):
             if drawing.step <= step:
@@ -217,7 +239,7 @@ class FlightPage:
         }
 
     def _past_values(self, records: Sequence[StepRecord]) -> dict[str, object]:
-        """Return what the page shows of steps that were flown, a row for each step."""
+        """Return the values that the page plots of past steps, each with a row for each step."""
         flight = self._flight
         beliefs = flight.beliefs_in(records)
         values = self._plotted_values(beliefs, flight.observations_in(records))
@@ -228,21 +250,26 @@ class FlightPage:
         return values
 
     def _sentences_in(self, record: StepRecord) -> list[str]:
-        """Return the sentences of the notices of a step, with the folder of the flight."""
+        """Return the sentences of the notices of a step.
+
+        Commands in them name the folder as DIR, which is replaced by the folder of the flight.
+        """
         folder = f" {self._flight.folder}"
         return [notice["sentence"].replace(" DIR", folder) for notice in record["notices"]]
 
     def _plotted_values(
         self, beliefs: StepBeliefs, observations: Float | None
     ) -> dict[str, object]:
-        """Return the values of figures in printed units, a row for each step.
+        """Return the values that the figures plot, in printed units, with a row for each step.
+
+        Rewards and sensors have a central 95 % interval; that of a sensor includes its noise.
 
         Parameters
         ----------
         beliefs : StepBeliefs
             The beliefs of n steps.
         observations : (n, G) array or None
-            The readings of the sensors, SI; None for steps to come.
+            The readings of G sensors in n steps, SI; None for predicted steps.
 
         Returns
         -------
@@ -252,6 +279,7 @@ class FlightPage:
         expected = beliefs.expected
         reward_margin = NORMAL_95 * expected.reward_standard_deviation
         sensor_mean = expected.mean
+        # The uncertain state and the noise are independent: their variances add up
         deviation = np.hypot(expected.standard_deviation, expected.noise)
         if self._shows_deviations:
             if observations is not None:
@@ -275,9 +303,11 @@ class FlightPage:
         return values
 
     def _state_values(self, beliefs: StepBeliefs) -> dict[str, Float]:
-        """Return mean, interval and standard deviation of each factor of the state (n, K).
+        """Return mean, interval and standard deviation of each state factor in printed units.
 
-        The interval is two standard deviations to either side, within the levels of the factor.
+        The interval is the mean plus and minus two standard deviations, clipped to the range of the
+        levels of the factor. All arrays have a row for each step and a column for each factor; they
+        are NaN in steps in which no state is believed.
         """
         scales = self._factor_scales
         lowest = np.array([factor.levels[0] for factor in self._factors])
@@ -290,6 +320,7 @@ class FlightPage:
             "state": mean,
             "state_lower": np.clip(mean - margin, lowest, highest),
             "state_upper": np.clip(mean + margin, lowest, highest),
+            # The margin is two standard deviations
             "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * margin),
         }
 
@@ -301,7 +332,10 @@ def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
 
 
 def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:
-    """Return the first step to be sent, so that the viewer has all that the page shows at once.
+    """Return the first step that must be sent to a viewer.
+
+    The page shows a window of `WINDOW_STEPS` steps. If the viewer has the first part of the window,
+    only the rest is sent; else the whole window.
 
     Parameters
     ----------

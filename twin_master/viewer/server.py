@@ -23,7 +23,7 @@ from twin_master.viewer.flight_page import FlightPage, Request
 
 ADDRESS = "127.0.0.1"
 POLL_SECONDS = 0.015
-"""Seconds between two looks at the run folder; a look takes some microseconds."""
+"""Seconds between two checks of the run folder for new lines; a check takes microseconds."""
 LONGEST_REQUEST = 4096
 """Greatest length of a request [bytes]."""
 _INVALID_MESSAGE = 1003
@@ -52,7 +52,8 @@ class ServedText(NamedTuple):
     Attributes
     ----------
     read : callable
-        Returns the text. It takes what the groups of its path match, as strings.
+        Returns the text. Its arguments are the parts of the requested path that the groups of the
+        regular expression match, as strings.
     media_type : str
         The type of the text, such as "text/html".
     """
@@ -65,7 +66,7 @@ class _StepsSocket(WebSocketHandler):
     """The connection of one open page."""
 
     def initialize(self, page: FlightPage) -> None:
-        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        """Set the page that answers; tornado calls this after the constructor."""
         self._page = page
 
     def on_message(self, message: str | bytes) -> None:
@@ -76,11 +77,11 @@ class _StepsSocket(WebSocketHandler):
             self.close(_INVALID_MESSAGE, str(error)[:100])
 
     def on_close(self) -> None:
-        """Forget the viewer, who has left."""
+        """Forget the viewer, whose connection is closed."""
         self._page.forget(self.send)
 
     def send(self, text: str) -> None:
-        """Send an answer; forget the viewer if it has left."""
+        """Send an answer; forget the viewer if its connection is closed."""
         try:
             self.write_message(text)
         except WebSocketClosedError:
@@ -91,7 +92,7 @@ class _TextHandler(RequestHandler):
     """Answers requests for one text."""
 
     def initialize(self, text: ServedText) -> None:
-        """Take what the rule of the handler gives; tornado calls this after the constructor."""
+        """Set the text to be served; tornado calls this after the constructor."""
         self._text = text
 
     def set_default_headers(self) -> None:
@@ -105,7 +106,7 @@ class _TextHandler(RequestHandler):
         Parameters
         ----------
         *groups : str
-            What the groups of the path match.
+            The parts of the requested path that the groups of its regular expression match.
         """
         self.set_header("Content-Type", f"{self._text.media_type}; charset=utf-8")
         try:
@@ -131,11 +132,11 @@ def package_text(package: str, name: str, media_type: str) -> ServedText:
 
 
 def _do_nothing() -> None:
-    """Stand for what is done every few milliseconds if nothing is to be done."""
+    """Do nothing; the default for `poll`."""
 
 
 def _is_always_wanted() -> bool:
-    """Say that a server goes on until its process is interrupted."""
+    """Return True; the default for `is_wanted`, with which a server runs until interrupted."""
     return True
 
 
@@ -147,7 +148,7 @@ def serve_texts(
     handlers: Sequence[Rule] = (),
     poll: Callable[[], None] = _do_nothing,
 ) -> None:
-    """Serve texts to browsers of this machine as long as they are wanted.
+    """Serve texts to browsers of this machine until `is_wanted` returns False.
 
     Parameters
     ----------

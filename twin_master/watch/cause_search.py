@@ -11,7 +11,7 @@ from typing import Protocol
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """A request to look for what the model of a watch lacks in some of its steps.
+    """A request to search some steps of a watch for an effect that its model lacks.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class SearchRequest:
     seed : int
         The seed of all random numbers of the search.
     low_priority : bool
-        Whether the search gives way to other processes, because a live watch goes on beside it.
+        Whether the search runs with low priority, because a live watch runs at the same time.
     """
 
     run_folder: Path

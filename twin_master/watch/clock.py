@@ -41,10 +41,11 @@ class Clock:
         self.only_step: int | None = None
 
     def step_of(self, time: float, next_step: int, stream: StreamNotices) -> int:
-        """Return the step of a message from its time.
+        """Return the step of a message from its time, and keep the origin of the clock up to date.
 
-        The first time belongs to the next step. So does a time that lies too far from the only one
-        before it: then the steps so far stay, and time is counted from this message on.
+        The first time of a stream is that of the next step. If only one time has come so far, and
+        this one lies too far from it, the clock was probably set: this message, too, is taken as
+        the next step, and times are counted from it on.
 
         Parameters
         ----------
@@ -88,7 +89,10 @@ class Clock:
         return round(step)
 
     def _is_too_far(self, step: float, next_step: int) -> bool:
-        """Return whether a step, possibly NaN, lies too far away to belong to the same clock."""
+        """Return whether a step lies too far from the next one to be a time of the same clock.
+
+        A step that is NaN, because the clock has no origin yet, counts as too far.
+        """
         gap = self._section.longest_gap
         is_near = -gap <= step <= next_step + gap
         if not is_near:
@@ -96,7 +100,11 @@ class Clock:
         return self.only_step is not None and step - self.only_step >= LARGEST_UNCONFIRMED_GAP
 
     def likely_unit(self, time: float, next_step: int, distance: float = 0.0) -> str:
-        """Return the smaller unit that a time seems to have; empty if the stated one fits.
+        """Return the unit in which a time seems to be given; empty if the stated unit fits.
+
+        Only units smaller than the stated one are tried. A unit is likely if, read in it, the time
+        lies one step after the only one before it, is close to the expected time, or counts from
+        1970.
 
         Parameters
         ----------
@@ -115,6 +123,7 @@ class Clock:
             expected_time = self.origin + self._section.seconds_per_step * next_step
         units = list(TIME_UNITS)
         smaller_units = units[units.index(self._section.time_unit) + 1 :]
+        # Each unit is a thousandth of the one before it
         for power, unit in enumerate(smaller_units, start=1):
             factor = 1000.0**power
             is_next_step = abs(distance / factor - 1.0) <= _JITTER

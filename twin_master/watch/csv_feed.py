@@ -16,7 +16,7 @@ from twin_master.watch.recorded_feeds import RecordedFeed
 
 
 def _parse_whole_number(cell: str) -> int:
-    """Return a whole number, also one that a table of floating-point numbers has as `12.0`."""
+    """Return the whole number in a cell; `12.0`, as floating-point tables write it, is 12."""
     digits, point, decimals = cell.partition(".")
     is_whole = point and not decimals.strip("0")
     return int(digits if is_whole else cell)
@@ -54,11 +54,16 @@ class CsvFeed(RecordedFeed):
         self._set_columns(self._read_header())
 
     def _read_header(self) -> list[str]:
-        """Return the names of the columns.
+        """Return the names of the columns from the first line of the file.
 
-        A file that was begun a moment ago has no header yet, and one that was copied and cut has
-        lost it. If the file is followed, it then has the header of the newest rotated file that
-        has one.
+        The file may have no header: it was begun a moment ago, or it was rotated by copying and
+        cutting it, so that it goes on with a row of readings. If it is followed, the header of the
+        newest rotated file that has one is returned then.
+
+        Raises
+        ------
+        MissionInputError
+            If no file has a header, or if they cannot be read.
         """
         files = [self.path]
         if self.follow:
@@ -66,6 +71,7 @@ class CsvFeed(RecordedFeed):
         try:
             lines = [first_line(file) for file in files]
             whole_lines = [line for line in lines if line.endswith(b"\n")]
+            # If no line is complete, the incomplete first line of the file itself is used
             rows = [_split_cells(line) for line in whole_lines or lines[:1]]
         except (OSError, ValueError) as error:
             reason = str(error).rstrip(".")
@@ -82,10 +88,13 @@ class CsvFeed(RecordedFeed):
         )
 
     def _has_readings(self, cells: Sequence[str]) -> bool:
-        """Return whether the cells of a row are readings, and not the names of columns."""
+        """Return whether the cells of a row are readings, and not the names of columns.
+
+        They are if a cell is a number and not every cell is the name of a column.
+        """
         if not any(map(_is_number, cells)):
             return False
-        # Sensors may have numbers as names
+        # Sensors may have numbers as names, so that numbers alone do not show readings
         try:
             return not all(self._is_column(PRESENT_NAMES.get(cell, cell)) for cell in cells)
         except Refused:  # a known name with a wrong unit
@@ -156,13 +165,17 @@ class CsvFeed(RecordedFeed):
         return sensors
 
     def open_file(self, position: Position | None) -> BinaryIO:
-        """Return the file that contains a position, open; take over the columns of its header."""
+        """Open the file that contains a position, set the columns by its header, and return it."""
         file = super().open_file(position)
         self.content_of(first_line(Path(file.name)), 0)
         return file
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
-        """Return the message in a row; None for a header, whose columns are taken over."""
+        """Return the message in a row, or a refusal of the row.
+
+        If the row is a header, the columns are set by it, and None is returned. Only the first line
+        of a file can be a header.
+        """
         try:
             cells = _split_cells(line)
         except ValueError as error:

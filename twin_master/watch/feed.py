@@ -19,7 +19,7 @@ class Feed:
     """
 
     replayable = False
-    """Whether the feed begins again in each process, with the messages that were read before."""
+    """Whether a resumed watch can read the messages again from the beginning of the feed."""
     position: Position | None = None
     """The position after the message that was given last, if the feed is a file."""
 
@@ -27,7 +27,7 @@ class Feed:
         self._items = items
 
     def contains_position(self, position: Position) -> bool:
-        """Return whether a position is one in this feed, and not in another source."""
+        """Return whether a position belongs to this feed; false for a feed without positions."""
         return False
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:

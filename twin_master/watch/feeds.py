@@ -25,7 +25,10 @@ STANDARD_INPUT = "-"
 def _read_messages(
     scenario: Scenario, contents: Iterable[bytes | Refused | None]
 ) -> Iterator[FeedItem]:
-    """Yield JSON objects as messages about the asset of a scenario."""
+    """Yield the message in each JSON text, with the beginning of the text.
+
+    None in the place of a text means that nothing has come yet; so it does in the result.
+    """
     reader = MessageReader(scenario)
     for content in contents:
         if content is None:

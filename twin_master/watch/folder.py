@@ -81,11 +81,11 @@ class GivenPatch(NamedTuple):
 
 
 def _do_nothing() -> None:
-    """Stand for what is done between two steps if nothing is to be done."""
+    """Do nothing; the default for what is called between two steps."""
 
 
 class Watch:
-    """A watch whose folder this process holds.
+    """A watch of an asset, whose folder is locked by this process.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Watch:
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel
-        The model of the beginning, and the patched models that were adopted.
+        The first model, and the patched models that were adopted, in their order.
     teaching : Teaching
         The state of teaching after the last line of the journal.
     journal : JournalFile
@@ -116,8 +116,9 @@ class Watch:
         The messages that come, from `begin` on.
     twin : Twin
         The twin, from `begin` on. It is replaced when a patched model is adopted.
-    filtered : (S,) array or None
-        The belief after the last step; None before the first step of this process.
+    filtered : (states,) array or None
+        The filtered probability of each state after the last step; None before the first step of
+        this process.
     is_quiet : bool
         Whether the operator was told that no step comes any more.
     """
@@ -155,7 +156,7 @@ class Watch:
         self._keep_knowledge(sibling)
 
     def _prepare_model(self) -> BelievedModel:
-        """Return the model of the beginning, calibrated and planned with."""
+        """Calibrate the model of the watch, plan with it, and return it as the first model."""
         with self.progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
         remark = calibration_sentence(
@@ -167,8 +168,11 @@ class Watch:
         return BelievedModel(0, knowledge, Path(patch) if patch else None)
 
     def _keep_knowledge(self, sibling: "Watch | None") -> None:
-        """Write the knowledge of all models into the folder, where viewers find it."""
-        # Without adopted patches both have the knowledge of the beginning
+        """Write the knowledge of all models into the folder, where viewers find it.
+
+        If this watch and its sibling have adopted no patch, both have the same knowledge, and the
+        file of the sibling is linked instead.
+        """
         has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
         if sibling is not None and has_same_knowledge:
             link_knowledge(sibling.folder, self.folder)
@@ -178,7 +182,10 @@ class Watch:
             save_knowledge(self.folder, model.knowledge, number)
 
     def update_from_journal(self) -> None:
-        """Read the state of teaching from the journal, and load the models adopted there."""
+        """Read the state of teaching from the journal, and load the models adopted in it.
+
+        Models that are loaded already are kept.
+        """
         check_header(self.journal_path, self._config_hash)
         notice = self.scenario.notice
         threshold = 1.0 if notice is None else notice.threshold  # without notices: of no effect
@@ -241,7 +248,9 @@ class Watch:
 
     @contextmanager
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
-        """Open the journal, and take up the twin as it is after the last line.
+        """Open the journal, and restore the twin and the intake after its last line.
+
+        This is a context manager. At its end the counts of the messages are written.
 
         Parameters
         ----------
@@ -272,16 +281,20 @@ class Watch:
             self._write_last_counts()
 
     def _write_last_counts(self) -> None:
-        """Write down the counts of the messages after the last step."""
+        """Write the counts of the messages that came after the last line into the journal.
+
+        If the disk is full the counts are lost, but no observation is.
+        """
         if self.intake.state()["counts"] == self._written_intake["counts"]:
             return
-        with suppress(FileNotWrittenError):  # no observation is lost
+        with suppress(FileNotWrittenError):
             self.write_event()
 
     def decisions(self) -> Iterator[JsonObject]:
-        """Yield the decision of each step, once it is in the journal, until no more comes.
+        """Yield the decision of each step, once it is in the journal, until the feed ends.
 
-        If the messages after a step are refused, its decision is given again with a notice.
+        If the messages after a step are refused, its decision is given again with a notice. If a
+        patched model is adopted between two steps, the loop goes on with the twin of this model.
         """
         while True:
             twin = self.twin
@@ -299,7 +312,10 @@ class Watch:
         return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
     def _write_step(self, step: MissionStep) -> JsonObject:
-        """Write a step into the journal; return its line."""
+        """Write a step into the journal, with the notices that were pending; return its line.
+
+        If the operator was told that no step comes any more, a notice says that they come again.
+        """
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)
         if self.is_quiet:
@@ -316,7 +332,13 @@ class Watch:
         return line
 
     def write_event(self, **fields: object) -> None:
-        """Write a line that is no step into the journal, such as a verdict or a model."""
+        """Write an event that is no step, such as a verdict, as a line into the journal.
+
+        Parameters
+        ----------
+        **fields : object
+            The entries of the line beside the last step, the next control and the intake.
+        """
         line = {
             "step": self.twin.steps - 1,
             "next_control": self.twin.proposed_control,
@@ -337,9 +359,10 @@ class Watch:
         return time.monotonic() - self._time_of_last_step
 
     def last_decision(self) -> JsonObject | None:
-        """Return the last decision in the journal; None without any.
+        """Return the last decision in the journal; None if there is none.
 
-        It has `told_again`, because a kill may have kept it from being sent, and nobody knows.
+        The decision is marked with `told_again`, because it may have been sent before: after a kill
+        that is not known.
         """
         for line, _, _ in records_backwards(self.journal_path):
             if "filtered" in line:
@@ -347,7 +370,11 @@ class Watch:
         return None
 
     def report_silence(self, send: Callable[[JsonObject], None]) -> None:
-        """Send the last decision with a notice, once no step has come for too long."""
+        """Send the last decision again, with a notice that no step has come for too long.
+
+        Nothing is sent before `watch.quiet_after_seconds` have passed, or if this silence was
+        reported already.
+        """
         longest_silence = self.scenario.watch.quiet_after_seconds
         if longest_silence is None or self.is_quiet or self.seconds_since_step < longest_silence:
             return
@@ -365,15 +392,21 @@ class Watch:
         send(decision)
 
     def _report_refusals(self) -> JsonObject:
-        """Write down that messages are refused; return the last decision with this notice."""
+        """Write a notice that messages are refused into the journal.
+
+        Returns
+        -------
+        dict
+            The last decision, with this notice.
+        """
         decision = self._last_decision_with(self.intake.stream.report_refusals(self.twin.steps))
         self.write_event(notices=decision["notices"], refused=decision)
         return decision
 
     def _last_decision_with(self, notice: Notice) -> JsonObject:
-        """Return the last decision with a notice in the place of its own ones.
+        """Return the last decision, its notices replaced by one notice.
 
-        Before the first step there is no decision: then it has the step -1 and no control.
+        If there is no decision yet, a record with the step -1 and without a control is returned.
         """
         decision = self.last_decision() or {"step": -1}
         return {**decision, "notices": [notice.as_record()]}
@@ -381,10 +414,10 @@ class Watch:
     def trial_of(
         self, patch: Path, from_step: int, compared: ComparedSteps = NO_STEPS
     ) -> Callable[..., PatchOutcome]:
-        """Return a function that computes the outcome of a patch; it takes `progress`.
+        """Return a function that computes the outcome of a patch.
 
-        The function uses the lines that the journal has now. So it may be called in a thread while
-        the watch goes on.
+        It reads the journal up to its present end, so that it may be called in a thread while the
+        watch goes on. Its only argument, `progress`, is optional.
 
         Parameters
         ----------
@@ -409,7 +442,13 @@ class Watch:
         )
 
     def _adopt_given(self, patch: GivenPatch) -> None:
-        """Adopt a patch that the user gives."""
+        """Adopt a patch that the user gives.
+
+        Raises
+        ------
+        MissionInputError
+            If no step was watched yet, or if `from_step` is neither one of them nor the next one.
+        """
         steps = self.twin.steps
         if not steps or not 0 <= patch.from_step <= steps:
             raise MissionInputError(
@@ -419,7 +458,9 @@ class Watch:
         self.adopt(outcome, None, self._copy_verdict_of(patch.file))
 
     def _copy_verdict_of(self, patch: Path) -> str:
-        """Copy the verdict beside a given patch, and its drawing of the missing force, for viewers.
+        """Copy the verdict in the folder of a given patch, with its drawing, for viewers.
+
+        The drawing shows the missing force that the verdict has found.
 
         Returns
         -------
@@ -439,7 +480,7 @@ class Watch:
     def adopt(
         self, outcome: PatchOutcome, notice: JsonObject | None, verdict_folder: str = ""
     ) -> None:
-        """Believe a patched model, and go on with its twin.
+        """Adopt a patched model: filter the steps again with it, and go on with its twin.
 
         Parameters
         ----------
@@ -477,7 +518,8 @@ class Watch:
         if verdict_folder:
             record["verdict"] = verdict_folder
 
-        # Before viewers read the line of the model: they show earlier steps with the old knowledge
+        # Save the knowledge before the line: viewers that read the line load both models, because
+        # they show earlier steps with the former one
         former_number = len(self.models) - 2
         save_knowledge(self.folder, self.models[former_number].knowledge, former_number)
         save_knowledge(self.folder, outcome.model.knowledge)
@@ -485,7 +527,7 @@ class Watch:
         self._show_adoption(record)
 
     def _show_adoption(self, model: ModelRecord) -> None:
-        """Show how well the patched model fits, beside the former one."""
+        """Tell the operator how well the patched model fits, beside the former one."""
         comparisons = []
         for name, value in model["before"].items():
             if value is not None:

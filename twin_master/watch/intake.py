@@ -35,7 +35,7 @@ SNAPSHOT_STEPS = 32
 
 @dataclass
 class Counts:
-    """How many messages came, and what became of them.
+    """The counts of messages and steps of a watch, by what became of them.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Counts:
     late : int
         The messages that came late and were assimilated in their step.
     duplicates : int
-        The messages that said nothing new.
+        The messages about an earlier step that added nothing to it.
     rejected : int
         The messages that were refused.
     """
@@ -113,7 +113,8 @@ class Intake:
     has_ended : bool
         Whether the feed has ended. If not, more may come after `read` has returned None.
     on_poll : callable or None
-        Called now and then while nothing comes. Without it `read` does not wait.
+        Called again and again while no reading comes. If it is None, `read` does not wait for
+        messages.
     step_limit : int or None
         The number of steps after which the watch ends.
     end_is_requested : bool
@@ -162,12 +163,13 @@ class Intake:
 
     @property
     def has_queued_readings(self) -> bool:
-        """Whether readings of the last message are still to be given."""
+        """Whether the queue still contains readings of the last message or of a gap before it."""
         return bool(self._queue)
 
     def state(self) -> JsonObject:
         """Return the state from which a resumed watch goes on, for the journal."""
-        # The message after a gap is read again until its own step is in the journal
+        # After a gap the queue holds missing steps, then the message itself. A watch that is
+        # resumed meanwhile reads this message again, so that it is not counted yet.
         is_read_again = self.has_queued_readings
         received = self.counts.received - 1 if is_read_again else self.counts.received
         state: JsonObject = {
@@ -187,6 +189,9 @@ class Intake:
 
     def journal_line(self, step: MissionStep, twin: Twin) -> JsonObject:
         """Return the line of the journal with the last reading and what the twin concluded.
+
+        Every `SNAPSHOT_STEPS` steps the line also contains the state of the twin, from which a
+        resumed watch goes on. Notices that the twin itself gives are not added a second time.
 
         Parameters
         ----------
@@ -218,9 +223,17 @@ class Intake:
         return record
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
-        """Go on from a state, see `state`; None is the beginning of a watch.
+        """Restore the state of an earlier process of the watch, so that reading goes on after it.
 
-        A file that was read before is read on. Another one is read from its first message.
+        If the feed is the file that was read before, reading goes on at the recorded position.
+        Every other feed is read from its first message. Messages that were written to
+        `rejected.jsonl` after the state was recorded are added to the counts, unless the feed
+        contains them again.
+
+        Parameters
+        ----------
+        state : mapping of str to object, or None
+            The state, as `state` returns it; None at the beginning of a watch.
         """
         feed_is_read_again = self._feed.replayable
         if state is not None:
@@ -241,19 +254,25 @@ class Intake:
         self.counts.received += rejected_later
 
     def request_end(self) -> None:
-        """Request the end of the watch: between two steps, never within one."""
+        """Request the end of the watch.
+
+        It ends between two steps, never within one. If it waits for a message, the waiting is
+        interrupted by an exception, which `read` catches.
+        """
         self.end_is_requested = True
         if self._is_waiting:
             raise _EndRequested
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading; see `Source.read`.
+        """Return the next reading for the twin, waiting for messages until there is one.
 
-        None also if the end was requested, and if nothing has come and there is no `on_poll`.
+        None is returned if the feed has ended, if the end of the watch was requested, if the twin
+        has all its steps, if the operator is to be told of refusals (`stops_at_refusals`), or if
+        no message has come and there is no `on_poll`, without which nothing is waited for.
         """
         with suppress(_EndRequested):
             while not self.end_is_requested and not self._has_all_steps(twin):
-                # Looked at before each message, because an impossible observation is refused, too
+                # Checked again each time, because `replace_impossible` refuses messages, too
                 if self.stops_at_refusals and self.stream.has_refusals_to_report:
                     return None
                 begin = time.monotonic()
@@ -270,11 +289,17 @@ class Intake:
         return None
 
     def _has_all_steps(self, twin: Twin) -> bool:
-        """Return whether the twin has the steps after which the watch ends."""
+        """Return whether the twin has assimilated as many steps as the watch is limited to."""
         return self.step_limit is not None and twin.steps >= self.step_limit
 
     def _receive_message(self, twin: Twin) -> bool:
-        """Take in the next message of the feed; return whether one has come."""
+        """Ask the feed for its next message, and put its readings into the queue or refuse it.
+
+        Returns
+        -------
+        bool
+            Whether a message has come, even if it was refused.
+        """
         item = self._next_item()
         self.has_ended = item is None
         message, self._text = item or (None, "")
@@ -295,7 +320,10 @@ class Intake:
         return True
 
     def _next_item(self) -> FeedItem | None:
-        """Return what the feed gives next; None if it has ended."""
+        """Return the next item of the feed; None if the feed has ended.
+
+        The item contains no message if nothing has come yet.
+        """
         if self._messages is None:
             self._messages = self._feed.messages(self._position)
         self._is_waiting = self.on_poll is not None
@@ -305,7 +333,11 @@ class Intake:
             self._is_waiting = False
 
     def _next_reading(self, twin: Twin) -> Reading:
-        """Return the first reading of the queue, and count it."""
+        """Take the first reading out of the queue, note it, and return it.
+
+        Noting it updates the notices, the counts, and the status of its step. The state before is
+        kept, because the twin may find the reading impossible.
+        """
         queued = self._queue.popleft()
         reading = queued.reading
         self.observation_step = queued.step
@@ -325,23 +357,28 @@ class Intake:
         return reading
 
     def _note_revision(self, index: int, status: StepStatus) -> None:
-        """Count a late message.
+        """Count a late message, and update the status of the earlier step that it belongs to.
 
         Parameters
         ----------
         index : int
-            The step of the message minus the next step: -1 is the last step, whose status is the
-            last one of the list.
+            The negative index of this step in the list of statuses: the step of the message minus
+            the next step of the twin, so that -1 is the last step.
         status : StepStatus
-            What the message has of its step.
+            The status that this message alone gives to its step.
         """
         self.counts.late += 1
         if self._statuses[index] is StepStatus.MISSING:
             self.counts.missing -= 1
+        # A status grows from MISSING over ASSUMED_CONTROL to WITH_CONTROL: nothing known is lost
         self._statuses[index] = max(status, self._statuses[index])
 
     def _note_accepted(self, step: int, reading: Reading) -> list[Notice]:
-        """Note that a message is assimilated; return the notices about the stream."""
+        """Note that a message is accepted for its step; return the notices about the stream.
+
+        This counts the message if it has any reading. The reading may still be refused later, see
+        `replace_impossible`.
+        """
         is_blind = bool(np.isnan(reading.observed).all())
         if not is_blind:
             self._with_readings_here += 1
@@ -351,10 +388,10 @@ class Intake:
         return self.stream.accept(step, is_blind=is_blind, ignored=ignored)
 
     def complaint(self) -> str:
-        """Return why the messages of this process were of no use, in a sentence.
+        """Return a sentence that says why the messages of this process were of no use.
 
-        It is empty if they were of use: if a message had the reading of a sensor, and those at the
-        end were not all refused.
+        The sentence is empty if no message came, or if they were of use: if at least one message
+        had the reading of a sensor, and fewer than `REFUSALS_IN_A_ROW` were refused at the end.
         """
         received = counted(self._received_here, "message")
         refused = self.stream.refused_in_a_row
@@ -374,7 +411,10 @@ class Intake:
         return ""
 
     def _note_unreadable_sensors(self, reading: Reading) -> list[Notice]:
-        """Return a notice for each sensor that becomes unreadable, or that is readable again."""
+        """Return a notice for each sensor that becomes unreadable, or that is readable again.
+
+        The set of unreadable sensors is updated. A sensor stays in it until a reading of it comes.
+        """
         if reading.revises is not None:  # a late message does not show how the sensors are now
             return []
         notices = []
@@ -398,7 +438,9 @@ class Intake:
         return notices
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Refuse an observation that has probability zero in every state.
+        """Refuse an observation that has probability zero in every state of the model.
+
+        What was noted when its message was accepted is undone.
 
         Parameters
         ----------
@@ -410,8 +452,9 @@ class Intake:
         Returns
         -------
         Reading
-            The reading in its place: none for the next step, which is predicted through; for an
-            earlier step the row that it had before.
+            The reading that replaces it. For the next step it has no value (NaN), so that the
+            belief is predicted through the step; for an earlier step it is the row that was
+            received before.
         """
         # Undo what was noted when the message was accepted
         self.stream.restore(self._previous_stream_state)
@@ -425,13 +468,17 @@ class Intake:
         return Reading(np.full(self._width, np.nan), reading.control)
 
     def _refuse(self, reason: str, step: int | None) -> None:
-        """Count the last message as refused, and write it down."""
+        """Count the last message as refused, and write it to `rejected.jsonl` with the reason."""
         self.counts.rejected += 1
         self.stream.note_refusal(step, one_line(reason))
         self._rejected.append(self.counts.received, reason, self._text)
 
     def _step_of(self, twin: Twin, message: Message) -> int:
-        """Return the step that a message names, or that of its time, or the next one."""
+        """Return the step of a message.
+
+        It is the step that the message names, or else the step at the time that the message names,
+        or else the next step of the twin.
+        """
         if message.step is not None:
             return message.step
         if message.time is None:
@@ -439,7 +486,10 @@ class Intake:
         return self._clock.step_of(message.time, twin.steps, self.stream)
 
     def _enqueue(self, twin: Twin, message: Message, step: int) -> None:
-        """Put a message into the queue: that of the next step, of one ahead, or of an earlier one.
+        """Put a message into the queue of readings.
+
+        If its step lies ahead of the next step of the twin, an empty reading is queued before it
+        for each step between them. If its step was received before, the message revises it.
 
         Raises
         ------
@@ -480,14 +530,23 @@ class Intake:
     def _enqueue_revision(
         self, twin: Twin, message: Message, step: int, status: StepStatus
     ) -> None:
-        """Put a message about an earlier step into the queue, if it says something new of it."""
+        """Put a message about an earlier step into the queue, if it adds anything to that step.
+
+        It adds something if it has readings that the step lacks, or another control than the one
+        that was assumed. Otherwise it is counted as a duplicate.
+
+        Raises
+        ------
+        Refused
+            If the message contradicts a reading or the control that was received of the step.
+        """
         row = twin.observed(step)
         is_in_both = ~np.isnan(row) & ~np.isnan(message.observed)
         if not np.array_equal(row[is_in_both], message.observed[is_in_both]):
             raise Refused(f"it contradicts what was received of step {step} before")
         has_other_control = message.control not in (None, twin.control_of(step))
         if has_other_control:
-            # Counted from the end: -1 is the status of the last step
+            # Negative index: the last status belongs to the last step of the twin
             former_status = self._statuses[step - twin.steps]
             if former_status is StepStatus.WITH_CONTROL:
                 raise Refused(f"it contradicts the control of step {step}")

@@ -16,7 +16,7 @@ from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 
 class Position(TypedDict):
-    """The position of a feed in a file, after a message, as a journal holds it.
+    """The position in a file up to which a feed has read it, as it is stored in a journal.
 
     Attributes
     ----------
@@ -37,10 +37,11 @@ _DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
 def rotated_files(path: Path) -> list[Path]:
-    """Return the files that had the name of a log before, and copies of them, the oldest first.
+    """Return the rotated files of a log, the oldest first.
 
-    Their names have a number or a date after that of the log, as logrotate and `logging.handlers`
-    make them: `log.csv.1`, `log.csv-20260501`, `log.csv.2026-05-01_12`.
+    They had the name of the log before, or are copies of it. Their names are that of the log and a
+    number or a date, as logrotate and `logging.handlers` make them: `log.csv.1`,
+    `log.csv-20260501`, `log.csv.2026-05-01_12`.
     """
     dates = []
     numbers = []
@@ -61,14 +62,14 @@ def _number_of_suffix(suffix: str) -> int:
 
 
 def first_line(path: Path) -> bytes:
-    """Return the first line of a file, as far as it is written; empty if there is no file."""
+    """Return the first line of a file, perhaps still incomplete; empty if there is no file."""
     with suppress(FileNotFoundError), path.open("rb") as file:
         return file.readline(LARGEST_MESSAGE)
     return b""
 
 
 def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | None:
-    """Return the file that contains a position; None if there is none.
+    """Return the file, among a log and its rotated files, that contains a position, or None.
 
     Parameters
     ----------
@@ -90,7 +91,11 @@ def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | 
 
 
 def contains(file: BinaryIO, position: Position | None) -> bool:
-    """Return whether an open file is the one that a position belongs to, and reaches up to it."""
+    """Return whether an open file contains a position.
+
+    It does if it is at least as long, and its first bytes have the hash of the position. The file
+    is read from its beginning, so that its own position changes.
+    """
     if position is None or file.seek(0, os.SEEK_END) < position["read"]:
         return False
     file.seek(0)
@@ -100,14 +105,14 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
 
 @lru_cache(1000)
 def _hash_of_beginning(beginning: bytes) -> str:
-    """Return the SHA-256 of the beginning of a file, by which the file is known again."""
+    """Return the SHA-256 of the beginning of a file, by which a renamed file is recognised."""
     return sha256(beginning).hexdigest()
 
 
 class Lines:
-    """The lines of what comes in pieces; a line that is too long is refused.
+    """The lines of a source of bytes that come in pieces; a line that is too long is refused.
 
-    What stands after the last line feed, at the very end, is a line, too.
+    The bytes after the last line feed are a line, too, once the source has ended.
 
     Attributes
     ----------
@@ -124,12 +129,16 @@ class Lines:
     def pieces(self) -> Iterator[bytes | Refused | None]:
         """Yield the pieces as they come.
 
-        None means that nothing has come yet. An empty piece ends a line that was begun.
+        None is yielded while nothing comes, and a refusal if bytes were lost. An empty piece ends a
+        line that has no line feed.
         """
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[bytes | Refused | None]:
-        """Yield the lines, each with its line feed; None if no further line has come yet."""
+        """Yield the lines, each with its line feed; None while no further line has come.
+
+        A line that is too long is yielded as a refusal, once its end has come.
+        """
         line: bytes | Refused = b""
         for piece in self.pieces():
             if not isinstance(piece, bytes):
@@ -214,7 +223,7 @@ class GrowingFile(Lines):
         self._start_reading(file, position)
 
     def _start_reading(self, file: BinaryIO, position: Position | None) -> None:
-        """Go on with a file at a position."""
+        """Read a file from a position on, or from its beginning if it does not contain it."""
         self.end = 0
         if position is not None and contains(file, position):
             self.end = position["read"]
@@ -229,7 +238,7 @@ class GrowingFile(Lines):
         return {"beginning": _hash_of_beginning(self._beginning[: self.end]), "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Yield the pieces of the file, and of those that take its place."""
+        """Yield the pieces of the file; if its name is followed, also of files that replace it."""
         try:
             if self._followed_path is None:
                 yield from self._pieces_to_end()
@@ -248,7 +257,10 @@ class GrowingFile(Lines):
             yield piece
 
     def _followed_pieces(self, path: Path) -> Iterator[bytes | Refused | None]:
-        """Yield what comes under a name, without end."""
+        """Yield the pieces of the file and of the files that get its name later, without end.
+
+        None is yielded while nothing comes.
+        """
         while True:
             piece = self._file.read(_PIECE_BYTES)
             if self._was_cut():
@@ -257,7 +269,7 @@ class GrowingFile(Lines):
             if not piece:
                 next_file = self._open_next(path)
                 if next_file is not None:
-                    # What its writer has left in the file before the other took its place
+                    # The writer may have added to the old file before it opened the new one
                     piece = self._file.read(_PIECE_BYTES)
                     if not piece:
                         yield from self._switch_to(next_file)
@@ -267,12 +279,15 @@ class GrowingFile(Lines):
             yield piece or None
 
     def _note_beginning(self, piece: bytes) -> None:
-        """Keep a piece, if it belongs to the beginning that identifies the file."""
+        """Add a piece to the beginning that identifies the file, until it is long enough."""
         if len(self._beginning) < _PIECE_BYTES:
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 
     def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
-        """Go on in the copy of a file that was cut; without a copy, at its new beginning."""
+        """Go on in the copy of a file that was cut, as logrotate does with `copytruncate`.
+
+        If there is no copy, a refusal is yielded, and reading goes on at the beginning of the file.
+        """
         copy = find_file(path, self.position, follow=True)
         if copy is None:
             yield Refused(
@@ -285,8 +300,8 @@ class GrowingFile(Lines):
     def _switch_to(self, file: BinaryIO, *, is_copy: bool = False) -> Iterator[bytes]:
         """Go on with another file.
 
-        A line that was begun goes on there only if one of the two files is a copy of the other. If
-        not, an empty piece ends it.
+        An incomplete line at the end of the former file continues in this one only if one of the
+        two is a copy of the other. If not, an empty piece ends the line.
         """
         line_goes_on = self._is_copy or is_copy
         position = self.position
@@ -297,7 +312,7 @@ class GrowingFile(Lines):
             yield b""
 
     def _was_cut(self) -> bool:
-        """Return whether the file has lost what was read of it, even if it has grown again."""
+        """Return whether the file was cut after it was read, even if it has grown again since."""
         beginning = os.pread(self._file.fileno(), len(self._beginning), 0)
         if beginning != self._beginning:
             return True
@@ -309,17 +324,17 @@ class GrowingFile(Lines):
         None if this file still has the name, or if nothing was written into the next one yet.
         """
         with suppress(FileNotFoundError):  # in the middle of being renamed
-            own = os.fstat(self._file.fileno())
-            if os.path.samestat(own, path.stat()):
+            status = os.fstat(self._file.fileno())
+            if os.path.samestat(status, path.stat()):
                 return None
             inodes = _inodes_of_log(path)
             inodes_again = _inodes_of_log(path)
-            next_path = _first_written_after(inodes, own.st_ino, path)
+            next_path = _first_written_after(inodes, status.st_ino, path)
             if next_path is None:
                 return None
             with ExitStack() as closing:
                 file = closing.enter_context(next_path.open("rb", buffering=0))
-                # Only if no file was renamed meanwhile, the opened file is the one that was chosen
+                # A file renamed meanwhile would let another file be opened than the chosen one
                 if inodes == inodes_again == _inodes_of_log(path):
                     closing.pop_all()
                     return file
@@ -332,9 +347,18 @@ def _inodes_of_log(path: Path) -> dict[Path, int]:
 
 
 def _first_written_after(inodes: dict[Path, int], inode: int, path: Path) -> Path | None:
-    """Return the first file after that with an inode that is not empty.
+    """Return the first file of a log that is not empty and newer than the file with an inode.
 
-    If no file has the inode, only the log at `path` counts.
+    If no file has the inode, only the log itself is considered.
+
+    Parameters
+    ----------
+    inodes : dict of Path to int
+        The inode of each file of the log, the oldest first.
+    inode : int
+        The inode of the file that was read to its end.
+    path : Path
+        The log itself.
     """
     later_files = [path]
     inodes_in_order = list(inodes.values())

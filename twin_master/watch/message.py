@@ -29,7 +29,7 @@ LARGEST_MESSAGE = 1_000_000
 LARGEST_STRAIN = 0.5
 """Largest strain; beyond it the publisher has forgotten the unit."""
 LARGEST_VALUE = 1e30
-"""Largest value of any other sensor, SI; it exceeds what exists, and its powers are finite."""
+"""Largest value of any other sensor, SI; no sensor reaches it, and its powers do not overflow."""
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
 """A unit whose first name has a power. The prefix has this power, too: a mm2 is 1e-6 m2."""
@@ -41,7 +41,7 @@ PRESENT_NAMES = {"turn": "step"}
 _UNITS_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """The length of a second in each unit of times."""
 _LEAST_SIMILARITY = 0.8
-"""Least ratio of `difflib` between a name and the known one that it was probably meant to be."""
+"""Least similarity (ratio of `difflib`) at which an unknown name counts as a misspelt known one."""
 _SHOWN_CHARACTERS = 60
 """Characters of an unknown name that a refusal shows."""
 _SHOWN_NAMES = 3
@@ -65,7 +65,7 @@ class Message(Reading):
     time : float or None
         The time [s] that the message names.
     assumed : bool
-        Whether its control was assumed when it was recorded, because no message had told it.
+        Whether its control was assumed when it was recorded, because no message had named it.
     ignored : dict of str to str
         The names in it that are no sensor. The value of a name is the known name that it was
         probably meant to be, in words; it is empty if there is none.
@@ -80,7 +80,7 @@ class Message(Reading):
 FeedItem = tuple[Message | Refused | None, str]
 """A message with the beginning of its text; None if no further message has come yet."""
 MessageContent = bytes | Mapping[str, object] | Message | Refused
-"""The content of a message: JSON, a parsed object, or what was already read or refused."""
+"""The content of a message: JSON text, a parsed object, or a message already read or refused."""
 
 
 class SensorColumn(NamedTuple):
@@ -105,7 +105,7 @@ class _SensorReadings:
     Attributes
     ----------
     observed : array of shape (G + I,)
-        The readings of the sensors and of the inspections, SI; NaN where none came.
+        The readings of G sensors, then those of I inspections, SI; NaN if none came.
     sensors : set of int
         The indices of the sensors that the message names.
     unreadable : dict of int to str
@@ -174,7 +174,9 @@ class MessageReader:
         self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
 
     def _find_column(self, name: str) -> SensorColumn | None:
-        """Return the sensor and the factor that a name stands for; None if it is no sensor.
+        """Return the sensor that a name means, with the factor to SI; None if it is no sensor.
+
+        The name is that of a sensor, alone or followed by a unit, in brackets or after `_`.
 
         Raises
         ------
@@ -201,7 +203,11 @@ class MessageReader:
         return SensorColumn(sensor, factors[unit or self._units[sensor]])
 
     def _unit_factors(self, sensor: int) -> dict[str, float]:
-        """Return the units in which a sensor is read, each with its factor to SI units."""
+        """Return the units in which a sensor may be sent, each with its factor to SI units.
+
+        They are the unit of the sensor with each SI prefix. In a unit with a power, such as m2,
+        the prefix has the power, too.
+        """
         unit = self._units[sensor]
         if unit == "1":
             return _FACTORS_WITHOUT_UNIT
@@ -210,21 +216,21 @@ class MessageReader:
         return {prefix + unit: factor**power for prefix, factor in _PREFIXES.items()}
 
     def _find_likely_name(self, name: str) -> str:
-        """Return the known name that an unknown one was probably meant to be; empty if none."""
+        """Return the known name that an unknown one probably misspells; empty if there is none."""
         known_names = (*OTHER_KEYS, *self._sensor_of_name)
         matches = get_close_matches(name, known_names, 1, cutoff=_LEAST_SIMILARITY)
         return matches[0] if matches else ""
 
     def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
-        """Return a sentence with names that are no sensor, and what to do.
+        """Return a sentence that says which names are no sensor, and what sensors are called.
 
         Parameters
         ----------
         names : sequence of str
             At least one unknown name.
         has_sensors : bool
-            Whether there are sensors beside them. If not, nothing is left when the names are
-            ignored, and the sentence does not advise it.
+            Whether the message also names sensors. Only then the sentence advises to ignore the
+            unknown names; without sensors nothing of the message would remain.
         """
         shown_names = [name[:_SHOWN_CHARACTERS] for name in names[:_SHOWN_NAMES]]
         quoted_names = listing(f"`{name}`" for name in shown_names)
@@ -268,7 +274,13 @@ class MessageReader:
         return record
 
     def _read_record(self, record: Mapping[str, object]) -> Message:
-        """Return the observation in a parsed message."""
+        """Return the observation in a parsed message.
+
+        Raises
+        ------
+        Refused
+            If a value is invalid, or if names of no sensor are not allowed.
+        """
         record = with_present_names(record, PRESENT_NAMES, "A message", Refused)
         readings = self._read_sensors(record)
         self._check_ignored_names(readings)
@@ -285,7 +297,11 @@ class MessageReader:
         )
 
     def _read_sensors(self, record: Mapping[str, object]) -> _SensorReadings:
-        """Return the readings of all sensors in a parsed message."""
+        """Return the readings of all sensors in a parsed message.
+
+        A value that is no number or too large leaves the sensor without a reading (`unreadable`).
+        Names of no sensor are collected in `ignored`, and refused later if they are not allowed.
+        """
         readings = _SensorReadings(np.full(self._width, np.nan))
         for name, value in self._named_values(record):
             if name == "covariance" and self._observation.modes is not None:
@@ -350,7 +366,11 @@ class MessageReader:
         return self._controls.index(str(value))
 
     def _named_values(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-        """Yield the names and values of sensors; each value of a list gets that of its sensor."""
+        """Yield the name and the value of each sensor in a parsed message.
+
+        A list of all sensors, under the key of their role, is split into its sensors, each with the
+        name `ROLE_NUMBER_UNIT`. Keys that begin with `_` are left out.
+        """
         role = self._observation.role
         unit = record.get("unit", "")
         if not isinstance(unit, str):
@@ -366,7 +386,13 @@ class MessageReader:
                 yield name, value
 
     def _read_covariance(self, value: object) -> Float:
-        """Return the lower triangle of the covariance (count, count) of all values, SI."""
+        """Return the lower triangle, row by row, of the covariance matrix of all sensors, SI.
+
+        Raises
+        ------
+        Refused
+            If the value is not a symmetric, positive semidefinite matrix of the right size.
+        """
         count = self._observation.count
         try:
             matrix = np.array(value, dtype=np.float64)
@@ -376,8 +402,8 @@ class MessageReader:
             raise Refused(
                 f"`covariance` is {count} rows of {count} numbers, in SI units; null is none"
             )
-        # Correlations in the place of covariances, so that the tolerances hold for any unit.
-        # A correlation is at most 1. A value with a variance of zero is not scaled.
+        # Check correlations and not covariances, so that the tolerances hold for any unit. No
+        # correlation exceeds 1. A sensor with zero variance is left unscaled: divided by one.
         standard_deviation = np.sqrt(np.abs(np.diag(matrix)))
         standard_deviation[standard_deviation == 0.0] = 1.0
         with np.errstate(over="ignore"):
@@ -398,7 +424,20 @@ class MessageReader:
             return math.nan
 
     def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
-        """Return what came in the place of a reading, and how to give its unit if it lacks one."""
+        """Return, in words, the value that came in the place of a reading.
+
+        A strain that is too large and has no unit was probably sent in microstrain: then the text
+        says how to give the unit.
+
+        Parameters
+        ----------
+        value : object
+            The value in the message.
+        number : float
+            The value in SI units; NaN if it is no number.
+        column : SensorColumn
+            The sensor, with the factor to SI units.
+        """
         if not math.isfinite(number):
             return json.dumps(value)[:30]
         is_strain = self._largest_values[column.sensor] == LARGEST_STRAIN

@@ -73,12 +73,19 @@ class Topic(Feed):
         self._end_of_pause = 0.0  # on the monotonic clock [s]
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield what has come, without end."""
+        """Yield the messages that the session has handed on, without end.
+
+        None is yielded while there is none. The position is not used: a broker cannot go back.
+        """
         while True:
             yield self._read_payload(self.payloads.popleft() if self.payloads else None)
 
     def _read_payload(self, payload: bytes | None) -> FeedItem:
-        """Return the observation in a message, which must name its step or time."""
+        """Return the observation in a message, with the beginning of its text.
+
+        A message that names neither its step nor its time is refused: a broker may deliver it
+        twice, and the second one would count as another step.
+        """
         if payload is None:
             return None, ""
         message = self._reader.read(payload)
@@ -87,7 +94,10 @@ class Topic(Feed):
         return message, beginning_of(payload)
 
     def attach(self, watch: Watch) -> None:
-        """Publish the decisions in the journal of a watch that is begun or taken up again."""
+        """Attach a watch, whose decisions are published from now on.
+
+        Decisions in its journal that the broker has not acknowledged will be published again.
+        """
         self.watch = watch
         self._path = watch.folder / PUBLISHED_NAME
         self._journal = watch.folder / JOURNAL_NAME
@@ -102,7 +112,10 @@ class Topic(Feed):
 
     @contextmanager
     def _contained_errors(self) -> Iterator[None]:
-        """Let an error end the publication of these decisions, and nothing else."""
+        """Let an error end the publication of the decisions of this asset, and nothing else.
+
+        The error is handed to `on_error`.
+        """
         try:
             yield
         except Exception as error:  # noqa: BLE001 - whatever it is
@@ -111,14 +124,21 @@ class Topic(Feed):
             self._on_error(error)
 
     def send_decision(self, decision: Decision) -> None:
-        """Publish the decisions in the journal, of which this is the last one."""
+        """Publish all decisions in the journal that were not sent yet; the last is the given one.
+
+        The message of the step is acknowledged, unless the queue still has readings of it.
+        """
         if self.watch is not None and not self.watch.intake.has_queued_readings:
             self._session.acknowledge()
         self._session.publishers[self] = None
         self.publish()
 
     def publish(self) -> None:
-        """Send the decisions in the journal, as many as the session can take."""
+        """Send the decisions in the journal that were not sent yet, up to the limit of the session.
+
+        A decision that was already sent over a former connection is marked with `told_again`.
+        Nothing is sent during the pause after a refusal.
+        """
         if time.monotonic() < self._end_of_pause or self.watch is None:
             return
         with self._contained_errors():
@@ -135,7 +155,19 @@ class Topic(Feed):
             self._session.publishers.pop(self, None)
 
     def note_answer(self, message_id: int, refusal: str | None) -> None:
-        """Note the answer of the broker; after a refusal decisions are sent again after a pause."""
+        """Note the answer of the broker to a decision.
+
+        If the broker has taken the decision, the size of the acknowledged part of the journal is
+        written to the disk. If it refuses it, all decisions without an answer are sent again after
+        a pause; the operator is told of the first refusal only.
+
+        Parameters
+        ----------
+        message_id : int
+            The number of the message with the decision.
+        refusal : str or None
+            Why the broker refuses the decision; None if it has taken it.
+        """
         if refusal is not None and message_id in self._line_of_message:
             is_first_refusal = self._end_of_pause == 0.0
             if is_first_refusal:
@@ -145,13 +177,13 @@ class Topic(Feed):
         if self._line_of_message.pop(message_id, None) is None:
             return
         with self._contained_errors():
-            # All lines before the first one without an answer
+            # The broker has all decisions before the first one that is still unanswered
             unanswered_lines = iter(self._line_of_message.values())
             self._acknowledged_size = next(unanswered_lines, self._sent_size)
             _overwrite_size(self._path, self._acknowledged_size)
 
     def resend_unacknowledged(self) -> None:
-        """Note that decisions without an answer must be sent again."""
+        """Mark the decisions without an answer as not sent, so that they are sent again."""
         self._formerly_sent_size = max(self._formerly_sent_size, self._sent_size)
         self._sent_size = self._acknowledged_size
         self._line_of_message.clear()
@@ -163,7 +195,10 @@ class Topic(Feed):
 
 
 def _write_size(path: Path, size: int) -> None:
-    """Make the file `published` with a size, in as many digits as any size has."""
+    """Create the file `published` with a size.
+
+    It has 20 digits, enough for any size, so that `_overwrite_size` never changes its length.
+    """
     atomic_write_text(path, f"{size:020d}\n")
 
 
@@ -180,7 +215,7 @@ def _read_size(path: Path) -> int:
 
 
 class MqttFeed(Topic):
-    """The topic of one asset with a session of its own; see `Session` for the errors.
+    """The topic of one asset, with its own session at the broker; see `Session` for the errors.
 
     Parameters
     ----------
@@ -189,7 +224,7 @@ class MqttFeed(Topic):
     watch : Watch
         The watch of the asset; one that was begun before goes on with what the broker has kept.
     note : callable
-        Called with a sentence when the connection is lost or found.
+        Called with a sentence when the connection is lost or made.
     scenario : Scenario, optional
         The scenario by which messages are read; that of the watch if left out.
     """
@@ -221,7 +256,10 @@ class MqttFeed(Topic):
         }
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield what comes, without end; a message is acknowledged when it is in the journal."""
+        """Yield the messages as they come, without end; None while nothing comes.
+
+        A message is acknowledged once its step is in the journal.
+        """
         for message in self._session.receive(0.1):
             yield self._read_payload(None if message is None else bytes(message.payload))
 
@@ -231,5 +269,5 @@ class MqttFeed(Topic):
 
 
 def _raise_error(error: Exception) -> None:
-    """Let an error that keeps decisions from being published end the watch."""
+    """Raise an error that keeps decisions from being published, so that the watch ends."""
     raise error

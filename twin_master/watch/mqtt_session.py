@@ -43,7 +43,7 @@ _SESSION_SECONDS = 7 * 86_400
 """How long the broker keeps messages while the watch is away [s]."""
 _KEEPALIVE_SECONDS = 30
 _GOODBYE_SECONDS = 5.0
-"""How long the end waits for the broker to take the last decisions [s]."""
+"""Longest time that the end of a watch waits for the broker to take the last decisions [s]."""
 _PROPERTIES_BYTES = 10_000
 """Room for the topic and the properties of a message in its packet [bytes]."""
 
@@ -147,7 +147,7 @@ class Session:
 
     @property
     def _is_connected(self) -> bool:
-        """Whether the broker has let the twin in, and the connection is not lost."""
+        """Whether the broker has accepted the connection, and it is not lost."""
         return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
@@ -167,15 +167,18 @@ class Session:
             protocol=paho.MQTTv5,
             manual_ack=True,
         )
+        # Limits of the session
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = _SESSION_SECONDS
         properties.ReceiveMaximum = _UNREAD_MESSAGES
         properties.MaximumPacketSize = LARGEST_MESSAGE + _PROPERTIES_BYTES
+        # User and encryption
         broker = self._broker
         if broker.user is not None:
             client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
         if broker.tls:
             client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+        # The heartbeat that the broker publishes if the connection breaks
         last_will = json.dumps({"state": "lost"})
         client.will_set(self._heartbeat_topic, last_will, qos=1, retain=True)
         client.on_message = lambda _client, _data, message: self.unread.append(message)
@@ -200,7 +203,11 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties | None",
     ) -> None:
-        """Subscribe to the observations once the broker has let the twin in."""
+        """Subscribe to the observations once the broker has accepted the connection.
+
+        If the broker refuses it, the connection is dropped later, with this cause. A connection
+        that only discards the former session does not subscribe.
+        """
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
         if reason.is_failure:
@@ -225,7 +232,10 @@ class Session:
         reasons: "list[ReasonCode]",
         _properties: "Properties | None",
     ) -> None:
-        """Note that observations come now, and let all publishers begin."""
+        """Note that the broker sends observations from now on, and let all publishers send.
+
+        If the broker refuses the subscription, the connection is dropped later, with this cause.
+        """
         reason = reasons[0]
         if reason.is_failure:
             self._failure = (
@@ -263,13 +273,16 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties",
     ) -> None:
-        """Hand the answer of the broker to the publisher of the message."""
+        """Hand the answer of the broker to the publisher that sent the message."""
         publisher = self._publisher_of_message.pop(message_id, None)
         if publisher is not None:
             publisher.note_answer(message_id, str(reason) if reason.is_failure else None)
 
     def _drop_connection(self, failure: str) -> None:
-        """Drop the connection, to try again later; the first time a failure ends the watch.
+        """Drop the connection, and plan when to try again.
+
+        A failure before the first subscription ends the watch with an error. Messages that were
+        not acknowledged are forgotten here: the broker sends them again.
 
         Parameters
         ----------
@@ -293,7 +306,9 @@ class Session:
         self._publisher_of_message.clear()
 
     def _exchange(self, wait: float) -> None:
-        """Exchange packets with the broker, or try to connect again.
+        """Exchange packets with the broker; if there is no connection, try to connect.
+
+        After an exchange, decisions that wait are sent, and the heartbeat if it is due.
 
         Parameters
         ----------
@@ -307,7 +322,7 @@ class Session:
             return
         count = len(self.unread)
         error = client.loop(wait)
-        # All that has arrived already
+        # Read all packets that have arrived already
         while not error and len(self.unread) > count:
             count = len(self.unread)
             error = client.loop(0.0)
@@ -393,7 +408,10 @@ class Session:
         return message.mid
 
     def close(self) -> None:
-        """Disconnect once the broker has the last decisions; the broker keeps the session."""
+        """Send the last decisions, and disconnect; the broker keeps the session.
+
+        This waits at most `_GOODBYE_SECONDS` for the broker to take the decisions.
+        """
         has_crashed = sys.exc_info()[0] is not None
         end = time.monotonic() + _GOODBYE_SECONDS
         while self._has_decisions_to_send and time.monotonic() < end:
@@ -414,7 +432,15 @@ class Session:
         return bool(self.publishers) or bool(self._publisher_of_message)
 
     def _say_goodbye(self, client: "Client", state: str) -> None:
-        """Publish the last heartbeat, and disconnect in order."""
+        """Publish the last heartbeat, and disconnect so that the broker sees an orderly end.
+
+        Parameters
+        ----------
+        client : Client
+            The client of the connection.
+        state : str
+            The state in the heartbeat: "ended", or "lost" after an error.
+        """
         connection = client.socket()
         if connection is None:
             return

@@ -52,7 +52,7 @@ def begin_watch(
     replace_run: bool = False,
     sibling: Watch | None = None,
 ) -> Iterator[Watch]:
-    """Make the folder of a watch, and hold it.
+    """Create the folder of a new watch, and give the watch while its folder is locked.
 
     Parameters
     ----------
@@ -85,10 +85,11 @@ def begin_watch(
 
 
 def _client_files_to_discard(folder: Path) -> dict[str, bytes]:
-    """Return the files with which a new watch ends the session that a former one has at a broker.
+    """Return files for a new folder that let the watch end the session of a former one at a broker.
 
-    The new watch in the folder of a former one keeps its client name, because only under this name
-    the broker can end the former session.
+    They are the files of client names in the folder that is replaced, each with a second line that
+    asks for the end of the session. The client name is kept, because a broker ends a session only
+    if a client of the same name asks for it.
     """
     files = {}
     for path in folder.glob(f"*{CLIENT_SUFFIX}"):
@@ -101,7 +102,7 @@ def _client_files_to_discard(folder: Path) -> dict[str, bytes]:
 def resume_watch(
     folder: Path, loaded: LoadedScenario | None, progress: Progress, sibling: Watch | None = None
 ) -> Iterator[Watch]:
-    """Take up the watch in a folder, and hold the folder.
+    """Give the watch in an existing folder while the folder is locked.
 
     Parameters
     ----------
@@ -140,9 +141,11 @@ def resume_watch(
 def copy_of_run_until(
     folder: Path, first: int | None, last: int | None, progress: Progress
 ) -> Iterator[Path]:
-    """Give the folder of a run that ended at a step.
+    """Give a run folder with results up to a step.
 
-    A watch may go on meanwhile. So of a watch a temporary copy is given, which ends at the step.
+    The folder of a run is given as it is. A watch may still go on and may have no results yet: a
+    temporary copy of its folder is given instead, with the journal up to the last step and the
+    results of these steps. The copy is removed at the end of the context.
 
     Parameters
     ----------
@@ -230,11 +233,11 @@ def _watch_config(folder: Path) -> JsonObject | None:
 
 
 def _ignore_decision(decision: Decision) -> None:
-    """Stand for what is done with a decision if nobody asks for it."""
+    """Do nothing with a decision; the default for `decide`."""
 
 
 def _ignore_watch(watch: Watch) -> None:
-    """Stand for what is done with a watch once its folder is held, if nothing is to be done."""
+    """Do nothing with a watch; the default for `begun`."""
 
 
 def watch(
@@ -381,7 +384,10 @@ def _folder_of_watch(loaded: LoadedScenario | None, folder: Path | str | None) -
 def _scenario_for_reading(
     loaded: LoadedScenario | None, folder: Path, *, allow_unknown: bool
 ) -> Scenario:
-    """Return the scenario by which observations are read, with its paths located."""
+    """Return the scenario by which observations are read, with absolute paths.
+
+    It is the loaded scenario, or, for a resumed watch without one, that of the folder.
+    """
     if loaded is None:
         scenario = run_folder.read_scenario(folder).with_paths_from(folder)
     else:
@@ -392,7 +398,7 @@ def _scenario_for_reading(
 
 
 def _check_teaching(scenario: Scenario, cause_search: CauseSearch | None) -> None:
-    """Refuse to teach if no search for causes is given, or none could find a cause."""
+    """Refuse `teach` if no search is given, or if none can find causes in this scenario."""
     check_teachable(scenario)
     if cause_search is None:
         raise MissionInputError("`teach` needs a `cause_search`, as `uav_twin.watch` has it.")
@@ -416,7 +422,7 @@ def _open_watch(
     resume: bool,
     replace: bool,
 ) -> AbstractContextManager[Watch]:
-    """Return the watch that is begun or resumed, as a context that holds its folder."""
+    """Return a context manager that gives the new or resumed watch while its folder is locked."""
     if resume and (replace or overrides != Overrides()):
         raise MissionInputError(
             "a watch is taken up with what its folder holds: give nothing beside --resume that "
@@ -440,8 +446,11 @@ def _run(
     step_limit: int | None,
     patch: GivenPatch | None,
 ) -> Counts:
-    """Run a watch until its feed ends; it is taught if there is a search for causes."""
-    # A kill may have kept the last decision from being sent
+    """Run a watch until its feed ends, and return the counts of its messages.
+
+    If a search for causes is given, a tutor searches, tries and adopts between the steps.
+    """
+    # If the earlier process was killed, its last decision may not have been sent
     unconfirmed = None if is_stored(watched.folder) else watched.last_decision()
     with closing(feed):
         if cause_search is None:
@@ -460,7 +469,7 @@ def _run(
 
 
 def _advice_after_error(watched: Watch) -> str:
-    """Return how to go on after an error ended a watch."""
+    """Return a sentence that says how to go on after an error has ended a watch."""
     has_steps = watched.teaching.step >= 0
     if has_steps:
         return (

@@ -115,6 +115,8 @@ def outcome_of_patch(
 ) -> PatchOutcome:
     """Return what a patch would change in the steps of a watch.
 
+    The steps from `from_step` on are filtered twice, without and with the patch.
+
     Parameters
     ----------
     journal : Path
@@ -143,14 +145,15 @@ def outcome_of_patch(
         file = Path(folder) / "patch.json"
         file.write_bytes(patch)
         model = patched_model(scenario, file, from_step, progress)
+    # Filter the steps without and with the patch
     lag = scenario.watch.lag
-    before, _ = replay(journal, models, lag, first_step=from_step, end=end, question=None)
-    after, _ = replay(journal, models, lag, first_step=from_step, end=end, question=model)
-    evidence_before = _log_evidence(before, compared)
-    evidence_after = _log_evidence(after, compared)
+    history_before, _ = replay(journal, models, lag, first_step=from_step, end=end, question=None)
+    history_after, _ = replay(journal, models, lag, first_step=from_step, end=end, question=model)
+    evidence_before = _log_evidence(history_before, compared)
+    evidence_after = _log_evidence(history_after, compared)
     record = {
-        "before": residual_summary(before, from_step, models),
-        "after": residual_summary(after, from_step, [*models, model]),
+        "before": residual_summary(history_before, from_step, models),
+        "after": residual_summary(history_after, from_step, [*models, model]),
         "policy_change": describe_policy_change(models[-1].knowledge, model.knowledge),
     }
     return PatchOutcome(patch, model, float(evidence_after - evidence_before), record)
@@ -175,14 +178,14 @@ def merge_patches(believed: Path | None, new: Path) -> bytes:
     """
     if believed is None:
         return new.read_bytes()
-    first = json.loads(believed.read_text(encoding="utf-8"))
-    second = json.loads(new.read_text(encoding="utf-8"))
-    record = {
-        "schema": second["schema"],
-        "effects": first["effects"] + second["effects"],
-        "channels": first.get("channels", {}) | second.get("channels", {}),
+    believed_record = json.loads(believed.read_text(encoding="utf-8"))
+    new_record = json.loads(new.read_text(encoding="utf-8"))
+    merged_record = {
+        "schema": new_record["schema"],
+        "effects": believed_record["effects"] + new_record["effects"],
+        "channels": believed_record.get("channels", {}) | new_record.get("channels", {}),
     }
-    return (json.dumps(record, indent=1) + "\n").encode()
+    return (json.dumps(merged_record, indent=1) + "\n").encode()
 
 
 def describe_policy_change(before: Knowledge, after: Knowledge) -> str:

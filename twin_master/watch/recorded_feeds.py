@@ -68,17 +68,20 @@ class RecordedFeed(Feed):
         self.reader = MessageReader(scenario)
 
     def contains_position(self, position: Position) -> bool:
-        """Return whether a position is in the file, or in a rotated one if it is followed."""
+        """Return whether a position is in this file, or, if it is followed, in a rotated one."""
         with self.open_file(position) as file:
             return contains(file, position)
 
     def open_file(self, position: Position | None) -> BinaryIO:
-        """Return the file that contains a position, open; if none does, that at the path."""
+        """Open the file that contains a position, or else the file at the path; return it."""
         file = find_file(self.path, position, follow=self.follow) or self.path
         return file.open("rb", buffering=0)
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield the messages after a position; None if no further one has come yet."""
+        """Yield each message after a position, with the beginning of its text.
+
+        The message is None if no further one has come yet. `position` is moved on before each item.
+        """
         followed_path = self.path if self.follow else None
         lines = GrowingFile(self.open_file(position), position, followed_path)
         lines.longest = self.longest_line
@@ -128,7 +131,11 @@ class RunFeed(RecordedFeed):
         self._lines = "".join(f"{json.dumps(record)}\n" for record in records).encode()
 
     def _records_of(self, group: xr.Dataset) -> list[JsonObject]:
-        """Return a message for each step of the group `observed`."""
+        """Return a message for each step of the group `observed`, in the keys of JSON messages.
+
+        A message contains the sensors, the step, and, if the group has them, the readings of
+        inspections, the covariance of identified modes, and the control in force.
+        """
         role = self.scenario.observation.role
         rows = group[role].values.tolist()
         controls = []
@@ -165,7 +172,10 @@ class RunFeed(RecordedFeed):
             )
 
     def _symmetric_matrix(self, triangle: Float) -> Float:
-        """Return the matrix with a lower triangle; a missing covariance (NaN) is zero."""
+        """Return the symmetric covariance (G, G) whose lower triangle is given row by row.
+
+        A missing covariance (NaN) becomes zero.
+        """
         count = self.scenario.observation.count
         matrix = np.zeros((count, count))
         matrix[np.tril_indices(count)] = np.nan_to_num(triangle)
@@ -205,8 +215,19 @@ class FolderFeed(RecordedFeed):
             )
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
-        """Return the observation in a line; None if it has none, or was cut off by a kill."""
-        record = record_of_line(line, self.path)
+        """Return the observation in a line of the journal, or a refusal of the line.
+
+        None is returned if the line has no observation, or if it is the incomplete last line of a
+        process that was killed.
+
+        Parameters
+        ----------
+        line : bytes
+            The line, with its line feed if it is complete.
+        begin : int
+            Where the line begins in the journal [bytes].
+        """
+        record = record_of_line(line, self.path)  # None if the checksum or the JSON is wrong
         if record is None and line.endswith(b"\n"):
             number = self.path.read_bytes()[:begin].count(b"\n") + 1
             return Refused(f"line {number} of {self.path.name} was changed or is damaged")
@@ -218,14 +239,18 @@ class FolderFeed(RecordedFeed):
             return Refused("the line has another layout")
 
     def _message_of(self, line: JournalLine) -> Message | Refused | None:
-        """Return the observation in a line of the journal; None for a step without a message."""
+        """Return the observation in a line of the journal; None if no message came of its step.
+
+        A journal of an asset with other sensors or controls is refused.
+        """
         observed = array_from_json(line["observed"])
         control = int(line["control_index"])
         line_step = int(line["step"])
         step = int(line.get("observation_step", line_step))
         status = StepStatus.WITH_CONTROL  # a line of a simulated mission has no intake
         if "intake" in line:
-            # The last character belongs to the step of the line, those before it to earlier steps
+            # `given` has a character for the status of each step that may still be revised. The
+            # last one belongs to `line_step`, so that `step` has the negative index below.
             character = line["intake"]["given"][step - line_step - 1]
             status = StepStatus(int(character))
         if status is StepStatus.MISSING:
@@ -235,6 +260,6 @@ class FolderFeed(RecordedFeed):
         if len(observed) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         row = np.full(width, np.nan)
-        row[: len(observed)] = observed  # it may have been recorded without covariances
+        row[: len(observed)] = observed  # a journal without covariances has only the sensors
         has_assumed_control = status is not StepStatus.WITH_CONTROL
         return Message(row, control, step=step, assumed=has_assumed_control)

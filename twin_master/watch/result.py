@@ -65,8 +65,19 @@ def store_watch(
 
 
 def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
-    """Return the last of the steps of a watch, smoothed, as the result of a mission."""
+    """Return the last steps of a watch, smoothed, as the result of a mission.
+
+    Parameters
+    ----------
+    watch : Watch
+        The watch.
+    step_count : int
+        The number of its steps.
+    last : int
+        The number of last steps that are returned.
+    """
     first = max(0, step_count - last)
+    # The replay begins at a snapshot at or before the first step: earlier steps are removed
     history, _ = replay(watch.journal_path, watch.models, None, first_step=first)
     history = history.without_first(first - history.first_step)
     history = replace(history, notices=notices_since(watch, first))
@@ -77,7 +88,7 @@ def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
 def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
     """Return the notices of a watch from a step on, each sentence once, with its step.
 
-    A notice before the first step of the watch counts to that step.
+    A notice that came before step 0 has the step 0.
 
     Parameters
     ----------
@@ -114,8 +125,11 @@ def _step_of(line: JournalLine) -> int:
 
 
 def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[FigureGroup]:
-    """Return the figures for the summary: numbers of messages, and the gap of each patch."""
-    words = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
+    """Return figures for the summary: the counts of messages, and the residuals of each patch.
+
+    Those of a patch are the root mean square residuals without and with it.
+    """
+    template_fields = {"step": watch.scenario.mission.step_name, "file": REJECTED_NAME}
     message_counts = [
         step_count,
         counts.missing,
@@ -123,9 +137,9 @@ def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Figu
         counts.duplicates,
         counts.rejected,
     ]
-    figures = [FigureGroup("watch", words, message_counts)]
+    figures = [FigureGroup("watch", template_fields, message_counts)]
     for model in watch.teaching.adopted_models:
         residuals = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-        fields = words | {"first": model["from_step"]}
-        figures.append(FigureGroup("patch", fields, residuals))
+        patch_fields = template_fields | {"first": model["from_step"]}
+        figures.append(FigureGroup("patch", patch_fields, residuals))
     return figures

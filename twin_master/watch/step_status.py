@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class StepStatus(IntEnum):
-    """What was received of a step; the numbers stand in journals."""
+    """Whether a message of a step has come, and with its control; journals store the numbers."""
 
     MISSING = 0
     """No message has come."""

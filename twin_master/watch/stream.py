@@ -8,11 +8,11 @@ from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.watch.records import JsonObject
 
 REFUSALS_IN_A_ROW = 3
-"""Refused messages without an accepted one between them after which the operator is told."""
+"""Number of messages refused in a row after which the operator gets a notice."""
 TIME_UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 """Units of times, each a thousandth of the one before it, and their names."""
 _MOST_SLIPS = 24
-"""Largest number of ignored names in notices, so that a flood of them does not fill the journal."""
+"""Largest number of ignored names that a watch reports, so that they do not fill the journal."""
 
 
 def unit_advice(unit: str) -> str:
@@ -60,7 +60,7 @@ class StreamNotices:
         self._refusals_are_reported = False
 
     def state(self, *, waiting: bool) -> JsonObject:
-        """Return the state that keeps a resumed watch from giving a notice twice, for a journal.
+        """Return the state for the journal, so that a resumed watch gives no notice twice.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class StreamNotices:
         return {key: value for key, value in state.items() if value}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take over a state, see `state`."""
+        """Restore a state that `state` returned; what it leaves out gets its initial value."""
         self._gap_end = state.get("gap_end", -1)
         self._clock_is_reported = state.get("clock", False)
         self.is_blind = state.get("blind", False)
@@ -96,7 +96,7 @@ class StreamNotices:
         self._refusals_are_reported = refused.get("told", False)
 
     def note_gap(self, first_missing: int, next_step: int, unit: str) -> None:
-        """Add a notice about steps of which no message came.
+        """Add a notice about a gap: steps without a message, before a step that has one.
 
         Parameters
         ----------
@@ -127,16 +127,18 @@ class StreamNotices:
         self._pending.append(notice)
 
     def note_clock_jump(self, next_step: int, distance: float, unit: str) -> None:
-        """Add a notice that a time lies too far from the only one before it.
+        """Add a notice that the time of a message lies too far from the only time before it.
 
-        The message is taken as the next step.
+        The caller takes such a message as the next step. A further jump is not reported until two
+        times agree.
 
         Parameters
         ----------
         next_step : int
             The next step.
         distance : float
-            The number of steps by which the time lies after the other one.
+            The number of steps by which the time lies after the only one before it; negative if
+            it lies earlier.
         unit : str
             The unit that the times seem to have.
         """
@@ -178,12 +180,15 @@ class StreamNotices:
         return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_reported
 
     def report_refusals(self, next_step: int) -> Notice:
-        """Return the notice that all messages are refused, and note that it was given.
+        """Return the notice that all messages since the last step were refused.
+
+        The notice is remembered as given, so that `has_refusals_to_report` is false until a message
+        is accepted again.
 
         Parameters
         ----------
         next_step : int
-            The step that is expected next.
+            The step that is expected next. If it is 0, no message was accepted yet.
         """
         self._refusals_are_reported = True
         count = self.refused_in_a_row
@@ -197,9 +202,15 @@ class StreamNotices:
         return Notice("refused", sentence, value=float(count))
 
     def _likely_cause(self, next_step: int) -> str:
-        """Return a sentence with what the steps of the refused messages have in common.
+        """Return a sentence with the likely cause if the refused messages belong to past steps.
 
-        The sentence begins with a space; it is empty if they have nothing in common.
+        Two patterns are known: all messages name the same step (a counter that stands still), or
+        rising steps that were watched before (a counter that has begun again).
+
+        Returns
+        -------
+        str
+            The sentence, after a space; empty if the steps fit neither pattern.
         """
         steps = [step for step in self._refused_steps if step is not None]
         if len(steps) < REFUSALS_IN_A_ROW or max(steps) >= next_step:
@@ -222,6 +233,8 @@ class StreamNotices:
 
     def accept(self, step: int, *, is_blind: bool, ignored: Mapping[str, str]) -> list[Notice]:
         """Note that a message is accepted; return the notices that are given with its step.
+
+        The count of refused messages is reset to zero.
 
         Parameters
         ----------
@@ -257,7 +270,11 @@ class StreamNotices:
         return Notice("blind", sentence)
 
     def _report_slips(self, when: str, ignored: Mapping[str, str]) -> list[Notice]:
-        """Return a notice about ignored names that look like known ones, each reported once."""
+        """Return a notice about ignored names that look like misspelt sensors or keys.
+
+        Each name is reported once in a watch, and at most `_MOST_SLIPS` names altogether. The list
+        is empty if there is nothing to report.
+        """
         new_slips = []
         for name, meaning in ignored.items():
             if meaning and name not in self._reported_slips:

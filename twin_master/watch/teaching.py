@@ -15,14 +15,14 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.records import JournalLine, JsonObject, ModelRecord, VerdictRecord
 
 SETTLE_STEPS = 10
-"""Steps that an alarm must hold before its cause is looked for; they also show what it is."""
+"""Number of steps after an alarm before its cause is searched; the search uses them as data."""
 CLEARLY = math.log(10.0)
 """Log evidence [nats] by which several gauges must explain an alarm better than one gauge.
 
 The alarm itself asks for the same.
 """
 CHECKED_BYTES = 250_000
-"""Least number of bytes at the end of a journal that are read, so that damage there is found."""
+"""Number of bytes at the end of a journal that are checked for damage when it is read."""
 
 _KEYS = {
     "threshold": "threshold",
@@ -112,16 +112,17 @@ class Teaching:
         return {key: getattr(self, attribute) for attribute, key in _KEYS.items()}
 
     def _restore(self, record: Mapping[str, object]) -> None:
-        """Take the state from a record, see `as_record`."""
+        """Restore the state from a record that `as_record` returned."""
         for attribute, key in _KEYS.items():
             if key in record:
                 setattr(self, attribute, record[key])
 
     def read_journal(self, path: Path) -> None:
-        """Take the state from the end of a journal.
+        """Restore the state after the last line of a journal.
 
-        Each line holds the state before it, so that the last line is enough. The lines before it
-        are only checked.
+        Each line contains the state before it, under `standing`. So the state is restored from the
+        last line and then updated with this line. The lines in the `CHECKED_BYTES` bytes before it
+        are read only to check that each begins at the byte at which it was written.
 
         Raises
         ------
@@ -131,6 +132,7 @@ class Teaching:
         last_line: JsonObject = {}
         journal_size = 0
         for line, begin, end in records_backwards(path):
+            # The journal is read backwards: the first line that comes is the last one
             last_line = last_line or line
             journal_size = journal_size or end
             is_header = begin == 0
@@ -166,7 +168,10 @@ class Teaching:
         self._note_alarms(alarms)
 
     def _take_step(self, line: JournalLine) -> None:
-        """Update the state with a step."""
+        """Update the state with a step.
+
+        The notices that were pending were given with this step; only further alarms count as new.
+        """
         self.step = int(line["step"])
         pending_sentences = {notice["sentence"] for notice in self.pending_notices}
         new_notices = []
@@ -178,7 +183,10 @@ class Teaching:
         self._request_search_if_due(line.get("suspicion", {}))
 
     def _note_alarms(self, notices: Sequence[JsonObject]) -> None:
-        """Note the alarms among notices; each puts the search off until the alarm has settled."""
+        """Note the alarms among notices.
+
+        Each alarm puts the search for its cause off by `SETTLE_STEPS` steps.
+        """
         for notice in notices:
             if notice["kind"] == "alarm":
                 self._current_alarm = (self.step, int(notice.get("since") or 0))
@@ -186,7 +194,17 @@ class Teaching:
                 self.first_alarm = self.first_alarm or (self.step, notice)
 
     def _request_search_if_due(self, suspicion: Mapping[str, float]) -> None:
-        """Request a search if the alarm has settled and its evidence still holds."""
+        """Request a search for the cause of the alarm, if one is due.
+
+        It is due if the alarm came at least `SETTLE_STEPS` steps ago, its evidence still exceeds
+        the threshold, and neither another search nor the trial of a patch goes on.
+
+        Parameters
+        ----------
+        suspicion : mapping of str to float
+            The log evidence [nats] after the last step for two hypotheses: no state of the model
+            explains the readings; a single gauge is off.
+        """
         is_busy = self.steps_to_search is not None or self.verdict_on_trial is not None
         if self._current_alarm is None or is_busy or self.step < self._next_search_step:
             return
@@ -205,7 +223,7 @@ class Teaching:
             self.verdict_on_trial = verdict
             return
         self.verdict_on_trial = None
-        # The next search has twice as many steps after the alarm, which may tell more.
+        # No patch is tried: search again once there are twice as many steps since the alarm
         if self._current_alarm is not None:
             alarm_step, _ = self._current_alarm
             last_searched = int(verdict["to_step"])

@@ -47,7 +47,10 @@ class Tutor:
         self.outcome: Future[PatchOutcome] | None = None
 
     def teach(self) -> None:
-        """Do what is due after the last step of the watch, whose journal is open."""
+        """Search for a cause, or decide on a patch, if that is due after the last step.
+
+        The journal of the watch must be open.
+        """
         teaching = self._watch.teaching
         if teaching.steps_to_search is not None:
             first_step, last_step = teaching.steps_to_search
@@ -57,7 +60,10 @@ class Tutor:
             self._judge(verdict)
 
     def _search(self, first_step: int, last_step: int) -> None:
-        """Search some steps for the cause of an alarm; write the verdict down once it is there."""
+        """Start or continue the search for the cause of an alarm in some steps.
+
+        Once the search has ended, its verdict is written into the journal.
+        """
         watch = self._watch
         folder = watch.folder / TEACHING / f"steps_{first_step}_to_{last_step}"
         request = SearchRequest(
@@ -96,19 +102,19 @@ class Tutor:
         return True
 
     def _judge(self, verdict: VerdictRecord) -> None:
-        """Adopt the patch of a verdict after all steps of its trial, or write down why not.
+        """Adopt the patch of a verdict at the end of its trial, or write down why not.
 
-        The outcome is computed in a thread. If the watch does not wait for it, a later call finds
-        it done.
+        The outcome of the trial is computed in a thread, which the first call starts. If the watch
+        does not wait for it, nothing else is done until a later call finds it computed.
         """
         if self.outcome is None:
             self.outcome = self._begin_trial(verdict)
         if not self.outcome.done():
             return
-        finished = self.outcome
+        computed_outcome = self.outcome
         self.outcome = None
         try:
-            outcome = finished.result()
+            outcome = computed_outcome.result()
         except PATCH_ERRORS as error:
             self._reject(verdict, f"The patch cannot be believed by this twin: {error}")
             return
@@ -128,7 +134,7 @@ class Tutor:
         return outcome
 
     def _reject(self, verdict: VerdictRecord, sentence: str) -> None:
-        """Write down that the patch of a verdict is not adopted, and why."""
+        """Write into the journal that the patch of a verdict is not adopted, and why."""
         rejected: VerdictRecord = {
             **verdict,
             "tried": False,
@@ -137,7 +143,7 @@ class Tutor:
         self._watch.write_event(verdict=rejected)
 
     def close(self) -> None:
-        """End the search, if there is one; a watch that is taken up again begins it anew."""
+        """Stop the search, if one is running; a resumed watch starts it again."""
         if self._running_search is not None:
             self._running_search.stop()
         self._running_search = None

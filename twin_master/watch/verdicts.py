@@ -40,10 +40,14 @@ def read_verdict(
 ) -> VerdictRecord:
     """Return the record of a verdict for the journal, with the notice to the operator.
 
+    The record says that the patch is tried if the verdict names a cause, has a patch, and gives no
+    reason against its trial (`caveats_of`).
+
     Parameters
     ----------
     folder : Path
-        The folder of the verdict, in that of the watch. If it has no verdict the record says so.
+        The folder of the verdict, in that of the watch. If there is no verdict in it, the kind of
+        the verdict is "none", and the notice says why.
     log : Path
         The messages of the search, whose last line is the reason if there is no verdict.
     first_step, last_step : int
@@ -88,8 +92,8 @@ def read_verdict(
 def _last_line(log: Path) -> str:
     """Return the last line of a file that is not blank; empty if there is none."""
     lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-    written_lines = [line.strip() for line in lines if line.strip()]
-    return written_lines[-1] if written_lines else ""
+    nonblank_lines = [line.strip() for line in lines if line.strip()]
+    return nonblank_lines[-1] if nonblank_lines else ""
 
 
 def caveats_of(verdict: VerdictJson) -> list[str]:
@@ -103,8 +107,9 @@ def caveats_of(verdict: VerdictJson) -> list[str]:
     Returns
     -------
     list of str
-        The reasons of the gates that failed; that the absolute fit was not tested; and that the
-        members of a group differ at other loads. Empty if nothing stands against the trial.
+        The reasons of the gates that failed; a sentence if the absolute fit was not tested; and a
+        sentence if only some members of a group are sensors that saturate. Empty if the patch may
+        be tried.
     """
     gates = verdict["gates"]
     caveats = [str(gate["reason"]) for gate in gates if gate["passed"] is False]
@@ -119,7 +124,7 @@ def caveats_of(verdict: VerdictJson) -> list[str]:
 
 
 def _has_tested_absolute_fit(gates: Sequence[VerdictJson]) -> bool:
-    """Return whether the gate of the absolute fit was tested; its `passed` is null if not."""
+    """Return whether the gate of the absolute fit was tested; if not, its `passed` is null."""
     return any(gate["name"] == ABSOLUTE_FIT and gate["passed"] is not None for gate in gates)
 
 
@@ -151,16 +156,20 @@ def command_to_believe(folder: str, first_step: int) -> str:
 def is_adopted(verdict: VerdictRecord, outcome: PatchOutcome) -> bool:
     """Return whether a patch is adopted after its trial.
 
-    No patch is adopted after an alarm of many gauges. The search then names the effect of its
-    catalogue that comes closest, and any effect that moves all gauges gains evidence over a model
-    that explains none of them.
+    It is if it gained at least `LEAST_GAIN` of log evidence, unless many gauges raised the alarm.
+    In that case the search names the effect of its catalogue that comes closest, and any effect
+    that moves all gauges gains evidence over a model that explains none of them.
     """
     has_gained = outcome.gained_evidence >= LEAST_GAIN
     return has_gained and not verdict.get("of_many", False)
 
 
 def trial_sentence(verdict: VerdictRecord, outcome: PatchOutcome, step_name: str) -> str:
-    """Return the sentence for the operator at the end of the trial of a patch."""
+    """Return the message to the operator at the end of the trial of a patch.
+
+    It says how much evidence the patch gained, and whether it is adopted. If the alarm of many
+    gauges keeps it from being adopted, the message has the command to adopt it by hand.
+    """
     first_step = verdict["from_step"]
     comparison = (
         f"Beside the model for {TRIAL_STEPS} {step_name}s the patch gained "
