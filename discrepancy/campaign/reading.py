@@ -197,7 +197,7 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
 def _check_trial_of_event(
     event: Event, name: str, trials: Mapping[str, Trial], source: str
 ) -> None:
-    """Refuse an event in a trial that is not there, or is not a record in time."""
+    """Refuse an event in a trial that does not exist, or that is not a record in time."""
     if name not in trials:
         raise CampaignFileError(
             f"{source}: the event {event.name!r} names the trial {name!r}, which is not among the "

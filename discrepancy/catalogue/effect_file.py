@@ -144,7 +144,7 @@ def _check_names(section: EffectSection, names: frozenset[str], place: str) -> N
 
 
 def _check_places_and_needs(section: EffectSection, place: str) -> None:
-    """Refuse words for places and needs that are not known, and an effect without primitives."""
+    """Refuse an effect with an unknown word for its places or needs, or without primitives."""
     for need in section.needs:
         if need not in NEEDS:
             raise CatalogueError(

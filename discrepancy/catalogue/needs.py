@@ -39,7 +39,7 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 
 
 def _no_event(effect: EffectInSetting) -> str | None:
-    """Return why no fitted trial has the events that it needs, or None."""
+    """Return the reason if no fitted trial has the events that an effect needs, else None."""
     campaign = effect.setting.campaign
     names_of_trials = [campaign.moment_names(trial.name) for trial in campaign.fitted]
     if not effect.moments or any(effect.moments <= names for names in names_of_trials):
@@ -52,7 +52,7 @@ def _no_event(effect: EffectInSetting) -> str | None:
 
 
 def _no_law(effect: EffectInSetting) -> str | None:
-    """Return why the model cannot carry its primitives, or None."""
+    """Return the reason if the model cannot carry the primitives of an effect, else None."""
     model = effect.setting.model
     for primitive in effect.primitives:
         if primitive in SENSORS or model.supports(primitive):
@@ -80,7 +80,7 @@ def _no_place(effect: EffectInSetting) -> str | None:
 
 
 def _no_port(effect: EffectInSetting) -> str | None:
-    """Return why the model has no port at which a force could act, or None."""
+    """Return the reason if the model has no port at which a force can act, else None."""
     model = effect.setting.model
     if not model.ports:
         return _sentence_on_model(model, NO_PORT)

@@ -130,7 +130,10 @@ def _largest_reading(context: BuildContext) -> float:
 
 
 def _compute_largest_reading(context: BuildContext) -> float:
-    """Return the largest absolute reading that is used at the place [its unit]; 0 without any."""
+    """Return the largest absolute used reading of the target channel or channels [their unit].
+
+    It is 0 if there is no used reading.
+    """
     target = context.target
     names: tuple[str, ...] = (target.name,)
     if target.name == EVERY_CHANNEL:

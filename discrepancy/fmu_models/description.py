@@ -221,7 +221,7 @@ class FmuModelDescription(ModelDescription):
     isolated: bool = True
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the contradictions of the file."""
+        """Yield the rules on the whole file: on names, effects and the reference temperature."""
         for kind in ("port", "parameter", "output", "input"):
             yield from self.repeated_name_faults(
                 kind, [section.name for section in getattr(self, kind)]

@@ -137,7 +137,7 @@ class FmuAtRest(IdentifiedFmu):
             # without ports nothing is wanted, and the FMU may not accept loads of zero
             return np.zeros((0, 0))
         probing_forces = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
-        # the first row is without a force
+        # the first row is without a force; each further row has a force at one port
         loads = dict.fromkeys(self.port_inputs, np.zeros(len(probing_forces) + 1))
         for name, force in zip(self.port_inputs, probing_forces, strict=True):
             loads[name] = loads[name] + np.append(0.0, force)

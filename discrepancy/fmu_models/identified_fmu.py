@@ -118,7 +118,10 @@ class IdentifiedFmu(FmuRuns):
         self._paces = ResultCache()
 
     def _check_parameters(self) -> None:
-        """Refuse what the FMU cannot be set to: beyond its range a posterior would be cut."""
+        """Refuse a file whose parameter bounds, effect switches or settings the FMU does not allow.
+
+        Bounds beyond the range of an FMU parameter would cut off its posterior.
+        """
         description = self.description
         settings: list[Mapping[str, float]] = []
         for parameter in description.parameter:
@@ -344,7 +347,11 @@ class IdentifiedFmu(FmuRuns):
     def _run_of_excitation(
         self, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FmuRun:
-        """Return the run of the FMU under an excitation, with the given release amounts."""
+        """Return the run of the FMU under an excitation.
+
+        Release variables that are inputs of the FMU are set before the start; the others are
+        parameters of the operating point.
+        """
         begin = {name: amount for name, amount in release_values.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in release_values.items() if name not in begin}
         run = FmuRun(

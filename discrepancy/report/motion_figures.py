@@ -45,15 +45,18 @@ class Worst(NamedTuple):
 
 
 def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
-    """Return the dynamic record whose residuals exceed the noise most; None without one."""
+    """Return the dynamic record with the largest rms residual over the noise.
+
+    None if no dynamic trial has a used sample.
+    """
     candidates: list[tuple[float, int, str]] = []
     for index, fitted in enumerate(trials):
         if not fitted.trial.is_dynamic:
             continue
         for name in fitted.trial.channels:
-            size_of_record = rms_over_noise([fitted], name)
-            if np.isfinite(size_of_record):
-                candidates.append((size_of_record, index, name))
+            rms_residual = rms_over_noise([fitted], name)
+            if np.isfinite(rms_residual):
+                candidates.append((rms_residual, index, name))
     if not candidates:
         return None
     _, index, name = max(candidates)

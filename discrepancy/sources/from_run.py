@@ -315,14 +315,14 @@ def _is_calibrated_wing(folder: Path) -> bool:
 
 
 def held_out_steps(count: int, block: int, share: float) -> BoolArray:
-    """Choose the steps to hold out: whole blocks, evenly spread, but never the first block.
+    """Choose the steps of a run to hold out: whole blocks, evenly spread, never the first block.
 
     Parameters
     ----------
     count : int
         Number of steps.
     block : int
-        Steps of a block.
+        Number of steps in a block.
     share : float
         Fraction of the steps that is held out.
 
@@ -333,8 +333,9 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     """
     block_count = count // block
     held_out_count = min(round(share * count / block), block_count - 1)
-    blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
-    return np.isin(np.arange(count) // block, blocks)
+    # n + 1 block numbers from 1 to the last; without the last of them, n are evenly spread
+    held_out_blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
+    return np.isin(np.arange(count) // block, held_out_blocks)
 
 
 # ---------------------------------------------------------------- files of the run folder
@@ -352,7 +353,13 @@ def _read_config(folder: Path) -> dict[str, Any]:
 
 
 def _read_run(folder: Path) -> xr.DataTree:
-    """Return the groups of `run.nc`; refuse a file that lacks something of the run of a wing."""
+    """Return the groups of the file `run.nc`, which a run of the twin of a wing has written.
+
+    Raises
+    ------
+    CampaignFileError
+        If the file is damaged, or lacks a group, the strains or the load factors of such a run.
+    """
     path = folder / RUN_FILE
     try:
         run = read_groups(path)
@@ -360,9 +367,9 @@ def _read_run(folder: Path) -> xr.DataTree:
         raise CampaignFileError(
             f"{cause}: it is not a whole run, resume the run or fly it again."
         ) from cause
-    missing = {"observed", "smoothed", "calibration"} - {*run.children}
-    if missing:
-        groups = ", ".join(sorted(missing))
+    missing_groups = {"observed", "smoothed", "calibration"} - {*run.children}
+    if missing_groups:
+        groups = ", ".join(sorted(missing_groups))
         raise CampaignFileError(f"{path} lacks the groups {groups}: it is no run of a twin.")
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:

@@ -282,7 +282,11 @@ class LumpedModel(DescribedModel, SystemModel):
     def _vector_equation(
         self, section: OutputSection, vector: Sequence[float], quantity: Quantity
     ) -> OutputEquation:
-        """Return the equation of an output vector . unknowns, differentiated as is wanted."""
+        """Return the equation of an output: vector . unknowns, or the time derivative of it.
+
+        It is differentiated as often as the quantity requires, such as once if the output is a
+        displacement and a channel measures its speed. The derivative has no constant.
+        """
         derivatives = 0
         if quantity is not section.quantity:
             derivatives = quantity.derivatives_of(section.quantity)

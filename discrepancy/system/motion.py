@@ -84,6 +84,7 @@ class Motion:
         acceleration = forces - restoring - self.velocity @ modal.damping.T
         if len(self.laws):
             acceleration -= self.port_forces @ self.laws.port_rows(modal.actions, self.q.shape[1])
+        # samples before the release, while the structure is held
         acceleration[: self.held_samples] = 0.0
         return acceleration
 

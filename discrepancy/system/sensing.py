@@ -250,7 +250,10 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
 
 
 def _sensors_by_channel(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
-    """Return sensor primitives by channels: one that names an output, for each of its channels."""
+    """Return sensor primitives that name channels, not model outputs.
+
+    A primitive that names a model output is replaced by one for each channel that measures it.
+    """
     primitives: list[Primitive] = []
     for primitive in sensors:
         name = getattr(primitive, "channel", EVERY_CHANNEL)

@@ -422,16 +422,17 @@ class SystemModel(Model):
     def _add_trials(
         self, estimator: PortScaleEstimator, campaign: Campaign, *, is_held: bool
     ) -> LargestMotion:
-        """Add the motions of all trials to an estimator, and return the largest of them.
+        """Add the motions of all trials to an estimator, and return their largest magnitudes.
 
         Parameters
         ----------
         estimator : PortScaleEstimator
-            What collects the motions of the ports.
+            Collects the motions of the ports; changed in place.
         campaign : Campaign
             The campaign.
         is_held : bool
-            Whether springs hold the structure, so that it has displacements at rest.
+            Whether springs hold the structure. Only then static trials and ring-downs are added, by
+            their displacements at rest.
         """
         parameters = self.prior_mean(campaign)
         largest = LargestMotion(0.0, 0.0, 0.0)
@@ -441,6 +442,7 @@ class SystemModel(Model):
                 motion = self._motion_under_inputs(campaign, trial)
                 measured_force = largest_measured_force(campaign, trial)
                 loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                # from modal coordinates (N, M + P) to the displacements of the structure
                 shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
                 largest = LargestMotion(
                     displacement=larger_magnitude(largest.displacement, motion.q @ shapes),
@@ -459,7 +461,8 @@ class SystemModel(Model):
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
         load_row = self.force_row(self.reference or places[0], state)
         participation = float(load_row @ system.shapes[:, 0]) ** 2
-        # mass of the first mode, referred to the load point
+        # Mass of the first mode, referred to the load point: its shape is scaled to a modal mass of
+        # 1, so a unit displacement of the load point needs the modal coordinate 1 / (row . shape).
         modal_mass = 1.0 / participation if participation else float(np.trace(system.mass))
         return GlobalScales(
             stiffness=1.0 / float(load_row @ system.equilibrium_under(load_row[None])[0]),
@@ -489,12 +492,16 @@ class SystemModel(Model):
         return motion
 
     def _static_displacements(self, case: PatchedTrial) -> FloatArray:
-        """Return the displacements (L, N) at rest, or from which a ring-down is released."""
+        """Return the displacements of all unknowns in each row of a static trial.
+
+        For a ring-down there is one row: the displacements from which the structure is released.
+        """
         system = self.system_in_state(case.state)
         excitation = self.excitation(case)
         if excitation.release is None:
             directions, levels = excitation.load_levels
             return np.asarray(levels @ system.equilibrium_under(directions))
+        # shape under a force at the release point, scaled to the displacement of that point
         row = excitation.release.row
         shape = system.equilibrium_under(row[None])
         displacement = excitation.release.release.displacement
