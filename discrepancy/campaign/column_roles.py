@@ -120,7 +120,7 @@ class ColumnReader:
         )
 
     def _output_quantity(self, role: str) -> Quantity | None:
-        """Return the quantity of a model's output; None for what is not one, or without a model."""
+        """Return the quantity of a model output; None if it does not exist or there is no model."""
         return None if self._quantity_of is None else self._quantity_of(role)
 
     def _determine_role(self, sheet: Sheet, head: str, unit: str) -> str:

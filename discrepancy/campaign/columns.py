@@ -68,16 +68,16 @@ class LaboratoryColumn:
 
     @property
     def is_channel(self) -> bool:
-        """Whether it is a measured channel: not an input, a time, a force or a temperature."""
+        """Whether the column is a measured channel: no input, time, force or temperature."""
         return self.quantity is not None and INPUT not in self.role
 
     @property
     def title(self) -> str:
-        """Its name in the campaign."""
+        """Name of the column in the campaign."""
         return self.head if self.is_channel else self.role.removeprefix(INPUT)
 
     def cells_in_si(self, decimal: str) -> tuple[str, ...]:
-        """Return its cells in SI; all are empty while its unit or its decimal mark is not known.
+        """Return the cells in SI; all are empty if the unit or the decimal mark is not known yet.
 
         Parameters
         ----------

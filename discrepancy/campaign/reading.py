@@ -158,7 +158,7 @@ def _remarks_on_unused_columns(
 
 
 def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
-    """Complete events by the names of all trials in which they happened, and check them.
+    """Return the events with the names of all their trials, after checking them.
 
     Parameters
     ----------
@@ -179,19 +179,19 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     """
     trials_by_name = {trial.name: trial for trial in trials}
     recorded_in_time = tuple(trial.name for trial in trials if trial.is_dynamic)
-    placed = []
+    completed = []
     for event in events:
         names = (event.trial,) if event.trial else event.trials or recorded_in_time
-        placed.append(replace(event, trial=None, trials=names))
-    for event in placed:
+        completed.append(replace(event, trial=None, trials=names))
+    for event in completed:
         for name in event.trials:
             _check_trial_of_event(event, name, trials_by_name, source)
             _check_moments(event, trials_by_name[name])
     for name in recorded_in_time:
-        events_of_trial = [event for event in placed if name in event.trials]
+        events_of_trial = [event for event in completed if name in event.trials]
         _check_names_of_moments(events_of_trial, name, source)
         _check_occurrences(events_of_trial, name, source)
-    return placed
+    return completed
 
 
 def _check_trial_of_event(

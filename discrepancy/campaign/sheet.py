@@ -197,12 +197,12 @@ def _sheet_of_rows(
 
 
 def _cell(row: Sequence[str], index: int) -> str:
-    """Return a cell of a row; an empty one beyond its end."""
+    """Return a cell of a row; an empty text if the row has fewer cells."""
     return row[index] if index < len(row) else ""
 
 
 def _remark_on_texts(title: str, number_count: int, text_count: int) -> str:
-    """Return the remark on a column that is left out for its texts, beside a count of numbers."""
+    """Return the remark that a column is left out because it holds texts, or no numbers."""
     content = "no numbers"
     if number_count:
         content = f"{counted(number_count, 'number')} and {counted(text_count, 'text')}"

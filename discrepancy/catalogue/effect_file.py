@@ -400,11 +400,11 @@ class _EffectFunctions:
         return EffectInSetting(setting, self.section, kinds, frozenset(moments))
 
     def places(self, setting: Setting) -> tuple[str, ...]:
-        """Return the places where it may act."""
+        """Return the places where the effect may act in a setting."""
         return places_of(self._in_setting(setting))
 
     def unavailable(self, setting: Setting) -> str | None:
-        """Return why it cannot be tested, or None."""
+        """Return the reason if the effect cannot be tested in a setting, else None."""
         return untestable_reason(self._in_setting(setting))
 
     def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:

@@ -111,7 +111,7 @@ class FmuSimulator(FmuAtRest):
         end: float,
         refinement: int,
     ) -> SampledOutputs:
-        """Return outputs and rates by the FMU's linear system, followed until a time `end` [s].
+        """Return outputs and their rates, computed with the FMU's linear system until `end` [s].
 
         Parameters
         ----------
@@ -243,7 +243,10 @@ class FmuSimulator(FmuAtRest):
         columns: Sequence[int],
         refinement: int,
     ) -> "SteppedOutputs":
-        """Return outputs of the FMU stepped until a time `end` [s], with the laws beside it.
+        """Return the outputs of the FMU, stepped until `end` [s] and coupled with the laws.
+
+        The steps are halved until the outputs that are read have converged, unless the FMU has a
+        fixed step or there are no laws.
 
         Parameters
         ----------
@@ -262,13 +265,16 @@ class FmuSimulator(FmuAtRest):
         """
         fixed_step = self.description.motion.step
         release_values = self._find_release_values(excitation)
-        # inputs are held over steps
+        # the FMU holds inputs constant over a step, so that a recorded force needs half the step
         longest_step = excitation.step if excitation.force is None else 0.5 * excitation.step
 
         def outputs_by(parts: int) -> FloatArray:
+            """Return the outputs (K, C) with the longest step divided into `parts` steps."""
             step = fixed_step or longest_step / parts
-            finer = excitation._replace(step=step, recorded_steps=ceil(end / step - 1e-6))
-            run = self._run_of_excitation(finer, release_values)
+            refined_excitation = excitation._replace(
+                step=step, recorded_steps=ceil(end / step - 1e-6)
+            )
+            run = self._run_of_excitation(refined_excitation, release_values)
             if len(laws):
                 # an unstable coupling grows beyond all numbers
                 with np.errstate(all="ignore"):

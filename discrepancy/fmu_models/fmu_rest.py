@@ -132,7 +132,7 @@ class FmuAtRest(IdentifiedFmu):
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
     def port_flexibility(self, state: OperatingPoint) -> FloatArray:
-        """Return the flexibility (P, P): displacements of ports (rows) per force (columns)."""
+        """Return the flexibility (P, P): displacement of each port (row) per force (column)."""
         if not self.ports:
             # without ports nothing is wanted, and the FMU may not accept loads of zero
             return np.zeros((0, 0))

@@ -474,11 +474,11 @@ class IdentifiedFmu(FmuRuns):
         return 2.0 * np.pi * float(max(frequencies[1], loudest))
 
     def nominal_step_choice(self, trial: Trial) -> StepChoice:
-        """Return the pace in the nominal state: steps do not change while parameters are fitted."""
-        pace: StepChoice = self._paces.get(
+        """Return the step of a trial in the nominal state, kept while parameters are fitted."""
+        step_choice: StepChoice = self._paces.get(
             trial.interval, lambda: self.choose_step(trial, self.nominal_point)
         )
-        return pace
+        return step_choice
 
 
 def recorded_step_count(trial: Trial) -> int:

@@ -408,7 +408,7 @@ class FmuModel(DescribedModel):
     def _excitation_of_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: PortLaws
     ) -> FmuExcitation:
-        """Return what moves the FMU in a dynamic trial."""
+        """Return the excitation of the FMU in a dynamic trial: a release or a recorded force."""
         state = self._operating_point(trial, conditions, patch)
         if trial.kind is TrialKind.RINGDOWN:
             excitation = self.fmu.excitation_of(trial, state, laws.ports)

@@ -158,7 +158,7 @@ def _sentence_on_group(
 def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     """Return the sentence on effects that these data show only if they are large.
 
-    Empty without any.
+    It is empty if there are no such effects.
     """
     hidden = [
         detectability

@@ -249,7 +249,7 @@ def _draw_over_motion(
     """
 
     def joined(name: str) -> FloatArray:
-        """Return an array of all trials that have it."""
+        """Return an array of the trials that have it, joined in their order."""
         arrays = [getattr(course, name) for course in missing.courses]
         return np.concatenate([array[samples] for array in arrays if array is not None])
 
@@ -371,7 +371,7 @@ def _add_figure(
 def _add_residual_figures(
     figures: dict[str, ReportFigure], content: ReportInput, before: ResidualSet
 ) -> None:
-    """Add the figures of residuals, before and after."""
+    """Add the figures of the residuals of the model without and with the added effect."""
     investigation = content.investigation
     after = investigation.after if added_label(investigation) else None
     held_out = [fitted.trial.name for fitted in before.trials if fitted.trial.held_out]

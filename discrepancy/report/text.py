@@ -49,7 +49,7 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
 
 
 def p_value_text(p_value: float) -> str:
-    """Return a p-value."""
+    """Return a p-value as text."""
     if isnan(p_value):
         return "not known"
     return "< 1e-6" if p_value < 1e-6 else f"{p_value:.2g}"

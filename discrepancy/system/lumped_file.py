@@ -221,7 +221,7 @@ class LumpedDescription(ModelDescription):
     # ------------------------------------------------------------ faults of a file
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the contradictions of the file."""
+        """Yield the rules on several tables of the file together, each with its message."""
         yield from self._missing_matrix_faults()
         yield from self._name_faults()
         yield from self._vanishing_matrix_faults()
@@ -243,7 +243,7 @@ class LumpedDescription(ModelDescription):
             )
 
     def _missing_matrix_faults(self) -> Iterator[Fault]:
-        """Yield the faults of required matrices that are missing."""
+        """Yield the rules on which matrices must be given."""
         displacement_count = self.displacement_count
         state_count = self.state_count
         yield (
@@ -260,7 +260,7 @@ class LumpedDescription(ModelDescription):
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
     def _matrix_faults(self, kind: str) -> Iterator[Fault]:
-        """Yield the matrices of a kind with a wrong size, symmetry or definiteness."""
+        """Yield the rules on the size, symmetry and definiteness of the matrices of a kind."""
         block = BLOCKS[kind]
         rows = self.state_count if block.rows_of_states else self.displacement_count
         columns = self.state_count if block.columns_of_states else self.displacement_count
@@ -423,6 +423,6 @@ class LumpedDescription(ModelDescription):
                 )
 
     def _has_unknowns_of(self, kind: str) -> bool:
-        """Return whether there are unknowns that the rows of a kind of matrix are of."""
+        """Return whether the file has the unknowns (displacements or states) of a kind's rows."""
         count = self.state_count if BLOCKS[kind].rows_of_states else self.displacement_count
         return count > 0

@@ -109,7 +109,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     @property
     def oscillates(self) -> bool:
-        """Whether it has a mode that vibrates."""
+        """Whether the model has a mode that vibrates."""
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
         return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
@@ -212,7 +212,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return offset_inputs
 
     def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
-        """Return the input of the model that a trial records.
+        """Return the section [[input]] of the model for an input that a trial records.
 
         Raises
         ------

@@ -186,7 +186,7 @@ class SystemModel(Model):
         return PatchedTrial(trial, conditions, patch, state)
 
     def excitation(self, case: PatchedTrial) -> Excitation:
-        """Return what acts in a trial."""
+        """Return the excitation of a trial: its loads and prescribed motions, or its release."""
         trial = case.trial
         initial = case.conditions.initial
         excitation = Excitation(
@@ -211,7 +211,7 @@ class SystemModel(Model):
         )
 
     def excited_system(self, case: PatchedTrial) -> ExcitedSystem:
-        """Return the system that moves in a dynamic trial, and what acts on it."""
+        """Return the linear system in a dynamic trial, and its excitation."""
         excitation = self.excitation(case)
         drives = tuple(excitation.prescribed_motions)
         return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
@@ -248,7 +248,7 @@ class SystemModel(Model):
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
     def _outputs_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
-        """Return what outputs show (N, C) in a static trial, row by row along its load path.
+        """Return the outputs (N, C) in the N rows of a static trial, in the order of its loading.
 
         The order matters: dry friction remembers how the present load was reached.
         """
@@ -514,7 +514,7 @@ def _depends_on_temperature(patch: ModelPatch) -> bool:
 
 
 def _is_moved_by_inputs(trial: Trial) -> bool:
-    """Return whether a trial is a motion under recorded inputs, and no release or rest."""
+    """Return whether a trial is a motion under recorded inputs, not a release or at rest."""
     return trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN
 
 
