@@ -65,6 +65,11 @@ def merge_clocks(
 ) -> MergedTable:
     """Merge the clocks of a table into one, and return its columns in SI.
 
+    A clock is a column of times with the columns that were sampled at these times. The merged
+    table has a row for each time of any clock. A channel has empty cells at the times of the other
+    clocks; a load or a temperature is interpolated there, and rows outside of its record are left
+    out. Samples at rest of different clocks are put in the same rows instead.
+
     Parameters
     ----------
     clocks : sequence of TableClock
@@ -87,7 +92,7 @@ def merge_clocks(
     times = [_clock_times(clock, decimal) for clock in clocks]
     seconds, positions = _merged_times(times)
     count = len(seconds)
-    clocks_are_equal = all(len(position) == count for position in positions)
+    clocks_are_equal = all(len(clock_positions) == count for clock_positions in positions)
     if kind == NOISE and not clocks_are_equal:
         return _rest_samples_in_order(clocks, times, decimal)
     if kind in (TrialKind.STATIC, TrialKind.FLIGHT) and not clocks_are_equal:
@@ -99,39 +104,40 @@ def merge_clocks(
     cells: dict[str, list[str]] = {TIME: _time_cells(seconds)}
     loads_are_known = np.ones(count, dtype=bool)
     filled_loads = []
-    for clock, own_times, position in zip(clocks, times, positions, strict=True):
-        has_all_times = len(position) == count
+    # cells of each column at the merged times
+    for clock, clock_times, clock_positions in zip(clocks, times, positions, strict=True):
+        has_all_times = len(clock_positions) == count
         for column in clock.columns:
             column_cells = _place_cells(
-                column.cells_in_si(decimal), own_times.rows, position, count
+                column.cells_in_si(decimal), clock_times.rows, clock_positions, count
             )
             if _must_be_known_throughout(column, kind) and not has_all_times:
                 hold = _hold_of_load(column, holds)
-                _fill_between_samples(column_cells, seconds, position, hold)
+                _fill_between_samples(column_cells, seconds, clock_positions, hold)
                 filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
-                is_after_first_sample = seconds >= own_times.seconds[0]
-                is_before_last_sample = seconds <= own_times.seconds[-1]
+                is_after_first_sample = seconds >= clock_times.seconds[0]
+                is_before_last_sample = seconds <= clock_times.seconds[-1]
                 loads_are_known &= is_after_first_sample & is_before_last_sample
             cells[column.title] = column_cells
 
     # rows in which all loads are known
     rows = np.flatnonzero(loads_are_known).tolist()
     cells_of_rows = {title: tuple(column[row] for row in rows) for title, column in cells.items()}
-    unread = [title for title, column in cells_of_rows.items() if not any(column)]
-    if unread:
+    unread_titles = [title for title, column in cells_of_rows.items() if not any(column)]
+    if unread_titles:
         raise CampaignFileError(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
-            f"{unread[0]!r} are known, and a load must be known while a channel is read."
+            f"{unread_titles[0]!r} are known, and a load must be known while a channel is read."
         )
-    sentence = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
     if not clocks_are_equal:
-        sentence = (
+        remark = (
             f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
             "channel has no reading where its own clock has no stamp"
         )
-    sentence += _remark_on_loads(filled_loads, outside=count - len(rows))
+    remark += _remark_on_loads(filled_loads, outside=count - len(rows))
     lines = _line_numbers(clocks, times, positions, count)
-    return MergedTable(cells_of_rows, tuple(lines[row] for row in rows), sentence)
+    return MergedTable(cells_of_rows, tuple(lines[row] for row in rows), remark)
 
 
 def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:

@@ -158,6 +158,7 @@ def _sheet_of_rows(
         cells_of_columns, [f"{place} {line}" for line in lines]
     )
 
+    # columns of numbers or times; columns with texts are left out with a remark, empty ones without
     heads: list[str] = []
     units: list[str] = []
     columns: list[tuple[str, ...]] = []

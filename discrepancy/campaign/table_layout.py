@@ -145,6 +145,8 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
             f"{name} holds no table: a row with the names of the columns is needed, and rows of "
             "numbers under it, with commas, semicolons or tabs between cells."
         )
+    # from the first to the last row with a number in the first core column, other rows of numbers
+    # belong to the table as well
     first, last = body[0], body[-1]
     body = [
         index for index in range(first, last + 1) if not has_text[index] and places_of_values[index]
@@ -221,18 +223,19 @@ def _check_other_rows(
     head: Sequence[str],
     place: str,
 ) -> None:
-    """Refuse a row with texts between the rows of numbers, and numbers that go on below the table.
+    """Refuse a row with texts within the table, and rows of numbers below it.
 
-    Comments and repeated heads are allowed. A footer has no number in the first core column.
+    Below the table, only a row with numbers in the first and in at least half of the core columns
+    is refused; other rows are a footer. Comments and repeated heads are allowed.
     """
     first, last = body[0], body[-1]
-    not_in_body = {*range(first, last)} - {*body}
+    other_rows = {*range(first, last)} - {*body}
     for index in range(last + 1, len(rows)):
         values = places_of_values[index]
-        is_torn_off = core[0] in values and 2 * len(values & {*core}) >= len(core)
-        if is_torn_off:
-            not_in_body.add(index)
-    for index in sorted(not_in_body):
+        is_row_of_numbers = core[0] in values and 2 * len(values & {*core}) >= len(core)
+        if is_row_of_numbers:
+            other_rows.add(index)
+    for index in sorted(other_rows):
         line, row = rows[index]
         is_head = row in (head, rows[first - 1][1])
         if is_head or row[0].startswith("#"):

@@ -225,15 +225,14 @@ class IdentifiedFmu(FmuRuns):
     def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (recorded_steps + 1, C) after a release by one unit.
 
-        They are relative to the outputs without a release.
-
-        The FMU is released by a usual amount, which is the same in all later calls, and the outputs
-        are divided by it.
+        The outputs without a release are subtracted. The FMU is released by the nominal amount of
+        the first call for this variable (the same in all later calls), and the outputs are divided
+        by it.
         """
-        usual_amplitude = excitation.releases[name] or 1.0
+        nominal_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
-            usual_amplitude = self.probing_amplitude(name)
-        amplitude = self._release_amplitudes.setdefault(name, usual_amplitude)
+            nominal_amplitude = self.probing_amplitude(name)
+        amplitude = self._release_amplitudes.setdefault(name, nominal_amplitude)
         run = self._run_of_excitation(excitation._replace(force=None), {name: amplitude})
         key = (*excitation.recording_arguments, name, True)
         return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
@@ -326,6 +325,7 @@ class IdentifiedFmu(FmuRuns):
             return release_values
 
         def missing_displacement(amount: float) -> float:
+            """Return the displacement by an amount minus the displacement of the release [m]."""
             at_begin = excitation._replace(force=None, recorded_steps=0)
             run = self._run_of_excitation(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")

@@ -330,6 +330,7 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
     time = plan.interval * samples
     releases = []
+    # each release from a smaller fraction of the plan's displacement; the third is held out
     for number, fraction in enumerate((1.0, 0.7, 0.5, 0.3), start=1):
         releases.append(
             Trial.plain(

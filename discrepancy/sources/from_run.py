@@ -412,9 +412,10 @@ def _strain_noise(scenario: dict[str, Any]) -> tuple[float, str]:
 
 
 def _calibrated_parameter(run: xr.DataTree) -> dict[str, tuple[float, float]]:
-    """Return mean and standard deviation of the calibrated parameter, by its name.
+    """Return the mean and standard deviation of the calibrated parameter, by its name.
 
-    They are those of the draws in the run. The result is empty if there is no such parameter.
+    They are computed from the draws of the calibration in the run. The result is empty if the run
+    has no calibrated parameter, or if all draws are equal.
     """
     name = str(run.attrs.get("parameter", ""))
     draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)
