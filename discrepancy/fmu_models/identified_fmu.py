@@ -405,6 +405,7 @@ class IdentifiedFmu(FmuRuns):
         excitation = FmuExcitation(
             state, interval, recorded_step_count(trial), inputs, releases=releases
         )
+        # a system without aliasing, identified from the responses to port forces or a release
         system, excitation, parts = self._system_that_shows_all_modes(excitation, interval)
         # the first mode
         mode = None
@@ -455,6 +456,7 @@ class IdentifiedFmu(FmuRuns):
             motion = self._response_to_release(excitation, next(iter(excitation.releases)))
         else:
             motion = self._response_to_force(excitation, excitation.inputs[0])
+        # vibration about the final position
         last_quarter = motion[-len(motion) // 4 :]
         motion = motion - last_quarter.mean(axis=0)
         frequencies, power = periodogram(
@@ -471,6 +473,7 @@ class IdentifiedFmu(FmuRuns):
                 "in [scales]."
             )
         loudest = frequencies[np.argmax(power.max(axis=1))]
+        # a line at zero is not a vibration: the first frequency above zero is the least
         return 2.0 * np.pi * float(max(frequencies[1], loudest))
 
     def nominal_step_choice(self, trial: Trial) -> StepChoice:

@@ -208,7 +208,7 @@ def simulate_motion(
 def _motion_from_record(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int
 ) -> Motion:
-    """Return the motion from the first stamp of a record that is no ring-down."""
+    """Return the motion under recorded inputs, from the first time stamp of the record on."""
     times = excitation.sample_times
     first_stamp = float(excitation.time[0])
     begin = state_at_first_stamp(system, excitation, laws)
@@ -308,6 +308,7 @@ def _with_held_samples(
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
+        """Return the row `before` for each held sample, followed by the rows `after`."""
         return np.vstack((np.tile(before, (held_count, 1)), after))[:count]
 
     return ModalMotion(
