@@ -171,6 +171,7 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     if not hidden:
         return []
     nearest = max(hidden, key=lambda detectability: detectability.distance)
+    # the squared distance grows with the square of the size of an effect
     factor = inf
     if nearest.distance > 0.0:
         factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5

@@ -218,6 +218,7 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
         True to draw the law as well.
     """
     strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
+    # the samples around the largest force, within the record
     first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
     first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
     drawn = slice(first, first + MOST_FORCE_SAMPLES)
@@ -243,7 +244,8 @@ def _draw_over_motion(
     missing : MissingForce
         The missing force.
     motion, series, law : str
-        Names of the arrays of a trial: the motion, the force, and its law (empty for none).
+        Names of the arrays of a trial: of the motion, of the force, and of the force by its law
+        (empty if there is no law).
     samples : slice
         Samples that are drawn.
     """

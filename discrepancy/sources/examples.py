@@ -406,6 +406,7 @@ def _simulate_readings(
     """
     conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:
+        # the first entry is the relative deviation of the whole release shape
         initial_modes = conditions.initial.copy()
         initial_modes[0, 0] = trial.release.deviation * generator.normal()
         conditions = Conditions(conditions.parameters, initial_modes, (0.0, 0.0), trial.health)

@@ -140,7 +140,10 @@ def _build_campaign(
     steps: slice,
     held_out_share: float,
 ) -> records.Campaign:
-    """Return some steps of a run as a campaign.
+    """Return some steps of a run as a campaign of one flight, with some of its steps held out.
+
+    The strains are the readings that the twin observed; those that were lost are not used. The
+    health is the twin's smoothed estimate.
 
     Parameters
     ----------
@@ -168,7 +171,7 @@ def _build_campaign(
     noise, source_of_noise = _strain_noise(scenario)
     channels = _strain_channels(observed["sensor"].values.tolist(), noise)
     temperature = _temperature_rises(run, steps)
-    belief = run["smoothed"].to_dataset().sel(step=steps)
+    health_estimate = run["smoothed"].to_dataset().sel(step=steps)
     flight = records.Trial.plain(
         "steps",
         records.TrialKind.FLIGHT,
@@ -179,8 +182,8 @@ def _build_campaign(
         temperature=np.zeros(count) if temperature is None else temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")),
-        health=np.asarray(belief["mean"].values, dtype=float),
-        health_deviation=np.maximum(belief["standard_deviation"].values, HEALTH_DEVIATION),
+        health=np.asarray(health_estimate["mean"].values, dtype=float),
+        health_deviation=np.maximum(health_estimate["standard_deviation"].values, HEALTH_DEVIATION),
     )
     is_held_out = held_out_steps(count, BLOCK, held_out_share)
     trials = [flight.rows(~is_held_out)]
