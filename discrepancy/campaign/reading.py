@@ -172,7 +172,7 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Raises
     ------
     CampaignFileError
-        If a trial of an event is not there or is not a record in time, two events have moments of
+        If a trial of an event does not exist or is no record in time, two events have moments of
         one name, or an event begins again before it is over.
     CampaignDataError
         If a moment lies outside the record of its trial.

@@ -120,7 +120,7 @@ def system_motion(
 
 
 class SystemWithPorts(NamedTuple):
-    """A system whose ports are coordinates beside the state.
+    """A system whose ports are coordinates in addition to its state.
 
     Attributes
     ----------

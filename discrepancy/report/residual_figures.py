@@ -87,7 +87,7 @@ def size_colour_scale(values: Sequence[float] | FloatArray) -> Normalize:
 
 
 def add_size_bar(figure: Figure, norm: Normalize, panels: Sequence[Axes]) -> None:
-    """Draw the colour bar of sizes of residuals beside panels."""
+    """Draw the colour bar of rms residuals to the right of the panels."""
     bar = style.color_bar(
         figure,
         ScalarMappable(norm, style.LEVELS),

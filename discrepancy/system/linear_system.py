@@ -51,7 +51,7 @@ class Modes(NamedTuple):
 
 
 class ModalFrequencies(Protocol):
-    """Modes of a structure, as far as their frequencies are asked for."""
+    """The frequencies of the modes of a structure."""
 
     @property
     def frequency(self) -> FloatArray:

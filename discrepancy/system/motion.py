@@ -341,7 +341,7 @@ def _integrate_from(
     first : float
         Time of the state `begin` [s].
     stamps : (N,) array
-        Times at which the motion is wanted [s].
+        Times at which the motion is computed [s].
     begin : InitialMotion
         The state at `first`.
     refinement : int

@@ -306,7 +306,7 @@ def _cholesky_solver(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray
 
 
 class WingModel(SystemModel):
-    """The wing in the states and under the structural patches that are asked for, each made once.
+    """The model of a wing; its system in each state and under each patch is computed once.
 
     Parameters
     ----------
