@@ -38,14 +38,14 @@ class Questionnaire:
         self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
 
     def stated_answer(self, option: str, subject: str) -> str | None:
-        """Return the answer about exactly this subject; None if there is none.
+        """Return the user's answer about exactly this column or file; None if there is none.
 
-        The question is not noted as open.
+        A missing answer is not noted as an open question.
         """
         return self.answers.get(option, {}).get(subject)
 
     def ask(self, option: str, subject: str, expected: str, choices: Collection[str] = ()) -> str:
-        """Return an answer; without one, an empty text, and the question is noted as open.
+        """Return an answer; if there is none, note an open question and return an empty text.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Questionnaire:
     def ask_or_assume(
         self, default: str, option: str, subject: str, expected: str, choices: Collection[str] = ()
     ) -> str:
-        """Return an answer; without one, the default, which is noted as an assumption.
+        """Return an answer; if there is none, note the default as assumed and return it.
 
         Parameters and errors are those of `ask`.
         """
@@ -98,7 +98,7 @@ class Questionnaire:
 
 
 def check_subjects(answers: Answers, heads: Collection[str], files: Collection[str]) -> None:
-    """Refuse an answer about a column or a file that is not there.
+    """Refuse an answer about a column or a file that does not exist.
 
     Parameters
     ----------

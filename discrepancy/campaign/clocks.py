@@ -65,6 +65,11 @@ def merge_clocks(
 ) -> MergedTable:
     """Merge the clocks of a table into one, and return its columns in SI.
 
+    A clock is a column of times with the columns that were sampled at these times. The merged
+    table has a row for each time of any clock. A channel has empty cells at the times of the other
+    clocks; a load or a temperature is interpolated there, and rows outside of its record are left
+    out. Samples at rest of different clocks are put in the same rows instead.
+
     Parameters
     ----------
     clocks : sequence of TableClock
@@ -87,7 +92,7 @@ def merge_clocks(
     times = [_clock_times(clock, decimal) for clock in clocks]
     seconds, positions = _merged_times(times)
     count = len(seconds)
-    clocks_are_equal = all(len(position) == count for position in positions)
+    clocks_are_equal = all(len(clock_positions) == count for clock_positions in positions)
     if kind == NOISE and not clocks_are_equal:
         return _rest_samples_in_order(clocks, times, decimal)
     if kind in (TrialKind.STATIC, TrialKind.FLIGHT) and not clocks_are_equal:
@@ -99,39 +104,40 @@ def merge_clocks(
     cells: dict[str, list[str]] = {TIME: _time_cells(seconds)}
     loads_are_known = np.ones(count, dtype=bool)
     filled_loads = []
-    for clock, own_times, position in zip(clocks, times, positions, strict=True):
-        has_all_times = len(position) == count
+    # cells of each column at the merged times
+    for clock, clock_times, clock_positions in zip(clocks, times, positions, strict=True):
+        has_all_times = len(clock_positions) == count
         for column in clock.columns:
             column_cells = _place_cells(
-                column.cells_in_si(decimal), own_times.rows, position, count
+                column.cells_in_si(decimal), clock_times.rows, clock_positions, count
             )
             if _must_be_known_throughout(column, kind) and not has_all_times:
                 hold = _hold_of_load(column, holds)
-                _fill_between_samples(column_cells, seconds, position, hold)
+                _fill_between_samples(column_cells, seconds, clock_positions, hold)
                 filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
-                is_after_first_sample = seconds >= own_times.seconds[0]
-                is_before_last_sample = seconds <= own_times.seconds[-1]
+                is_after_first_sample = seconds >= clock_times.seconds[0]
+                is_before_last_sample = seconds <= clock_times.seconds[-1]
                 loads_are_known &= is_after_first_sample & is_before_last_sample
             cells[column.title] = column_cells
 
     # rows in which all loads are known
     rows = np.flatnonzero(loads_are_known).tolist()
     cells_of_rows = {title: tuple(column[row] for row in rows) for title, column in cells.items()}
-    unread = [title for title, column in cells_of_rows.items() if not any(column)]
-    if unread:
+    unread_titles = [title for title, column in cells_of_rows.items() if not any(column)]
+    if unread_titles:
         raise CampaignFileError(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
-            f"{unread[0]!r} are known, and a load must be known while a channel is read."
+            f"{unread_titles[0]!r} are known, and a load must be known while a channel is read."
         )
-    sentence = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
     if not clocks_are_equal:
-        sentence = (
+        remark = (
             f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
             "channel has no reading where its own clock has no stamp"
         )
-    sentence += _remark_on_loads(filled_loads, outside=count - len(rows))
+    remark += _remark_on_loads(filled_loads, outside=count - len(rows))
     lines = _line_numbers(clocks, times, positions, count)
-    return MergedTable(cells_of_rows, tuple(lines[row] for row in rows), sentence)
+    return MergedTable(cells_of_rows, tuple(lines[row] for row in rows), remark)
 
 
 def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
@@ -209,23 +215,37 @@ def _line_numbers(
     positions: Sequence[Sequence[int]],
     count: int,
 ) -> list[int]:
-    """Return the line in the file of each of `count` stamps, by the first clock that has it."""
+    """Return the line in the file of each of `count` merged times.
+
+    If several clocks have the same time, the line of the first of these clocks is taken.
+
+    Parameters
+    ----------
+    clocks : sequence of TableClock
+        The clocks of one table.
+    times : sequence of _ClockTimes
+        Times of each clock.
+    positions : sequence of sequence of int
+        For each clock, the indices of its times among the merged times.
+    count : int
+        Number of merged times.
+    """
     lines_of_rows = clocks[0].times.sheet.lines
     lines = [0] * count
-    # backwards, so that the first clock is written last
-    for own_times, position in reversed([*zip(times, positions, strict=True)]):
-        for index, row in zip(position, own_times.rows, strict=True):
-            lines[index] = lines_of_rows[row]
+    # from the last clock to the first, so that the first overwrites the others
+    for clock_times, clock_positions in reversed([*zip(times, positions, strict=True)]):
+        for position, row in zip(clock_positions, clock_times.rows, strict=True):
+            lines[position] = lines_of_rows[row]
     return lines
 
 
 def _rest_samples_in_order(
     clocks: Sequence[TableClock], times: Sequence[_ClockTimes], decimal: str
 ) -> MergedTable:
-    """Return samples at rest of several clocks in the order of their samples.
+    """Return the table of a noise record whose columns were sampled by several clocks.
 
-    The k-th samples of all clocks share a row, although their times differ. Only the sampling
-    interval of a noise record matters.
+    Row k holds the k-th sample of each clock, although the clocks took it at different times: only
+    the sampling interval of a noise record matters. Shorter columns end with empty cells.
 
     Raises
     ------
@@ -233,32 +253,33 @@ def _rest_samples_in_order(
         If the clocks have several sampling intervals.
     """
     intervals = []
-    for own_times in times:
-        duration = own_times.seconds[-1] - own_times.seconds[0]
-        intervals.append(duration / max(len(own_times.seconds) - 1, 1))
+    for clock_times in times:
+        duration = clock_times.seconds[-1] - clock_times.seconds[0]
+        intervals.append(duration / max(len(clock_times.seconds) - 1, 1))
     if max(intervals) - min(intervals) > EVENNESS_TOLERANCE * min(intervals):
-        each = listing(
+        periods = listing(
             f"{interval:.6g} s by {clock.times.head!r}"
             for clock, interval in zip(clocks, intervals, strict=True)
         )
         raise CampaignFileError(
-            f"{_file_name(clocks)}: samples at rest were taken every {each}, and a campaign has "
+            f"{_file_name(clocks)}: samples at rest were taken every {periods}, and a campaign has "
             "one interval for all: save those of one rate, or state `noise` of the other channels "
             "in campaign.toml."
         )
-    longest = max(times, key=lambda own_times: len(own_times.seconds))
+    # the clock with most samples gives the times and the lines of the rows
+    longest = max(times, key=lambda clock_times: len(clock_times.seconds))
     count = len(longest.seconds)
     cells = {TIME: tuple(_time_cells(longest.seconds))}
-    for clock, own_times in zip(clocks, times, strict=True):
-        first_positions = range(len(own_times.rows))
+    for clock, clock_times in zip(clocks, times, strict=True):
+        first_rows = range(len(clock_times.rows))
         for column in clock.columns:
             column_cells = _place_cells(
-                column.cells_in_si(decimal), own_times.rows, first_positions, count
+                column.cells_in_si(decimal), clock_times.rows, first_rows, count
             )
             cells[column.title] = tuple(column_cells)
     lines = tuple(clocks[0].times.sheet.lines[row] for row in longest.rows)
-    sentence = f"{_stamped_columns_text(clocks)}: samples at rest stand in their order"
-    return MergedTable(cells, lines, sentence)
+    remark = f"{_stamped_columns_text(clocks)}: samples at rest stand in their order"
+    return MergedTable(cells, lines, remark)
 
 
 def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:

@@ -76,7 +76,7 @@ class ColumnReader:
         return scaled_unit(head, unit, scale)
 
     def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
-        """Return a column whose cells are readings in a unit; ask for its role and its unit."""
+        """Return the record of a column of readings; ask the user for a role or unit it lacks."""
         role = self._determine_role(sheet, head, unit)
         if not unit and role != LEFT_OUT:
             self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
@@ -98,30 +98,38 @@ class ColumnReader:
             ) from None
 
     def _channel_or_input(self, sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
-        """Return a column that is a channel or an input.
+        """Return the record of a table column that is a channel or an input.
 
-        Its quantity is None while it is not known.
+        If its quantity cannot be determined yet, the quantity and the SI unit stay empty, and the
+        user is asked for the quantity.
         """
         quantity = self._determine_quantity(head, role, unit)
         if quantity is None:
             return LaboratoryColumn(sheet, head, role, unit)
-        plain_name = LOGGER_NAMES.get(unit, unit)
+        # a logger may write a unit in its own way, such as Celsius for degC
+        usual_unit = LOGGER_NAMES.get(unit, unit)
         return LaboratoryColumn(
             sheet=sheet,
             head=head,
             role=role,
             unit=unit,
-            si=plain_name if plain_name in NEVER_CONVERTED else UNITS[quantity].si,
+            # temperatures are not converted to SI
+            si=usual_unit if usual_unit in NEVER_CONVERTED else UNITS[quantity].si,
             quantity=quantity,
             to_si=factor_to_si(quantity, unit),
         )
 
     def _output_quantity(self, role: str) -> Quantity | None:
-        """Return the quantity of a model's output; None for what is not one, or without a model."""
+        """Return the quantity of a model output; None if it does not exist or there is no model."""
         return None if self._quantity_of is None else self._quantity_of(role)
 
     def _determine_role(self, sheet: Sheet, head: str, unit: str) -> str:
-        """Return the role of a column: as answered, by its name, or as the only time or force."""
+        """Return the role of a column: time, an input, or the model output that it measures.
+
+        These decide in turn: the user's answer; the head, if it is the name of an input; the unit,
+        if this is the only column with a unit of time (or of force); the head, if it is the name of
+        a model output. Otherwise the user is asked, and the result is empty.
+        """
         answer = self._questionnaire.stated_answer("column", head)
         if answer is not None:
             return answer
@@ -149,7 +157,16 @@ class ColumnReader:
         return self._questionnaire.ask("column", head, expected)
 
     def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
-        """Return the quantity of a channel or an input, None while that is not known."""
+        """Return the quantity that a channel or an input measures.
+
+        If the unit fits several quantities and neither an answer nor the model decides, the user is
+        asked, and the result is None.
+
+        Raises
+        ------
+        ValueError
+            If the role is no output of the model.
+        """
         answer = self._questionnaire.stated_answer("quantity", head)
         possible = possible_quantities(unit, answer)
         if self._quantity_of is not None and role and INPUT not in role:
@@ -158,8 +175,8 @@ class ColumnReader:
                 raise ValueError(f"the model has no output {role!r}")
             if modelled in possible:
                 possible = (modelled,)
-        # a length is a displacement before it is a level, and a unit of strain is not a plain
-        # number
+        # a length is taken as a displacement rather than as a level, and a unit of strain as strain
+        # rather than as a plain number
         is_usual = possible[0] is Quantity.DISPLACEMENT or _STRAIN.fullmatch(unit)
         if len(possible) == 1 or is_usual:
             return possible[0]

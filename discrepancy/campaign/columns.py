@@ -68,16 +68,16 @@ class LaboratoryColumn:
 
     @property
     def is_channel(self) -> bool:
-        """Whether it is a measured channel: not an input, a time, a force or a temperature."""
+        """Whether the column is a measured channel: no input, time, force or temperature."""
         return self.quantity is not None and INPUT not in self.role
 
     @property
     def title(self) -> str:
-        """Its name in the campaign."""
+        """Name of the column in the campaign."""
         return self.head if self.is_channel else self.role.removeprefix(INPUT)
 
     def cells_in_si(self, decimal: str) -> tuple[str, ...]:
-        """Return its cells in SI; all are empty while its unit or its decimal mark is not known.
+        """Return the cells in SI; all are empty if the unit or the decimal mark is not known yet.
 
         Parameters
         ----------
@@ -336,7 +336,7 @@ def units_of_columns(
 
 
 def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[str, str]) -> str:
-    """Return the remark on which file a table came from, and what its columns were taken as.
+    """Return the remark on the source file of a table and on the role of each of its columns.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mappin
     used : sequence of LaboratoryColumn
         Its columns that are not left out.
     scales : mapping of str to str
-        The options `--scale` by the head of their column.
+        Values of the option `--scale` of the import, by the head of the column they apply to.
     """
     phrases = []
     empty_cell_count = 0
@@ -365,22 +365,22 @@ def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mappin
 
 
 def missing_answers(questions: Mapping[tuple[str, str], Sequence[str]]) -> str:
-    """Return the message that options are missing.
+    """Return the message that lists the options which an import still needs.
 
     Parameters
     ----------
     questions : mapping of (str, str) to sequence of str
-        Columns or files that a question is about, by its option and what the option expects; an
-        empty name if it is about all.
+        For each missing option and the phrase on what it expects: the heads of the columns, or the
+        names of the files, that need a value. A single empty name means one value for all.
     """
-    options = []
+    option_phrases = []
     for (option, expected), subjects in questions.items():
-        value = "..."
+        placeholder = "..."
         if subjects[0]:
-            value = f"NAME=... for {listing(map(repr, subjects))}"
-        options.append(f"--{option} {value} ({expected})")
-    count = sum(map(len, questions.values()))
+            placeholder = f"NAME=... for {listing(map(repr, subjects))}"
+        option_phrases.append(f"--{option} {placeholder} ({expected})")
+    missing = sum(map(len, questions.values()))
     return (
-        f"{counted(count, 'answer')} {is_or_are(count)} missing, and nothing was written: "
-        f"give {'; '.join(options)}."
+        f"{counted(missing, 'answer')} {is_or_are(missing)} missing, and nothing was written: "
+        f"give {'; '.join(option_phrases)}."
     )

@@ -143,7 +143,7 @@ class LaboratoryImport:
         return self._questionnaire.ask("kind", file, listing(KINDS, "or"), KINDS)
 
     def _only_noise_file(self) -> str | None:
-        """Return the file of samples at rest, None without one; refuse a second one."""
+        """Return the file of samples at rest, or None if there is none; refuse a second one."""
         files = [name for name, kind in self.kinds.items() if kind == NOISE]
         if len(files) > 1:
             raise CampaignFileError(
@@ -211,13 +211,13 @@ class LaboratoryImport:
         return answer == "yes"
 
     def _release_table(self, file: str) -> dict[str, Any]:
-        """Return the table `release` of a ring-down; one of 1 m while the question is open."""
+        """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
         expected = "how far the point was held that was let go, such as 15.5mm"
         answer = self._questionnaire.ask("release", file, expected)
         return release_in_si(answer or "1m")
 
     def _reference_temperature(self) -> float | None:
-        """Return the reference temperature [degC]; None without a column of temperatures."""
+        """Return the reference temperature [degC]; None if no column is a temperature."""
         if not any(column.role == "temperature" for column in self.columns):
             return None
         expected = "degC, at which the model's parameters hold"

@@ -171,20 +171,23 @@ def _columns(name: str, value: object) -> dict[str, np.ndarray]:
 
 
 def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns that belong in one table, by their lengths.
+    """Choose, by their lengths, the columns of a file that make up one table.
 
-    These are the columns of the length that contains most numbers in all. If columns of times have
-    several lengths, the columns of all these lengths belong to the table as well.
+    Columns of equal length are taken together. The length whose columns hold most numbers in total
+    is chosen. If there are columns of times of several lengths, a table may have several clocks,
+    and the columns of these lengths are chosen too.
     """
-    lengths = Counter(len(column) for column in columns.values())
-    main_length = max(lengths, key=lambda length: (length * lengths[length], length))
-    times = time_heads([*columns], [""] * len(columns))
-    accepted = {len(columns[name]) for name in times}
-    if len(accepted) > 1:
-        accepted.add(main_length)
+    column_counts = Counter(len(column) for column in columns.values())
+    # of two lengths whose columns hold equally many numbers, the larger one
+    main_length = max(column_counts, key=lambda length: (length * column_counts[length], length))
+    # MATLAB variables have no units, so that columns of times are recognised by their names
+    names_of_times = time_heads([*columns], [""] * len(columns))
+    accepted_lengths = {len(columns[name]) for name in names_of_times}
+    if len(accepted_lengths) > 1:
+        accepted_lengths.add(main_length)
     else:
-        accepted = {main_length}
-    return {name: column for name, column in columns.items() if len(column) in accepted}
+        accepted_lengths = {main_length}
+    return {name: column for name, column in columns.items() if len(column) in accepted_lengths}
 
 
 def _cells(column: np.ndarray) -> list[str]:

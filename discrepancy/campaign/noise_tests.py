@@ -55,11 +55,13 @@ def pooled_variance_p_value(
 ) -> float:
     """Combine the p-values of several channels' mean squares into one.
 
-    Each p-value becomes a standard normal score, and the scores are added with weights (Stouffer's
-    method). A model error that raises the mean squares of all channels alike raises a score by its
-    size over the standard deviation of the mean square, whose variance is
-    2 / freedom + 2 / noise_freedom; this gives the weights. The combined p-value is exact, while a
-    sum of the squares themselves would have a heavy tail if a noise record is short.
+    Each p-value becomes a standard normal score. The weighted sum of the scores, divided by the
+    root of the sum of the squared weights, is again standard normal if the channels are independent
+    (Stouffer's method), so that the combined p-value is exact then. A sum of the squares themselves
+    would have a heavy tail if a noise record is short. The weight of a channel is the inverse
+    standard deviation of its mean square, which has the variance 2 / freedom + 2 / noise_freedom: a
+    model error that raises all mean squares by the same amount is then found best. A common factor
+    of the weights cancels.
 
     Parameters
     ----------

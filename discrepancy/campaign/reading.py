@@ -158,7 +158,7 @@ def _remarks_on_unused_columns(
 
 
 def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
-    """Complete events by the names of all trials in which they happened, and check them.
+    """Return the events with the names of all their trials, after checking them.
 
     Parameters
     ----------
@@ -172,32 +172,32 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Raises
     ------
     CampaignFileError
-        If a trial of an event is not there or is not a record in time, two events have moments of
+        If a trial of an event does not exist or is no record in time, two events have moments of
         one name, or an event begins again before it is over.
     CampaignDataError
         If a moment lies outside the record of its trial.
     """
     trials_by_name = {trial.name: trial for trial in trials}
     recorded_in_time = tuple(trial.name for trial in trials if trial.is_dynamic)
-    placed = []
+    completed = []
     for event in events:
         names = (event.trial,) if event.trial else event.trials or recorded_in_time
-        placed.append(replace(event, trial=None, trials=names))
-    for event in placed:
+        completed.append(replace(event, trial=None, trials=names))
+    for event in completed:
         for name in event.trials:
             _check_trial_of_event(event, name, trials_by_name, source)
             _check_moments(event, trials_by_name[name])
     for name in recorded_in_time:
-        events_of_trial = [event for event in placed if name in event.trials]
+        events_of_trial = [event for event in completed if name in event.trials]
         _check_names_of_moments(events_of_trial, name, source)
         _check_occurrences(events_of_trial, name, source)
-    return placed
+    return completed
 
 
 def _check_trial_of_event(
     event: Event, name: str, trials: Mapping[str, Trial], source: str
 ) -> None:
-    """Refuse an event in a trial that is not there, or is not a record in time."""
+    """Refuse an event in a trial that does not exist, or that is not a record in time."""
     if name not in trials:
         raise CampaignFileError(
             f"{source}: the event {event.name!r} names the trial {name!r}, which is not among the "

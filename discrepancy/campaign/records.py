@@ -226,7 +226,7 @@ class Trial(TrialKeys):
 
     @property
     def input_names(self) -> tuple[str, ...]:
-        """Names of what is recorded beside the channels; the force of a forced trial is "force"."""
+        """Names of the recorded inputs of the trial; the force of a forced trial is "force"."""
         if self.kind is TrialKind.FORCED:
             return ("force",)
         return tuple(recorded.name for recorded in self.inputs)

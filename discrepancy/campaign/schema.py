@@ -200,7 +200,7 @@ class TrialSection(records.TrialKeys):
 
 
 def _first_repeated(names: Iterable[str]) -> str | None:
-    """Return a name that occurs more than once, the first in the alphabet; None without one."""
+    """Return the alphabetically first name that occurs more than once; None if there is none."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     return min(repeated, default=None)
 

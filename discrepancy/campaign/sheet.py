@@ -158,6 +158,7 @@ def _sheet_of_rows(
         cells_of_columns, [f"{place} {line}" for line in lines]
     )
 
+    # columns of numbers or times; columns with texts are left out with a remark, empty ones without
     heads: list[str] = []
     units: list[str] = []
     columns: list[tuple[str, ...]] = []
@@ -197,12 +198,12 @@ def _sheet_of_rows(
 
 
 def _cell(row: Sequence[str], index: int) -> str:
-    """Return a cell of a row; an empty one beyond its end."""
+    """Return a cell of a row; an empty text if the row has fewer cells."""
     return row[index] if index < len(row) else ""
 
 
 def _remark_on_texts(title: str, number_count: int, text_count: int) -> str:
-    """Return the remark on a column that is left out for its texts, beside a count of numbers."""
+    """Return the remark that a column is left out because it holds texts, or no numbers."""
     content = "no numbers"
     if number_count:
         content = f"{counted(number_count, 'number')} and {counted(text_count, 'text')}"

@@ -44,10 +44,12 @@ def _rows_of_longer_clocks(
     units: Sequence[str],
     places_of_values: Sequence[set[int]],
 ) -> list[int]:
-    """Return the indices of rows below a table that belong to the longer of its clocks.
+    """Return the indices of rows below a table's body that continue its longer columns of times.
 
-    A table may have several columns of times, each with columns of its own and its own length. The
-    shorter columns end earlier, so that the first core column may be empty in the last rows.
+    A table may have several columns of times, each with the columns that were sampled at them, and
+    these groups may differ in length. The body of the table ends with its first core column (see
+    `find_table`). If that column is one of the shorter ones, rows of the longer ones follow. They
+    end at the first row that has no time, or that has a text that is not a number.
 
     Parameters
     ----------
@@ -63,18 +65,18 @@ def _rows_of_longer_clocks(
     names = []
     units_of_names = []
     for title, unit in zip(head, units, strict=False):  # a row of units may be shorter
-        name, own_unit = split_head(title, unit)
+        name, unit_of_name = split_head(title, unit)
         names.append(name)
-        units_of_names.append(own_unit)
+        units_of_names.append(unit_of_name)
     times = time_heads(names, units_of_names)
-    places_of_times = {place for place, name in enumerate(names) if name in times}
-    if len(places_of_times) < 2:
+    time_columns = {column for column, name in enumerate(names) if name in times}
+    if len(time_columns) < 2:
         return []
     further_rows: list[int] = []
     for index, (_, row) in enumerate(rows, start=first):
-        filled = {place for place, cell in enumerate(row) if cell}
-        has_other_texts = bool(filled - places_of_values[index])
-        if not filled & places_of_times or has_other_texts:
+        filled_columns = {column for column, cell in enumerate(row) if cell}
+        has_other_texts = bool(filled_columns - places_of_values[index])
+        if not filled_columns & time_columns or has_other_texts:
             break
         further_rows.append(index)
     return further_rows
@@ -143,6 +145,8 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
             f"{name} holds no table: a row with the names of the columns is needed, and rows of "
             "numbers under it, with commas, semicolons or tabs between cells."
         )
+    # from the first to the last row with a number in the first core column, other rows of numbers
+    # belong to the table as well
     first, last = body[0], body[-1]
     body = [
         index for index in range(first, last + 1) if not has_text[index] and places_of_values[index]
@@ -178,14 +182,25 @@ def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]
 
 
 def _head_and_units(rows: Rows, first: int) -> tuple[list[str], list[str]]:
-    """Return heads and units of the columns, from the rows above the first row of numbers."""
+    """Return the heads and the units of the columns, from the two rows above the first numbers.
+
+    The row above the numbers holds the units if all its cells are units, and if the row above it
+    has at least as many cells: the latter holds the heads then. Otherwise there is no row of units.
+
+    Parameters
+    ----------
+    rows : list of (int, list of str)
+        Rows of the file.
+    first : int
+        Index of the first row of numbers.
+    """
     row_above = rows[first - 1][1]
-    second_above = rows[first - 2][1] if first > 1 else []
+    row_two_above = rows[first - 2][1] if first > 1 else []
     no_units = [""] * len(row_above)
-    if sum(map(bool, second_above)) < sum(map(bool, row_above)):
+    if sum(map(bool, row_two_above)) < sum(map(bool, row_above)):
         return row_above, no_units
     if all(is_unit(cell) for cell in row_above if cell):
-        return second_above, [plain_unit(cell) for cell in row_above]
+        return row_two_above, [plain_unit(cell) for cell in row_above]
     return row_above, no_units
 
 
@@ -208,18 +223,19 @@ def _check_other_rows(
     head: Sequence[str],
     place: str,
 ) -> None:
-    """Refuse a row with texts between the rows of numbers, and numbers that go on below the table.
+    """Refuse a row with texts within the table, and rows of numbers below it.
 
-    Comments and repeated heads are allowed. A footer has no number in the first core column.
+    Below the table, only a row with numbers in the first and in at least half of the core columns
+    is refused; other rows are a footer. Comments and repeated heads are allowed.
     """
     first, last = body[0], body[-1]
-    not_in_body = {*range(first, last)} - {*body}
+    other_rows = {*range(first, last)} - {*body}
     for index in range(last + 1, len(rows)):
         values = places_of_values[index]
-        is_torn_off = core[0] in values and 2 * len(values & {*core}) >= len(core)
-        if is_torn_off:
-            not_in_body.add(index)
-    for index in sorted(not_in_body):
+        is_row_of_numbers = core[0] in values and 2 * len(values & {*core}) >= len(core)
+        if is_row_of_numbers:
+            other_rows.add(index)
+    for index in sorted(other_rows):
         line, row = rows[index]
         is_head = row in (head, rows[first - 1][1])
         if is_head or row[0].startswith("#"):

@@ -218,17 +218,19 @@ def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArra
     """
     begins_branch = np.zeros(len(table), dtype=np.int64)
     for column in loads:
+        # a turn: a change of the load has another sign than the previous change; rows of equal load
+        # are skipped
         steps = np.diff(table.numbers(column, user))
-        moving = np.flatnonzero(steps)
-        turns = np.diff(np.sign(steps[moving])) != 0.0
-        begins_branch[moving[1:][turns] + 1] = 1
+        changes = np.flatnonzero(steps)
+        is_turn = np.diff(np.sign(steps[changes])) != 0.0
+        begins_branch[changes[1:][is_turn] + 1] = 1
     return np.cumsum(begins_branch)
 
 
 def _channels_of_trial(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection
 ) -> tuple[Channel, ...]:
-    """Return the channels that a trial names, or all that have a column in its table."""
+    """Return the channels that a trial names; if it names none, all with a column in its table."""
     if section.channels is None:
         channels = tuple(
             channel for channel in campaign.channel if channel.table_column in table.columns
@@ -236,6 +238,7 @@ def _channels_of_trial(
     else:
         by_name = {channel.name: channel for channel in campaign.channel}
         channels = tuple(by_name[name] for name in section.channels)
+    # refuses a channel without a column
     for channel in channels:
         table.cells(channel.table_column, f"the channel {channel.name!r}")
     if not channels:

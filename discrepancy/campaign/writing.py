@@ -145,14 +145,16 @@ def _file_name(number: int, trial: records.Trial) -> str:
 
 
 def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _FileUnits) -> str:
-    """Return the table of a trial as text.
+    """Return the table of a trial as text: its times, loads, temperatures, inputs and channels.
 
     Raises
     ------
     CampaignFileError
-        If it has temperatures and the campaign no reference temperature.
+        If the trial has temperatures other than the reference temperature, but the campaign has no
+        reference temperature.
     """
     columns: dict[str, records.FloatArray] = {}
+    # rows of a static or flight trial need times only if they were not all taken at its start
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
     if trial.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED):
@@ -160,6 +162,7 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _
         columns["force"] = file_units.in_unit(trial.force, "force", to_newton)
     if trial.kind is records.TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
+    # the trial holds temperatures minus the reference temperature, the table the temperatures
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
             raise CampaignFileError(no_reference_temperature_message(trial.name))
@@ -321,11 +324,11 @@ def _input_table(recorded: records.RecordedInput, file_units: _FileUnits) -> rec
 def _trial_section(
     campaign: records.Campaign, trial: records.Trial, file: str, file_units: _FileUnits
 ) -> schema.TrialSection:
-    """Return a trial as `campaign.toml` has it; keys with their default are left out."""
+    """Return the section [[trial]] of `campaign.toml` for a trial; default values are left out."""
     left_out: dict[str, tuple[int, ...]] = {}
     if not file_units.left_out_as_empty:
         for index, name in enumerate(trial.channels):
-            rows = np.flatnonzero(~trial.used[:, index]) + 1
+            rows = np.flatnonzero(~trial.used[:, index]) + 1  # files count rows from 1
             if rows.size:
                 left_out[name] = tuple(rows.tolist())
     is_driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed

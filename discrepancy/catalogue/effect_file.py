@@ -144,7 +144,7 @@ def _check_names(section: EffectSection, names: frozenset[str], place: str) -> N
 
 
 def _check_places_and_needs(section: EffectSection, place: str) -> None:
-    """Refuse words for places and needs that are not known, and an effect without primitives."""
+    """Refuse an effect with an unknown word for its places or needs, or without primitives."""
     for need in section.needs:
         if need not in NEEDS:
             raise CatalogueError(
@@ -400,11 +400,11 @@ class _EffectFunctions:
         return EffectInSetting(setting, self.section, kinds, frozenset(moments))
 
     def places(self, setting: Setting) -> tuple[str, ...]:
-        """Return the places where it may act."""
+        """Return the places where the effect may act in a setting."""
         return places_of(self._in_setting(setting))
 
     def unavailable(self, setting: Setting) -> str | None:
-        """Return why it cannot be tested, or None."""
+        """Return the reason if the effect cannot be tested in a setting, else None."""
         return untestable_reason(self._in_setting(setting))
 
     def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:

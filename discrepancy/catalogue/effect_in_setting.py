@@ -189,7 +189,7 @@ class EffectInSetting:
 
 @dataclass(frozen=True)
 class Target:
-    """What a place stands for in a primitive.
+    """The ports, channels, runs or loggers that a place of an effect stands for.
 
     Attributes
     ----------

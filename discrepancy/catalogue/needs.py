@@ -30,7 +30,10 @@ INPUTS = DYNAMIC - {TrialKind.RINGDOWN}
 
 
 def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None:
-    """Return why no fitted trial is of these kinds (of those it acts on by default), or None."""
+    """Return the reason if no fitted trial is of these kinds, else None.
+
+    By default the kinds are those that the effect acts on.
+    """
     kinds = kinds or effect.section.acts_on
     if any(trial.kind in kinds for trial in effect.setting.campaign.fitted):
         return None
@@ -39,7 +42,7 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 
 
 def _no_event(effect: EffectInSetting) -> str | None:
-    """Return why no fitted trial has the events that it needs, or None."""
+    """Return the reason if no fitted trial has the events that an effect needs, else None."""
     campaign = effect.setting.campaign
     names_of_trials = [campaign.moment_names(trial.name) for trial in campaign.fitted]
     if not effect.moments or any(effect.moments <= names for names in names_of_trials):
@@ -52,7 +55,7 @@ def _no_event(effect: EffectInSetting) -> str | None:
 
 
 def _no_law(effect: EffectInSetting) -> str | None:
-    """Return why the model cannot carry its primitives, or None."""
+    """Return the reason if the model cannot carry the primitives of an effect, else None."""
     model = effect.setting.model
     for primitive in effect.primitives:
         if primitive in SENSORS or model.supports(primitive):
@@ -70,7 +73,7 @@ def _sentence_on_model(model: Model, predicate: str) -> str:
 
 
 def _no_place(effect: EffectInSetting) -> str | None:
-    """Return why there is no place where it could act, or None."""
+    """Return the reason if there is no place where an effect can act, else None."""
     if places_of(effect):
         return None
     word = effect.section.places
@@ -80,7 +83,7 @@ def _no_place(effect: EffectInSetting) -> str | None:
 
 
 def _no_port(effect: EffectInSetting) -> str | None:
-    """Return why the model has no port at which a force could act, or None."""
+    """Return the reason if the model has no port at which a force can act, else None."""
     model = effect.setting.model
     if not model.ports:
         return _sentence_on_model(model, NO_PORT)
@@ -97,7 +100,7 @@ def _no_turning_port(effect: EffectInSetting) -> str | None:
 
 
 def _no_length(effect: EffectInSetting) -> str | None:
-    """Return why the model has no length with stations, or None."""
+    """Return the reason if the model has no length with stations, else None."""
     model = effect.setting.model
     if model.stations is not None:
         return None
@@ -105,14 +108,14 @@ def _no_length(effect: EffectInSetting) -> str | None:
 
 
 def _no_force(effect: EffectInSetting) -> str | None:
-    """Return why no fitted trial has a force, or None."""
+    """Return the reason if no fitted trial has a force, else None."""
     if any(np.any(trial.force != 0.0) for trial in effect.setting.campaign.fitted):
         return None
     return "No static or forced trial of the campaign has an applied force."
 
 
 def _no_temperature(effect: EffectInSetting) -> str | None:
-    """Return why the fitted trials do not differ in temperature, or None."""
+    """Return the reason if the fitted trials do not differ in temperature, else None."""
     campaign = effect.setting.campaign
     if campaign.reference_temperature is None:
         return "No temperatures were recorded in the campaign."
@@ -123,7 +126,7 @@ def _no_temperature(effect: EffectInSetting) -> str | None:
 
 
 def _no_channel(effect: EffectInSetting) -> str | None:
-    """Return why there is no trial to fit, or None."""
+    """Return the reason if there is no trial to fit, else None."""
     return None if effect.setting.campaign.fitted else "The campaign has no channel to fit."
 
 
@@ -141,7 +144,7 @@ def _no_second_clock(effect: EffectInSetting) -> str | None:
 
 
 def _no_input(effect: EffectInSetting) -> str | None:
-    """Return why no fitted trial has recorded inputs in time, or None."""
+    """Return the reason if no fitted trial has recorded inputs in time, else None."""
     return _no_trial(effect, INPUTS)
 
 
@@ -180,9 +183,9 @@ NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
 
 
 def untestable_reason(effect: EffectInSetting) -> str | None:
-    """Return why an effect cannot be tested: the first of its needs that is not met.
+    """Return the reason why an effect cannot be tested: its first need that is not met.
 
-    None if all are.
+    None if all needs are met.
     """
     at_any_port = replace(effect, section=replace(effect.section, preferred=()))
     for need in effect.section.needs:

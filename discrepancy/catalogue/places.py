@@ -75,7 +75,7 @@ def _is_read_repeatedly(effect: EffectInSetting, name: str) -> bool:
             start = trial.start if trial.is_dynamic else 0.0
             first_time = min(first_time, np.min(trial.time + start))
             last_time = max(last_time, np.max(trial.time + start))
-    # an effect that grows from time zero is seen only in readings after it
+    # an effect that grows from time zero on changes only readings after this time
     return bool(last_time > max(first_time, 0.0))
 
 

@@ -21,7 +21,9 @@ LARGEST_SHARE = 0.9
 
 @dataclass(frozen=True)
 class BuildContext:
-    """Where a patch of an effect is built, for the names in its expressions.
+    """The effect, place and values for which a patch is built.
+
+    The names in the expressions of the effect are evaluated from it.
 
     Attributes
     ----------
@@ -58,8 +60,9 @@ class BuildContext:
 def loss_integral(velocity_exponent: float, displacement_exponent: float) -> float:
     """Return the energy that a force dissipates in a cycle, over 2 F_0 A.
 
-    For the force F_0 |v / (A w)|^p |x / A|^a sgn v under x = A sin w t it is the beta function of
-    (p + 2) / 2 and (a + 1) / 2; for Coulomb friction (p = a = 0) it is 2.
+    Under the motion x = A sin w t, the force F_0 |v / (A w)|^p |x / A|^a sgn v dissipates F_0 A
+    times the integral of |cos|^(p + 1) |sin|^a over a turn, which is twice the beta function of
+    (p + 2) / 2 and (a + 1) / 2. For Coulomb friction (p = a = 0) the result is 2.
 
     Parameters
     ----------
@@ -85,7 +88,7 @@ def _is_held(context: BuildContext) -> float:
 
 
 def _holding_force(context: BuildContext) -> float:
-    """Return the largest force with which the port still moves.
+    """Return the largest friction force at a port that does not hold the port still.
 
     It is `LARGEST_SHARE` of the elastic force at the port's natural displacement. There is no limit
     (infinity) for a force that vanishes at rest (a velocity exponent of one or more), for a port
@@ -130,7 +133,10 @@ def _largest_reading(context: BuildContext) -> float:
 
 
 def _compute_largest_reading(context: BuildContext) -> float:
-    """Return the largest absolute reading that is used at the place [its unit]; 0 without any."""
+    """Return the largest absolute used reading of the target channel or channels [their unit].
+
+    It is 0 if there is no used reading.
+    """
     target = context.target
     names: tuple[str, ...] = (target.name,)
     if target.name == EVERY_CHANNEL:
@@ -154,7 +160,10 @@ def _sampling_interval(context: BuildContext) -> float:
 
 
 def _largest_release(context: BuildContext) -> float:
-    """Return the largest release displacement of the trials with the channel; 1 without any."""
+    """Return the largest release displacement of the fitted trials that record the channel.
+
+    It is 1 if no such trial has a release displacement.
+    """
     releases = [
         abs(trial.release.displacement)
         for trial in context.setting.campaign.fitted

@@ -1,1 +1,1 @@
-"""Faults of data, alone and beside a model."""
+"""Faults of data that are found without a model, and by comparison with one."""

@@ -237,9 +237,9 @@ def _is_clipped_over_load(
     if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[other_rows]).size < 2:
         return False
     line = np.polynomial.Polynomial.fit(load[other_rows], values[other_rows], 1)
-    beyond = float(np.max(np.abs(line(load[start:stop]) - values[start])))
+    excess = float(np.max(np.abs(line(load[start:stop]) - values[start])))
     scatter = float(np.std(values[other_rows] - line(load[other_rows])))
-    return beyond > 1.5 * digit + 6.0 * scatter
+    return excess > 1.5 * digit + 6.0 * scatter
 
 
 def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float) -> bool:
@@ -260,8 +260,10 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     neighbours = np.r_[start - 3 : start, stop : stop + 3]
     if neighbours[0] < 0 or neighbours[-1] >= len(values):
         return False
-    places = neighbours - 0.5 * (start + stop - 1)
-    _, _, weights_at_middle = np.linalg.pinv(np.vander(places, 3))
-    beyond = abs(weights_at_middle @ values[neighbours] - values[start])
+    # the parabola at the middle of the run (sample 0) is a weighted sum of the six neighbours
+    relative_samples = neighbours - 0.5 * (start + stop - 1)
+    _, _, weights_at_middle = np.linalg.pinv(np.vander(relative_samples, 3))
+    excess = abs(weights_at_middle @ values[neighbours] - values[start])
+    # each neighbour may be wrong by this error; half of the largest sum of such errors is allowed
     error = 3.0 * digit + 6.0 * estimate_roughness(values)
-    return bool(beyond > 0.5 * np.abs(weights_at_middle).sum() * error)
+    return bool(excess > 0.5 * np.abs(weights_at_middle).sum() * error)

@@ -87,7 +87,7 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
 
 
 def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -> str | None:
-    """Return the phrase about a vibration at a mode's frequency in a noise record; None without it.
+    """Return the phrase about a vibration at a mode's frequency in a noise record, or None.
 
     Parameters
     ----------

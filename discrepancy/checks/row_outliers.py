@@ -12,7 +12,7 @@ NORMAL_OVER_MAD = 1.4826
 LEAST_REPEATS = 3
 """Least number of repeats: the median of two does not show which of them is wrong."""
 LEAST_ROWS = 8
-"""Least number of rows for a parabola to be judged by: five remain beside its coefficients."""
+"""Fewest rows of a trial to which a parabola is fitted: five more than its coefficients."""
 LARGEST_SCATTER = 2.0
 """Largest scatter about a parabola, in noise deviations, for the load to act by a parabola."""
 

@@ -105,6 +105,7 @@ def find_slip(
     distances: dict[Slip, float] = {}
     for assumed, assumed_in_si in units_in_si.items():
         for meant, meant_in_si in units_in_si.items():
+            # the assumed unit is the stated one; if none is stated, one of the two must be SI
             has_si = 1.0 in (assumed_in_si, meant_in_si)
             if assumed != stated and (stated or not has_si):
                 continue
@@ -253,26 +254,29 @@ def _channel_faults(
         The trials that show it.
     """
     channel = campaign.channels[name]
-    first = trials[0]
+    first_trial = trials[0]
     column = ""
-    if channel.column and first.file:
-        column = f", column {channel.column!r} of {first.file},"
+    if channel.column and first_trial.file:
+        column = f", column {channel.column!r} of {first_trial.file},"
     number_of_trials = sum(name in trial.channels for trial in campaign.trials)
     is_in_one_of_several = len(trials) == 1 and number_of_trials > 1
-    trials_text = f" in the trial {first.name!r}" if is_in_one_of_several else ""
+    trials_text = f" in the trial {first_trial.name!r}" if is_in_one_of_several else ""
     sentence = (
         f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model "
         f"says{trials_text} {slip}: correct its `unit`, or convert the column"
     )
-    trial_name = first.name if is_in_one_of_several else ""
+    trial_name = first_trial.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
     # an accelerometer also shows gravity, whose value is known: this counts as a second record
-    witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
-    yield from _grade_slip(fault, slip, agreeing=len(trials) + witnesses)
+    further_evidence = 1 if channel.quantity is Quantity.ACCELERATION else 0
+    yield from _grade_slip(fault, slip, agreeing=len(trials) + further_evidence)
 
 
 def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
     """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
+
+    A large slip is a fault. A medium one is a fault if several records agree, else a doubt. A small
+    one is a doubt if several records agree, else it is not reported.
 
     Parameters
     ----------

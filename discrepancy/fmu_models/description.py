@@ -23,7 +23,7 @@ CARRIED = tuple(primitive.kind for primitive in (*STRUCTURE, *LOADS, StiffnessDr
 
 
 def _as_table(force: object) -> object:
-    """Return force inputs by load place, also from the only one."""
+    """Return the force inputs by load place; a single input without a place is allowed."""
     return {DEFAULT_PLACE: force} if isinstance(force, str) else force
 
 
@@ -63,7 +63,7 @@ class FmuInputsSection(Section):
 
     @property
     def regions(self) -> dict[str, str]:
-        """FmuInputsSection of stiffness losses by damage region."""
+        """Inputs of the stiffness losses, by damage region."""
         regions: dict[str, str] = {}
         if self.z1 is not None:
             regions["z1"] = self.z1
@@ -221,7 +221,7 @@ class FmuModelDescription(ModelDescription):
     isolated: bool = True
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the contradictions of the file."""
+        """Yield the rules on the whole file: on names, effects and the reference temperature."""
         for kind in ("port", "parameter", "output", "input"):
             yield from self.repeated_name_faults(
                 kind, [section.name for section in getattr(self, kind)]
@@ -238,7 +238,7 @@ class FmuModelDescription(ModelDescription):
         yield lacks_temperature, "temperature_reference needs the input temperature"
 
     def binding_file(self, folder: Path) -> Path | None:
-        """Return the binding file that is named: a shipped one, or one seen from a folder."""
+        """Return the path of the named binding, shipped or in a folder; None if none is named."""
         if self.binding is None:
             return None
         return binding_files().get(self.binding, folder / self.binding)

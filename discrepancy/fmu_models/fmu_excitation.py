@@ -56,7 +56,7 @@ class FmuExcitation(NamedTuple):
 
     @property
     def first_force(self) -> float:
-        """The recorded force at the first sample, zero without one."""
+        """The recorded force at the first sample; zero if no force is recorded."""
         return 0.0 if self.force is None else float(self.force.values[0])
 
     @property

@@ -111,7 +111,7 @@ class FmuSimulator(FmuAtRest):
         end: float,
         refinement: int,
     ) -> SampledOutputs:
-        """Return outputs and rates by the FMU's linear system, followed until a time `end` [s].
+        """Return outputs and their rates, computed with the FMU's linear system until `end` [s].
 
         Parameters
         ----------
@@ -182,7 +182,10 @@ class FmuSimulator(FmuAtRest):
     def _held_outputs(
         self, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FloatArray:
-        """Return the outputs (C,) of a linear FMU before its release, less the undisturbed ones."""
+        """Return the outputs (C,) of a linear FMU before its release, less the undisturbed ones.
+
+        Responses to unit values of the release variables are added, as the FMU is linear.
+        """
         return np.asarray(
             sum(
                 self._response_to_release(excitation, name)[0] * value
@@ -240,7 +243,10 @@ class FmuSimulator(FmuAtRest):
         columns: Sequence[int],
         refinement: int,
     ) -> "SteppedOutputs":
-        """Return outputs of the FMU stepped until a time `end` [s], with the laws beside it.
+        """Return the outputs of the FMU, stepped until `end` [s] and coupled with the laws.
+
+        The steps are halved until the outputs that are read have converged, unless the FMU has a
+        fixed step or there are no laws.
 
         Parameters
         ----------
@@ -259,13 +265,16 @@ class FmuSimulator(FmuAtRest):
         """
         fixed_step = self.description.motion.step
         release_values = self._find_release_values(excitation)
-        # inputs are held over steps
+        # the FMU holds inputs constant over a step, so that a recorded force needs half the step
         longest_step = excitation.step if excitation.force is None else 0.5 * excitation.step
 
         def outputs_by(parts: int) -> FloatArray:
+            """Return the outputs (K, C) with the longest step divided into `parts` steps."""
             step = fixed_step or longest_step / parts
-            finer = excitation._replace(step=step, recorded_steps=ceil(end / step - 1e-6))
-            run = self._run_of_excitation(finer, release_values)
+            refined_excitation = excitation._replace(
+                step=step, recorded_steps=ceil(end / step - 1e-6)
+            )
+            run = self._run_of_excitation(refined_excitation, release_values)
             if len(laws):
                 # an unstable coupling grows beyond all numbers
                 with np.errstate(all="ignore"):
@@ -296,13 +305,18 @@ class FmuSimulator(FmuAtRest):
         return SteppedOutputs(outputs, fixed_step or longest_step / parts)
 
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
-        """Return a run that begins in equilibrium with laws under its first loads."""
+        """Return a run that begins in equilibrium with laws under its first loads.
+
+        If no load acts, or no port of a law is displaced by the first loads, the run is returned as
+        it is.
+        """
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
         if not run.offsets or not np.any(outputs[:, columns]):
             return SettledRun(run, None)
 
         def run_under(forces: FloatArray) -> FmuRun:
+            """Return the run whose first inputs are the loads minus the forces of the laws."""
             loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
             begin = self.subtract_law_forces(loads, laws, forces)
             return run._replace(
@@ -310,6 +324,7 @@ class FmuSimulator(FmuAtRest):
             )
 
         def outputs_under(forces: FloatArray) -> FloatArray:
+            """Return the outputs at the start under given forces of the laws."""
             return self._outputs_at_begin(run_under(forces))
 
         _, solution = self.find_equilibrium_with_laws(
@@ -323,7 +338,10 @@ class FmuSimulator(FmuAtRest):
         return outputs[None]
 
     def _outputs_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> FloatArray:
-        """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""
+        """Return the outputs (K, C) at the K step boundaries of a run with laws at its ports.
+
+        All are NaN if the explicit coupling of FMU and laws is unstable.
+        """
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
         names = [self.ports[port] for port in ports]

@@ -54,8 +54,8 @@ class FmuAtRest(IdentifiedFmu):
         """Return the outputs (L, C) at rest, for L states that differ in their inputs.
 
         An FMU without a static solution is stepped until its motion has decayed (`static.settle`).
-        If it is linear, that is done without loads only: its static gain gives the changes by
-        loads.
+        If it is linear, it is stepped without loads only, and the changes by the loads are computed
+        from its static gain.
 
         Parameters
         ----------
@@ -132,12 +132,12 @@ class FmuAtRest(IdentifiedFmu):
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
     def port_flexibility(self, state: OperatingPoint) -> FloatArray:
-        """Return the flexibility (P, P): displacements of ports (rows) per force (columns)."""
+        """Return the flexibility (P, P): displacement of each port (row) per force (column)."""
         if not self.ports:
-            # without ports nothing is wanted, and the FMU may not accept loads of zero
+            # there is nothing to compute, and the FMU may not accept loads of zero
             return np.zeros((0, 0))
         probing_forces = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
-        # the first row is without a force
+        # the first row is without a force; each further row has a force at one port
         loads = dict.fromkeys(self.port_inputs, np.zeros(len(probing_forces) + 1))
         for name, force in zip(self.port_inputs, probing_forces, strict=True):
             loads[name] = loads[name] + np.append(0.0, force)
@@ -182,6 +182,7 @@ class FmuAtRest(IdentifiedFmu):
             return outputs
 
         def outputs_under(forces: FloatArray) -> FloatArray:
+            """Return the outputs (L, C) of the FMU under the loads minus forces of the laws."""
             return self.solve_rest(states, self.subtract_law_forces(loads, laws, forces))
 
         return self.find_equilibrium_with_laws(

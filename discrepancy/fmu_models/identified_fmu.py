@@ -118,7 +118,10 @@ class IdentifiedFmu(FmuRuns):
         self._paces = ResultCache()
 
     def _check_parameters(self) -> None:
-        """Refuse what the FMU cannot be set to: beyond its range a posterior would be cut."""
+        """Refuse a file whose parameter bounds, effect switches or settings the FMU does not allow.
+
+        Bounds beyond the range of an FMU parameter would cut off its posterior.
+        """
         description = self.description
         settings: list[Mapping[str, float]] = []
         for parameter in description.parameter:
@@ -222,15 +225,14 @@ class IdentifiedFmu(FmuRuns):
     def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (recorded_steps + 1, C) after a release by one unit.
 
-        They are relative to the outputs without a release.
-
-        The FMU is released by a usual amount, which is the same in all later calls, and the outputs
-        are divided by it.
+        The outputs without a release are subtracted. The FMU is released by the nominal amount of
+        the first call for this variable (the same in all later calls), and the outputs are divided
+        by it.
         """
-        usual_amplitude = excitation.releases[name] or 1.0
+        nominal_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
-            usual_amplitude = self.probing_amplitude(name)
-        amplitude = self._release_amplitudes.setdefault(name, usual_amplitude)
+            nominal_amplitude = self.probing_amplitude(name)
+        amplitude = self._release_amplitudes.setdefault(name, nominal_amplitude)
         run = self._run_of_excitation(excitation._replace(force=None), {name: amplitude})
         key = (*excitation.recording_arguments, name, True)
         return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
@@ -323,6 +325,7 @@ class IdentifiedFmu(FmuRuns):
             return release_values
 
         def missing_displacement(amount: float) -> float:
+            """Return the displacement by an amount minus the displacement of the release [m]."""
             at_begin = excitation._replace(force=None, recorded_steps=0)
             run = self._run_of_excitation(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
@@ -344,7 +347,11 @@ class IdentifiedFmu(FmuRuns):
     def _run_of_excitation(
         self, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FmuRun:
-        """Return the run of the FMU under an excitation, with the given release amounts."""
+        """Return the run of the FMU under an excitation.
+
+        Release variables that are inputs of the FMU are set before the start; the others are
+        parameters of the operating point.
+        """
         begin = {name: amount for name, amount in release_values.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in release_values.items() if name not in begin}
         run = FmuRun(
@@ -398,6 +405,7 @@ class IdentifiedFmu(FmuRuns):
         excitation = FmuExcitation(
             state, interval, recorded_step_count(trial), inputs, releases=releases
         )
+        # a system without aliasing, identified from the responses to port forces or a release
         system, excitation, parts = self._system_that_shows_all_modes(excitation, interval)
         # the first mode
         mode = None
@@ -448,6 +456,7 @@ class IdentifiedFmu(FmuRuns):
             motion = self._response_to_release(excitation, next(iter(excitation.releases)))
         else:
             motion = self._response_to_force(excitation, excitation.inputs[0])
+        # vibration about the final position
         last_quarter = motion[-len(motion) // 4 :]
         motion = motion - last_quarter.mean(axis=0)
         frequencies, power = periodogram(
@@ -464,14 +473,15 @@ class IdentifiedFmu(FmuRuns):
                 "in [scales]."
             )
         loudest = frequencies[np.argmax(power.max(axis=1))]
+        # a line at zero is not a vibration: the first frequency above zero is the least
         return 2.0 * np.pi * float(max(frequencies[1], loudest))
 
     def nominal_step_choice(self, trial: Trial) -> StepChoice:
-        """Return the pace in the nominal state: steps do not change while parameters are fitted."""
-        pace: StepChoice = self._paces.get(
+        """Return the step of a trial in the nominal state, kept while parameters are fitted."""
+        step_choice: StepChoice = self._paces.get(
             trial.interval, lambda: self.choose_step(trial, self.nominal_point)
         )
-        return pace
+        return step_choice
 
 
 def recorded_step_count(trial: Trial) -> int:

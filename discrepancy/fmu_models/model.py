@@ -170,15 +170,18 @@ class FmuModel(DescribedModel):
         return largest
 
     def _port_stiffnesses(self, campaign: Campaign, conditions: Conditions) -> list[PortStiffness]:
-        """Return the stiffness of each port, by the linear system if the FMU has one.
+        """Return the modal and the static stiffness of each port.
 
-        Otherwise the static stiffness stands for both.
+        They are those of the linear system in the first dynamic trial, if there is such a trial and
+        the FMU is linear in it. Otherwise the static stiffness is returned as the modal one too.
         """
         static_trial = first_trial(campaign, is_dynamic=False)
         if static_trial is None:
+            # the sampling interval of 1 s has no effect at rest
             static_trial = trial_without_readings(TrialKind.STATIC, 1.0)
         static_state = self._operating_point(static_trial, conditions)
-        compliance = np.diag(self.fmu.port_flexibility(static_state))
+        # displacement of each port under a unit force at this port
+        compliances = np.diag(self.fmu.port_flexibility(static_state))
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
             state = self._operating_point(dynamic_trial, conditions)
@@ -186,7 +189,10 @@ class FmuModel(DescribedModel):
             system = self.fmu.linear_system(excitation)
             if system is not None:
                 return self._stiffnesses_of_system(system)
-        return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
+        return [
+            PortStiffness(1.0 / port_compliance, 1.0 / port_compliance)
+            for port_compliance in compliances.tolist()
+        ]
 
     def _stiffnesses_of_system(self, system: FmuStateSpace) -> list[PortStiffness]:
         """Return the stiffness of each port of a linear system."""
@@ -203,8 +209,8 @@ class FmuModel(DescribedModel):
             return frequency
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
-            state = self._operating_point(dynamic_trial, conditions)
-            return self.fmu.choose_step(dynamic_trial, state).angular_frequency or 1.0
+            operating_point = self._operating_point(dynamic_trial, conditions)
+            return self.fmu.choose_step(dynamic_trial, operating_point).angular_frequency or 1.0
         if campaign.trials:
             return 1.0
         # without a campaign: adapt the sampling interval to the frequency, in three rounds
@@ -303,7 +309,11 @@ class FmuModel(DescribedModel):
     def _loads_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
     ) -> dict[str, FloatArray]:
-        """Return the inputs (N,) that a trial at rest sets in each row."""
+        """Return the FMU inputs in the N rows of a trial at rest: values (N,) by variable name.
+
+        A flight sets only the load factor. Other trials set their recorded inputs with the offsets,
+        and the force at the load place if there is one, or if nothing else is recorded.
+        """
         offsets = conditions.offset or (0.0,) * len(trial.inputs)
         loads: dict[str, FloatArray] = {}
         for recorded, offset in zip(trial.inputs, offsets, strict=True):
@@ -398,7 +408,7 @@ class FmuModel(DescribedModel):
     def _excitation_of_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: PortLaws
     ) -> FmuExcitation:
-        """Return what moves the FMU in a dynamic trial."""
+        """Return the excitation of the FMU in a dynamic trial: a release or a recorded force."""
         state = self._operating_point(trial, conditions, patch)
         if trial.kind is TrialKind.RINGDOWN:
             excitation = self.fmu.excitation_of(trial, state, laws.ports)

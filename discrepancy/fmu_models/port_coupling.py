@@ -97,6 +97,7 @@ class PortCoupling:
         h = self._step
         self._operating_point.q[:] = positions
         self._operating_point.v[:] = speeds
+        # changes of position and speed of the ports under a constant acceleration
         self._steps.increment[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
         self._steps.begin_force[:] = accelerations
         self._steps.end_force[:] = accelerations

@@ -120,7 +120,7 @@ def system_motion(
 
 
 class SystemWithPorts(NamedTuple):
-    """A system whose ports are coordinates beside the state.
+    """A system whose ports are coordinates in addition to its state.
 
     Attributes
     ----------
@@ -160,7 +160,9 @@ def _system_with_ports(
     state_count = len(system.state_matrix)
     port_columns = np.array(columns, dtype=np.int64)[first_laws]
     port_forces = np.array(force_numbers, dtype=np.int64)[first_laws]
-    # rates of ports and state
+    # The state s is the speed of a coordinate: s' = A s + B f is an equation of motion without
+    # stiffness, with the damping -A. A port has the position C s, so that its speed is C A s up to
+    # the forces, and the rate of that speed is C A A s + C A B f.
     port_rates = system.output_matrix[port_columns] @ system.state_matrix
     directions = np.vstack((port_rates @ system.input_matrix, system.input_matrix))
     damping = np.zeros((port_count + state_count, port_count + state_count))

@@ -180,7 +180,10 @@ class FmuVariables:
         return observed
 
     def _expanded_outputs(self, section: FmuOutputSection) -> list[ObservedVariable]:
-        """Return the outputs of a section, one or several, and store the quantity of each."""
+        """Return the observed variables of an output section, and store their quantities.
+
+        A section may stand for several outputs by a pattern in its name and its variable.
+        """
         names = expand(section.name)
         variables = expand(section.variable)
         if len(names) != len(variables):

@@ -126,7 +126,7 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
         power += spectra[1 : power.size + 1].sum(axis=1)
     frequencies = np.arange(1, power.size + 1) / (count * longest.interval)
     peaks = []
-    for index in range(3, power.size - 1):
+    for index in range(3, power.size - 1):  # index 3 is four periods in the record
         frequency = float(frequencies[index])
         is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
         if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
@@ -319,7 +319,7 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
             power += 2.0 * spectra.sum(axis=1) / (weight @ weight)
         power[:4] = 0.0  # less than one period in the record
         index = int(np.argmax(power))
-        choices += length // 2
+        choices += length // 2  # about as many independent frequencies
         # a decaying line must explain at least 5 % more than the best so far
         if power[index] > 1.05 * greatest_power:
             greatest_power = float(power[index])
@@ -416,9 +416,10 @@ class _UsedSamples:
         return np.asarray(block_diag(*np.split(functions, ends[:-1])))
 
     def prediction_features(self, *names: str) -> FloatArray:
-        """Return features of the prediction by name (n, k); zeros in a trial that lacks one.
+        """Return functions of the prediction at the n used samples of all trials, side by side.
 
-        The features are those of `discrepancy.location.map.dependence_functions`.
+        They are zero in a trial that lacks them. The names, such as "x", are those of
+        `discrepancy.location.map.dependence_functions`.
         """
         widths = [
             feature.shape[1]
@@ -435,7 +436,11 @@ class _UsedSamples:
 
 
 def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
-    """Return the functions of each dependence of static readings: on time and load."""
+    """Return the functions of time and of load that static readings may depend on.
+
+    The constant with the time allows for a time scale that begins anywhere. A dependence on the
+    load is proportional (the prediction x and the load) or not (|load| load, load^2).
+    """
     bases: dict[tuple[str, str], FloatArray] = {}
     time = samples.stack_used_samples(lambda fitted: fitted.trial.time)
     if np.ptp(time) > 0.0:
@@ -480,6 +485,7 @@ def _dynamic_bases(
         amplitude = np.abs(motion[:, 0])
         if not amplitude.any():
             continue
+        # equal ratios of amplitude, down to a thousandth of the largest one
         log_amplitude = np.log(np.clip(amplitude / amplitude.max(), 1e-3, None))
         by_amplitude = _hat_functions(log_amplitude, float(log_amplitude.min()), 0.0)
         for name, shapes in (("amplitude", by_amplitude), ("time", by_time)):

@@ -450,7 +450,7 @@ def _dependence_cells(
     cell: Cell,
     noise_freedom: float,
 ) -> Iterator[Cell]:
-    """Yield the cell of a function that residuals may depend on; nothing if the fit absorbed it.
+    """Yield the cell of a function that residuals may depend on, unless the fit absorbed it.
 
     Its value is the correlation coefficient of residuals and function, or the mean residual.
 
@@ -467,7 +467,7 @@ def _dependence_cells(
     cell : Cell
         The cell, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 without one.
+        Degrees of freedom of the channel's noise record; 0 if it has none.
     """
     equations = normal_equations_of(columns, ((fitted, used),), column)
     if equations is None:
@@ -504,7 +504,7 @@ def _variance_cells(
     cell : Cell
         The cell, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 without one.
+        Degrees of freedom of the channel's noise record; 0 if it has none.
     """
     # a bin of few samples is not tested; a whole record is, however short
     least_count = 1 if cell.axis == "whole" else _LEAST_SAMPLES_OF_CELL
@@ -534,7 +534,7 @@ def _frequency_cells(
     template : Cell
         Cell with the names of trial and channel.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 without one.
+        Degrees of freedom of the channel's noise record; 0 if it has none.
     """
     ordinates = periodogram(series)
     if ordinates.size < 4 * BIN_COUNT or noise_freedom <= 0.0:

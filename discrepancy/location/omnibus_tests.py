@@ -100,6 +100,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
     if not p_values_of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
     p_value = noise_tests.combine_p_values(p_values_of_groups)
+    # without a tested record: a p-value that is never the least
     worst = min(records, key=lambda record: record.p_value, default=_RecordVariance("", 2.0))
     if len(records) > 1:
         p_value = min(1.0, 2.0 * min(p_value, len(records) * worst.p_value))
@@ -119,7 +120,10 @@ class _RecordVariance(NamedTuple):
 def _variance_tests_of_records(
     residuals: ResidualSet, channels: Sequence[str]
 ) -> Iterator[_RecordVariance]:
-    """Yield the variance test of each record of channels that share a noise record."""
+    """Yield the variance test of each channel in each trial; the channels share a noise record.
+
+    Records whose residuals have fewer than `LEAST_FREEDOM` degrees of freedom are left out.
+    """
     noise_freedom = residuals.degrees_of_freedom(channels[0])
     for fitted in residuals.trials:
         single_trial = replace(residuals, trials=(fitted,))

@@ -277,6 +277,7 @@ def _known_patterns(
     # the main pattern of the predictions is their first right singular vector
     predictions = []
     for fitted in trials:
+        # deviations from the mean, in units of the noise
         predictions.append((fitted.prediction - fitted.prediction.mean(axis=0)) / noise)
     prediction = np.vstack(predictions)
     _, _, right_vectors = np.linalg.svd(prediction, full_matrices=False)

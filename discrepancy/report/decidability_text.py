@@ -56,14 +56,17 @@ def confused_effects(separability: Separability, name: str) -> list[str]:
 
 
 def group_lines(separability: Separability, hint: str = "the table says to which") -> list[str]:
-    """Return a sentence for each group of effects that look alike, or one that there is none.
+    """Return the sentences on which effects a campaign cannot tell apart.
+
+    There is one sentence for each group of effects that look alike. If there is no group, a single
+    sentence says that all effects can be told apart, or that no effect would change the readings.
 
     Parameters
     ----------
     separability : Separability
         What the campaign can distinguish.
     hint : str
-        Where a reader finds which member is close to which.
+        Phrase that says where the report lists which members of a larger group look alike.
     """
     detectable = [
         detectability
@@ -155,7 +158,7 @@ def _sentence_on_group(
 def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     """Return the sentence on effects that these data show only if they are large.
 
-    Empty without any.
+    It is empty if there are no such effects.
     """
     hidden = [
         detectability
@@ -168,6 +171,7 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     if not hidden:
         return []
     nearest = max(hidden, key=lambda detectability: detectability.distance)
+    # the squared distance grows with the square of the size of an effect
     factor = inf
     if nearest.distance > 0.0:
         factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5

@@ -218,6 +218,7 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
         True to draw the law as well.
     """
     strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
+    # the samples around the largest force, within the record
     first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
     first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
     drawn = slice(first, first + MOST_FORCE_SAMPLES)
@@ -243,13 +244,14 @@ def _draw_over_motion(
     missing : MissingForce
         The missing force.
     motion, series, law : str
-        Names of the arrays of a trial: the motion, the force, and its law (empty for none).
+        Names of the arrays of a trial: of the motion, of the force, and of the force by its law
+        (empty if there is no law).
     samples : slice
         Samples that are drawn.
     """
 
     def joined(name: str) -> FloatArray:
-        """Return an array of all trials that have it."""
+        """Return an array of the trials that have it, joined in their order."""
         arrays = [getattr(course, name) for course in missing.courses]
         return np.concatenate([array[samples] for array in arrays if array is not None])
 
@@ -371,7 +373,7 @@ def _add_figure(
 def _add_residual_figures(
     figures: dict[str, ReportFigure], content: ReportInput, before: ResidualSet
 ) -> None:
-    """Add the figures of residuals, before and after."""
+    """Add the figures of the residuals of the model without and with the added effect."""
     investigation = content.investigation
     after = investigation.after if added_label(investigation) else None
     held_out = [fitted.trial.name for fitted in before.trials if fitted.trial.held_out]

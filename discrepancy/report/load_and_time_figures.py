@@ -147,7 +147,7 @@ def _draw_loads(
 
 
 def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
-    """Draw the windows in time with gaps as bars, a row for each of the records with the largest.
+    """Draw the windows in time in which model and measurements differ, as bars by trial.
 
     Parameters
     ----------
@@ -157,7 +157,8 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     Returns
     -------
     Figure or None
-        The figure with at most `MOST_RECORDS` rows; None if there are no windows.
+        The figure with a row for each of the `MOST_RECORDS` trials with the largest gaps; None if
+        there are no windows.
     """
     if not windows:
         return None

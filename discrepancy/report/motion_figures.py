@@ -45,15 +45,18 @@ class Worst(NamedTuple):
 
 
 def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
-    """Return the dynamic record whose residuals exceed the noise most; None without one."""
+    """Return the dynamic record with the largest rms residual over the noise.
+
+    None if no dynamic trial has a used sample.
+    """
     candidates: list[tuple[float, int, str]] = []
     for index, fitted in enumerate(trials):
         if not fitted.trial.is_dynamic:
             continue
         for name in fitted.trial.channels:
-            size_of_record = rms_over_noise([fitted], name)
-            if np.isfinite(size_of_record):
-                candidates.append((size_of_record, index, name))
+            rms_residual = rms_over_noise([fitted], name)
+            if np.isfinite(rms_residual):
+                candidates.append((rms_residual, index, name))
     if not candidates:
         return None
     _, index, name = max(candidates)
@@ -262,7 +265,7 @@ def _draw_backbone(
     factor: float,
     scale: float,
 ) -> None:
-    """Draw an entry of the backbones of a mode over the amplitude: predicted, and measured.
+    """Draw frequency or damping ratio of a mode over its amplitude, predicted and measured.
 
     Parameters
     ----------
@@ -273,9 +276,9 @@ def _draw_backbone(
     curves : sequence of (DrawnModel, Backbone)
         Models and their predicted backbones.
     name : str
-        Name of the entry.
+        "frequency" or "damping_ratio".
     factor, scale : float
-        Factors from amplitude and entry to the units of the figure.
+        Factors from the amplitude, and from the drawn value, to the units of the figure.
     """
     for drawn, curve in curves:
         axes.plot(
@@ -304,7 +307,7 @@ def _draw_backbone(
 
 def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
     """Limit the vertical axis to the range of the measured values, with a margin."""
-    low, high = np.nanquantile(values, (0.02, 0.98))
+    low, high = np.nanquantile(values, (0.02, 0.98))  # without single outliers
     margin = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
     bottom, top = axes.get_ylim()
     axes.set_ylim(max(bottom, low - margin), min(top, high + margin))

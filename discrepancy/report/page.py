@@ -102,7 +102,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
 
 
 def _with_half_width(value: float, deviation: float) -> str:
-    """Return a value with the half-width of its 90 % interval; "exact" without a deviation."""
+    """Return a value with the half-width of its 90 % interval, or "exact" if its deviation is 0."""
     return plus_minus(value, NINETY * deviation) if deviation > 0.0 else f"{value:.6g}, exact"
 
 
@@ -129,6 +129,7 @@ def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]
     rows = []
     for title, template in WORDS.content["scores"].items():
         rows.append([title, *(fill_cell(template, score=score) for score in scores.values())])
+    # rms of the residuals of each channel, in the unit in which it is drawn
     channels = {} if investigation.before is None else investigation.before.channels
     names = dict.fromkeys(name for score in scores.values() for name in score.rms)
     for name in names:
@@ -141,10 +142,11 @@ def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]
 
 
 def effect_rows(verdict: Verdict) -> list[dict[str, Any]]:
-    """Return a row for each parameter of each effect, by members if the verdict is a group.
+    """Return the rows of the table of effects: one row for each parameter of each effect.
 
-    A row has the number of the member, in its first row only, the effect, and the parameter as
-    `item`.
+    If the verdict is a group of hypotheses that look alike, its members follow one another, and the
+    first row of each has its number as `member`. `item` is the parameter; None if an effect has
+    none.
     """
     rows = []
     members = [*words.group_members(verdict).values()] or [verdict.effects]
@@ -180,7 +182,7 @@ def missing_effects_text(verdict: Verdict) -> str:
 
 
 def sizes_sentence(content: ReportInput) -> str:
-    """Return how large the named effects are, in SI units or by their parameters."""
+    """Return the sentence on the sizes of the named effects, in SI units or by their parameters."""
     investigation = content.investigation
     if content.intervals and investigation.problem is not None and investigation.fit is not None:
         effects = named_effects(investigation.problem, investigation.fit)

@@ -87,7 +87,7 @@ def size_colour_scale(values: Sequence[float] | FloatArray) -> Normalize:
 
 
 def add_size_bar(figure: Figure, norm: Normalize, panels: Sequence[Axes]) -> None:
-    """Draw the colour bar of sizes of residuals beside panels."""
+    """Draw the colour bar of rms residuals to the right of the panels."""
     bar = style.color_bar(
         figure,
         ScalarMappable(norm, style.LEVELS),
@@ -164,7 +164,7 @@ BELOW: dict[str, Any] = {
 
 
 def rms_over_noise(trials: Sequence[FittedTrial], channel: str) -> float:
-    """Return the rms residual of a channel over the noise; nan if no sample is used."""
+    """Return the rms residual of a channel in units of its noise; nan if no sample is used."""
     sum_of_squares = 0.0
     count = 0
     for fitted, column, used in channel_fits(trials, channel):
@@ -198,17 +198,19 @@ def rms_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]
 
 
 def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:
-    """Return the places of channels on the wing: distance from the root [m] and chord fraction.
+    """Return where channels are drawn on the wing: distance from the root [m] and chord fraction.
 
-    Channels without a place are left out.
+    The place that a channel states is taken, else the place of its strain gauge in the design, or
+    the tip if the channel measures the tip displacement. Other channels are left out.
     """
     places: dict[str, tuple[float, float]] = {}
     positions = design.gauges.positions
     for channel in channels:
         gauge = strain_gauge(channel.output)
         if channel.station is not None:
-            chord = 0.4 if channel.chord is None else channel.chord
-            places[channel.name] = (channel.station, chord)
+            # a channel without a chord fraction is drawn at 40 % of the chord
+            chord_fraction = 0.4 if channel.chord is None else channel.chord
+            places[channel.name] = (channel.station, chord_fraction)
         elif 0 <= gauge < len(positions):
             places[channel.name] = positions[gauge]
         elif channel.output == "tip_displacement":

@@ -49,7 +49,7 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
 
 
 def p_value_text(p_value: float) -> str:
-    """Return a p-value."""
+    """Return a p-value as text."""
     if isnan(p_value):
         return "not known"
     return "< 1e-6" if p_value < 1e-6 else f"{p_value:.2g}"
@@ -123,7 +123,10 @@ def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
 
 
 def force_sentence(force: ForceAtPort) -> str:
-    """Return the sentence on a missing force: where, how large, and what its law leaves."""
+    """Return the sentence on a missing force: its port, its size, and what its law leaves.
+
+    It also compares the evidence for the port with that for the second best port.
+    """
     name, displacement_unit, speed_unit = port_motion_units(force)
     evidence = force.evidence[force.port]
     other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
@@ -142,9 +145,10 @@ def force_sentence(force: ForceAtPort) -> str:
 
 
 def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
-    """Return how much of a missing force remains with its law, for fitted and held-out trials.
+    """Return how much of a missing force its law leaves unexplained.
 
-    Only kinds of trials in which the law could be tested are returned, with their names.
+    There is one entry for the fitted trials and one for the held-out trials, named "fitted" and
+    "held-out". An entry is left out if the law could not be tested in these trials.
     """
     if force is None:
         return []
@@ -156,16 +160,20 @@ def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
 
 
 def proof_scores(proof: Proof) -> tuple[Scores, Scores, str]:
-    """Return the scores before and after, and their trials: held-out ones if there are any."""
+    """Return the scores without and with the added effects, and the kind of the scored trials.
+
+    The held-out trials are taken if there are any ("held-out"), else the fitted ones ("fitted").
+    """
     if proof.held_out_before is not None and proof.held_out_after is not None:
         return proof.held_out_before, proof.held_out_after, "held-out"
     return proof.fitted_before, proof.fitted_after, "fitted"
 
 
 def error_sentence(investigation: Investigation) -> str:
-    """Return the sentence on which fraction of the error the effects remove.
+    """Return the sentence that says which fraction of the model's error the added effects explain.
 
-    Empty if nothing was added to the model.
+    If that fraction could not be computed, it is the sentence with the reason. It is empty if
+    nothing was added to the model.
     """
     proof = investigation.proof
     before = investigation.before
@@ -175,6 +183,7 @@ def error_sentence(investigation: Investigation) -> str:
     if proof.closed is None:
         return proof.closed_reason
     is_named = investigation.verdict.kind in NAMING
+    # the clause begins with the subject "it", which is replaced
     predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
     if proof.closed.has_grown:
         subject = "With it" if is_named else "With the best hypothesis, which is no name,"
@@ -184,7 +193,7 @@ def error_sentence(investigation: Investigation) -> str:
 
 
 def noise_levels(proof: Proof) -> tuple[str, str]:
-    """Return the rms of the residuals over the noise, before and after, as texts."""
+    """Return the rms of the residuals over the noise, without and with the effects, as texts."""
     before, after, _ = proof_scores(proof)
     rms_before = number(before.chi_square_per_sample**0.5, 2)
     rms_after = number(after.chi_square_per_sample**0.5, 2)
@@ -192,12 +201,12 @@ def noise_levels(proof: Proof) -> tuple[str, str]:
 
 
 def remainders_sentence(verdict: Verdict) -> str:
-    """Return the sentence on what remains unexplained in which channel; empty if nothing does."""
+    """Return the sentence on what remains unexplained in each channel; empty if nothing does."""
     return WORDS.say("left", remainders=verdict.remainders)
 
 
 def _effects_label(effects: Iterable[tuple[str, str, bool]]) -> str:
-    """Return effects joined by plus signs: their names, places and whether a shape is free."""
+    """Return the label of effects: their names, places and a mark for a free shape, joined by +."""
     labels = []
     for name, place, has_free_shape in effects:
         marks = [place] if place else []

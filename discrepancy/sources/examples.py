@@ -80,9 +80,10 @@ class ExamplePlan:
 
 
 def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
-    """Return the plan of a test of the wing.
+    """Return the plan of a test of the wing, with a channel for each gauge and one for the tip.
 
-    Gauges have noise of 2 microstrain, and the displacement of the tip has noise of 0.05 mm.
+    The gauges have a noise of 2 microstrain, and the displacement of the tip has one of 0.05 mm,
+    both with 200 degrees of freedom. Flights measure the gauges only.
 
     Parameters
     ----------
@@ -306,7 +307,11 @@ def write_example(
 
 
 def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
-    """Return the trials of a kind without readings."""
+    """Return the trials of a kind without readings; one of each kind is held out.
+
+    Static trials load and unload the model in steps of a fifth of the plan's force. Flights take
+    its load factors. Ring-downs are released from its displacement and from fractions of it.
+    """
     if kind is TrialKind.STATIC:
         levels = plan.force * np.arange(6, dtype=np.float64) / 5.0
         return [
@@ -325,6 +330,7 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
     time = plan.interval * samples
     releases = []
+    # each release from a smaller fraction of the plan's displacement; the third is held out
     for number, fraction in enumerate((1.0, 0.7, 0.5, 0.3), start=1):
         releases.append(
             Trial.plain(
@@ -400,6 +406,7 @@ def _simulate_readings(
     """
     conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:
+        # the first entry is the relative deviation of the whole release shape
         initial_modes = conditions.initial.copy()
         initial_modes[0, 0] = trial.release.deviation * generator.normal()
         conditions = Conditions(conditions.parameters, initial_modes, (0.0, 0.0), trial.health)

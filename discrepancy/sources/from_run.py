@@ -140,7 +140,10 @@ def _build_campaign(
     steps: slice,
     held_out_share: float,
 ) -> records.Campaign:
-    """Return some steps of a run as a campaign.
+    """Return some steps of a run as a campaign of one flight, with some of its steps held out.
+
+    The strains are the readings that the twin observed; those that were lost are not used. The
+    health is the twin's smoothed estimate.
 
     Parameters
     ----------
@@ -168,7 +171,7 @@ def _build_campaign(
     noise, source_of_noise = _strain_noise(scenario)
     channels = _strain_channels(observed["sensor"].values.tolist(), noise)
     temperature = _temperature_rises(run, steps)
-    belief = run["smoothed"].to_dataset().sel(step=steps)
+    health_estimate = run["smoothed"].to_dataset().sel(step=steps)
     flight = records.Trial.plain(
         "steps",
         records.TrialKind.FLIGHT,
@@ -179,8 +182,8 @@ def _build_campaign(
         temperature=np.zeros(count) if temperature is None else temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")),
-        health=np.asarray(belief["mean"].values, dtype=float),
-        health_deviation=np.maximum(belief["standard_deviation"].values, HEALTH_DEVIATION),
+        health=np.asarray(health_estimate["mean"].values, dtype=float),
+        health_deviation=np.maximum(health_estimate["standard_deviation"].values, HEALTH_DEVIATION),
     )
     is_held_out = held_out_steps(count, BLOCK, held_out_share)
     trials = [flight.rows(~is_held_out)]
@@ -315,14 +318,14 @@ def _is_calibrated_wing(folder: Path) -> bool:
 
 
 def held_out_steps(count: int, block: int, share: float) -> BoolArray:
-    """Choose the steps to hold out: whole blocks, evenly spread, but never the first block.
+    """Choose the steps of a run to hold out: whole blocks, evenly spread, never the first block.
 
     Parameters
     ----------
     count : int
         Number of steps.
     block : int
-        Steps of a block.
+        Number of steps in a block.
     share : float
         Fraction of the steps that is held out.
 
@@ -333,8 +336,9 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     """
     block_count = count // block
     held_out_count = min(round(share * count / block), block_count - 1)
-    blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
-    return np.isin(np.arange(count) // block, blocks)
+    # n + 1 block numbers from 1 to the last; without the last of them, n are evenly spread
+    held_out_blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
+    return np.isin(np.arange(count) // block, held_out_blocks)
 
 
 # ---------------------------------------------------------------- files of the run folder
@@ -352,7 +356,13 @@ def _read_config(folder: Path) -> dict[str, Any]:
 
 
 def _read_run(folder: Path) -> xr.DataTree:
-    """Return the groups of `run.nc`; refuse a file that lacks something of the run of a wing."""
+    """Return the groups of the file `run.nc`, which a run of the twin of a wing has written.
+
+    Raises
+    ------
+    CampaignFileError
+        If the file is damaged, or lacks a group, the strains or the load factors of such a run.
+    """
     path = folder / RUN_FILE
     try:
         run = read_groups(path)
@@ -360,9 +370,9 @@ def _read_run(folder: Path) -> xr.DataTree:
         raise CampaignFileError(
             f"{cause}: it is not a whole run, resume the run or fly it again."
         ) from cause
-    missing = {"observed", "smoothed", "calibration"} - {*run.children}
-    if missing:
-        groups = ", ".join(sorted(missing))
+    missing_groups = {"observed", "smoothed", "calibration"} - {*run.children}
+    if missing_groups:
+        groups = ", ".join(sorted(missing_groups))
         raise CampaignFileError(f"{path} lacks the groups {groups}: it is no run of a twin.")
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:
@@ -405,9 +415,10 @@ def _strain_noise(scenario: dict[str, Any]) -> tuple[float, str]:
 
 
 def _calibrated_parameter(run: xr.DataTree) -> dict[str, tuple[float, float]]:
-    """Return mean and standard deviation of the calibrated parameter, by its name.
+    """Return the mean and standard deviation of the calibrated parameter, by its name.
 
-    They are those of the draws in the run. The result is empty if there is no such parameter.
+    They are computed from the draws of the calibration in the run. The result is empty if the run
+    has no calibrated parameter, or if all draws are equal.
     """
     name = str(run.attrs.get("parameter", ""))
     draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)

@@ -127,6 +127,9 @@ def _read_numbers(
 def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return the longest free fall in a record of a phone, without `END_CUT` seconds at its ends.
 
+    The accelerometer of a phone in free fall reads nearly zero, as it shows acceleration minus
+    gravity.
+
     Returns
     -------
     time : (N,) ndarray
@@ -141,6 +144,7 @@ def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
     """
     columns = _read_numbers(file, ("time", "x", "y", "z"))
     is_falling = np.abs(columns["z"]) < LARGEST_FALLING_READING
+    # falls begin and end in turn where `is_falling` changes
     edges = np.flatnonzero(np.diff(np.r_[False, is_falling, False].astype(int)))
     begins, ends = edges[::2], edges[1::2]
     if not len(begins):
@@ -187,8 +191,9 @@ def _phone_files(data: Path) -> RigFiles:
 
 
 def _tank_files(data: Path) -> RigFiles:
-    """Return the records of two tanks for estimation and for validation."""
+    """Return the files of two records of two tanks: one for estimation, one for validation."""
     columns = _read_numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
+    # the records have no times: they were sampled every 4 s
     time: FloatArray = 4.0 * np.arange(len(columns["uEst"]), dtype=np.float64)
     tables = {}
     for name, suffix in (("estimation", "Est"), ("validation", "Val")):

@@ -52,6 +52,7 @@ def state_at_first_stamp(
     motions = list(excitation.prescribed_motions.values())
     drive_positions = np.array([float(motion.values_at(first_stamp)[0]) for motion in motions])
     drive_speeds = np.array([float(motion.values_at(first_stamp, 1)[0]) for motion in motions])
+    # modal coordinates and their speeds, those of the drives last
     q = np.zeros(mode_count + len(motions))
     v = np.zeros(mode_count + len(motions))
     memory = None
@@ -67,6 +68,7 @@ def state_at_first_stamp(
         ]
         # an exact zero, since dry friction acts at any other speed
         drive_speeds[np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)] = 0.0
+    # equilibrium under the first loads and the first positions of the drives
     if excitation.begins is Start.SETTLED:
         load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))
         if load.any() or drive_positions.any():
@@ -124,6 +126,7 @@ def released_state(
         moves, point_shape, np.where(point_shape < 0.0, -least_participation, least_participation)
     )
     unit_amplitudes = point.release.displacement / participation
+    # deviations of displacement and speed from the release shape, in units of these amplitudes
     initial_by_mode = np.zeros((len(system.angular_frequency), 2))
     initial_by_mode[: len(excitation.initial)] = excitation.initial[: len(initial_by_mode)]
     relative_displacements, relative_velocities = initial_by_mode.T
@@ -131,6 +134,7 @@ def released_state(
     if point.release.at_rest:
         return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
     frequency = system.angular_frequency
+    # the loads shift the position of rest: a load f has the modal amplitudes shapes.T f / omega^2
     under_load = (first_load @ system.shapes)[0] / frequency**2 if first_load.any() else 0.0
     q = relative_displacements * unit_amplitudes + under_load
     return ReleasedState(InitialMotion(q, relative_velocities * unit_amplitudes * frequency), None)
@@ -159,18 +163,19 @@ def _held_state(
     unit_amplitudes : (M,) array
         Modal amplitudes of the release displacement.
     load : (1, n) array
-        What else acts [N].
+        Sum of the other loads [N].
     """
     row = point.row
     unit_force_displacement = system.apply_flexibility(row)
     compliance = float(row @ unit_force_displacement)
+    # the first entry scales the whole shape, by the holding force
     deviation = displacements * unit_amplitudes
     deviation[0] = 0.0
     holding_force = point.release.displacement * (1.0 + displacements[0]) / compliance
     memory = system.static_path(holding_force * row + load, laws, fixed_row=row, time=0.0).memory
     total_force = holding_force * row + load[0]
     if memory is not None:
-        # Laws move the point back: the holding force grows by what compensates that.
+        # the forces of the laws move the release point back: the holding force compensates that
         law_rows = system.rows_of_laws(laws, 0.0)
         holding_force += (
             float(law_rows @ unit_force_displacement @ memory[:, LAGGED_FORCE]) / compliance

@@ -90,7 +90,7 @@ class Model(ABC):
         return f"the model {self.name!r}"
 
     def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
+        """Return the quantity of an output, or None if the model has no such output."""
         return self.quantities.get(output)
 
     @property
@@ -166,7 +166,7 @@ class Model(ABC):
 
     @property
     def oscillates(self) -> bool:
-        """Whether it has a mode that vibrates."""
+        """Whether the model has a mode that vibrates."""
         return True
 
     # ------------------------------------------------------------ checks
@@ -207,7 +207,7 @@ class Model(ABC):
             )
 
     def check_outputs(self, outputs: Outputs) -> None:
-        """Refuse outputs that the model does not have, or that no channel can measure so."""
+        """Refuse outputs that do not exist, or that a channel of its quantity cannot measure."""
         for output, measured in outputs:
             quantity = self.output_quantity(output)
             if quantity is None:

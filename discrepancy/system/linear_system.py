@@ -51,7 +51,7 @@ class Modes(NamedTuple):
 
 
 class ModalFrequencies(Protocol):
-    """Modes of a structure, as far as their frequencies are asked for."""
+    """The frequencies of the modes of a structure."""
 
     @property
     def frequency(self) -> FloatArray:
@@ -175,13 +175,22 @@ class LinearSystem:
         shapes = np.zeros((self.unknown_count, count + self.state_count))
         shapes[:n, :count] = displacement_shapes
         if self.state_count:
-            capacity, axes = np.linalg.eigh(self.mass[n:, n:])
-            shapes[n:, count:] = axes / np.sqrt(capacity)
+            # states of first order: unit shapes along the principal axes of the capacity matrix
+            capacities, principal_axes = np.linalg.eigh(self.mass[n:, n:])
+            shapes[n:, count:] = principal_axes / np.sqrt(capacities)
         frequency = np.sqrt(np.maximum(squares, 0.0))
         return Modes(np.concatenate((frequency, np.zeros(self.state_count))), shapes, count)
 
     def _displacement_modes(self) -> tuple[FloatArray, FloatArray]:
-        """Return squared angular frequencies (K,) [1/s^2] and shapes (n, K) of displacements."""
+        """Return the modes of the n displacements, with all drives held at zero.
+
+        Returns
+        -------
+        squares : (K,) ndarray
+            Squared angular frequencies [1/s^2].
+        shapes : (n, K) ndarray
+            Mode shapes with a modal mass of 1.
+        """
         n = self.displacement_count
         mass = self.mass[:n, :n]
         stiffness = 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
@@ -202,7 +211,8 @@ class LinearSystem:
                 squares, shapes = eigh(stiffness, mass, subset_by_index=subset)
             except np.linalg.LinAlgError as cause:
                 raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
-        # rigid motions have an eigenvalue of zero, allowed if no spring need hold the system
+        # A rigid motion has the eigenvalue zero, up to rounding. It is allowed only if `mode_count`
+        # is None.
         if self.mode_count is None:
             is_rounding = np.abs(squares) <= ROUNDING * np.max(np.abs(squares), initial=0.0)
             squares = np.where(is_rounding, 0.0, squares)
@@ -247,7 +257,10 @@ class LinearSystem:
 
     @cached_property
     def modal_system(self) -> ModalSystem:
-        """Modes and drives as a modal system with ports; coupling that is rounding is left out."""
+        """The equations of motion in modal coordinates, with drives and ports.
+
+        Without drives, coupling of the modes that is only a rounding error is left out.
+        """
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
         frequency = np.pad(self.angular_frequency, (0, drive_count))

@@ -35,6 +35,7 @@ class LoadChange(NamedTuple):
     @classmethod
     def from_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
         """Return the change of loads by all gains and places of a patch, applied in their order."""
+        # a later gain acts on the load as it is changed so far, thus on earlier tares as well
         change = cls()
         for primitive in patch:
             if isinstance(primitive, LoadGain):

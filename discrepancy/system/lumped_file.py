@@ -155,7 +155,11 @@ class LumpedDescription(ModelDescription):
 
     @cached_property
     def is_structure_on_springs(self) -> bool:
-        """Whether it is a plain structure on springs, without states, drives or controllers."""
+        """Whether the file describes only a structure on springs with forces as inputs.
+
+        It then has no states, constant loads, prescribed motions, damping parts or controllers. Its
+        inputs act along vectors of their own, and its outputs are vectors without a constant.
+        """
         if not self.input or self.free:
             return False
         if self.state_count or self.load or self.damping_part or self.controller:
@@ -217,7 +221,7 @@ class LumpedDescription(ModelDescription):
     # ------------------------------------------------------------ faults of a file
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the contradictions of the file."""
+        """Yield the rules on several tables of the file together, each with its message."""
         yield from self._missing_matrix_faults()
         yield from self._name_faults()
         yield from self._vanishing_matrix_faults()
@@ -239,7 +243,7 @@ class LumpedDescription(ModelDescription):
             )
 
     def _missing_matrix_faults(self) -> Iterator[Fault]:
-        """Yield the faults of required matrices that are missing."""
+        """Yield the rules on which matrices must be given."""
         displacement_count = self.displacement_count
         state_count = self.state_count
         yield (
@@ -256,7 +260,7 @@ class LumpedDescription(ModelDescription):
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
     def _matrix_faults(self, kind: str) -> Iterator[Fault]:
-        """Yield the matrices of a kind with a wrong size, symmetry or definiteness."""
+        """Yield the rules on the size, symmetry and definiteness of the matrices of a kind."""
         block = BLOCKS[kind]
         rows = self.state_count if block.rows_of_states else self.displacement_count
         columns = self.state_count if block.columns_of_states else self.displacement_count
@@ -294,7 +298,11 @@ class LumpedDescription(ModelDescription):
         return kind if kind in KINDS else f"coupling.{kind}"
 
     def _vanishing_matrix_faults(self) -> Iterator[Fault]:
-        """Yield parameters whose `low` of zero leaves no mass, capacity or stiffness."""
+        """Yield the parameters whose lower bound of zero makes a required matrix singular.
+
+        The mass and the capacity must be positive definite, and the stiffness too unless the file
+        states a free structure. The parts that the parameter does not scale must be so alone.
+        """
         needed = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
         for parameter in self.parameter:
             if parameter.low > 0.0:
@@ -318,7 +326,12 @@ class LumpedDescription(ModelDescription):
     def _vector_faults(
         self, kind: str, section: NamedVector | OutputSection | ControllerSection
     ) -> Iterator[Fault]:
-        """Yield vectors of a wrong length, zero ones, and ones of displacements and states."""
+        """Yield the rules on the vectors of a section.
+
+        A vector must have the right length and must not be zero. That of a port or a controller
+        must not read displacements and states at once. The direction `acts` of a port is checked by
+        `_flow_fault`, and a controller must not need an acceleration.
+        """
         n = self.displacement_count
         unknowns = n + self.state_count
         for key in ("vector", "acts", "station_derivative"):
@@ -350,7 +363,11 @@ class LumpedDescription(ModelDescription):
             )
 
     def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
-        """Return the fault of a port whose `acts` takes nothing from the state that it sees."""
+        """Return the rule that a flow at a port of states lowers the reading of the port.
+
+        A unit flow along `acts` changes the states at the rate capacity^-1 acts, and the reading
+        row . states of the port at the rate row . capacity^-1 acts, which must be positive.
+        """
         n = self.displacement_count
         is_of_states = not any(row[:n]) and not any(acts[:n])
         capacity = np.sum([*self.matrices_of("capacity").values()], axis=0)
@@ -362,7 +379,7 @@ class LumpedDescription(ModelDescription):
         )
 
     def _name_faults(self) -> Iterator[Fault]:
-        """Yield names that are there twice, and references to names that are not there."""
+        """Yield the names that occur twice, and the references to names that do not exist."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [section.name for section in getattr(self, kind)] for kind in kinds}
         part_names: list[str] = []
@@ -376,7 +393,7 @@ class LumpedDescription(ModelDescription):
         }
         for kind, kind_names in unique_names.items():
             yield from self.repeated_name_faults(kind, kind_names)
-        # matrices that there are, and what parameters can scale
+        # the matrices of the file, and all that its parameters can scale
         kinds_there = [kind for kind in KINDS if self._has_unknowns_of(kind)]
         matrices = [*kinds_there, *part_names]
         scalable = [*matrices, *names["input"], *names["load"], *names["law"], *names["controller"]]
@@ -396,7 +413,7 @@ class LumpedDescription(ModelDescription):
     def _reference_faults(
         self, kind: str, key: str, verb: str, known_names: Sequence[str]
     ) -> Iterator[Fault]:
-        """Yield what sections of a kind name by a key and what is not known."""
+        """Yield the names that sections of a kind state under a key and that do not exist."""
         listed = ", ".join(known_names) or "none"
         for section in getattr(self, kind):
             for name in as_list(getattr(section, key)):
@@ -406,6 +423,6 @@ class LumpedDescription(ModelDescription):
                 )
 
     def _has_unknowns_of(self, kind: str) -> bool:
-        """Return whether there are unknowns that the rows of a kind of matrix are of."""
+        """Return whether the file has the unknowns (displacements or states) of a kind's rows."""
         count = self.state_count if BLOCKS[kind].rows_of_states else self.displacement_count
         return count > 0

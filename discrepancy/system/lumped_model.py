@@ -109,7 +109,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     @property
     def oscillates(self) -> bool:
-        """Whether it has a mode that vibrates."""
+        """Whether the model has a mode that vibrates."""
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
         return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
@@ -212,7 +212,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return offset_inputs
 
     def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
-        """Return the input of the model that a trial records.
+        """Return the section [[input]] of the model for an input that a trial records.
 
         Raises
         ------
@@ -282,7 +282,11 @@ class LumpedModel(DescribedModel, SystemModel):
     def _vector_equation(
         self, section: OutputSection, vector: Sequence[float], quantity: Quantity
     ) -> OutputEquation:
-        """Return the equation of an output vector . unknowns, differentiated as is wanted."""
+        """Return the equation of an output: vector . unknowns, or the time derivative of it.
+
+        It is differentiated as often as the quantity requires, such as once if the output is a
+        displacement and a channel measures its speed. The derivative has no constant.
+        """
         derivatives = 0
         if quantity is not section.quantity:
             derivatives = quantity.derivatives_of(section.quantity)

@@ -111,7 +111,7 @@ class OutputSection(NamedSection):
     constant: Number = 0.0
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of more than one kind, and of a reaction that is no force."""
+        """Yield the rules on an output: it is of one kind only, and a reaction is a force."""
         kinds = [kind for kind in (self.vector, self.reaction, self.controller) if kind is not None]
         yield (
             len(kinds) != 1,
@@ -153,7 +153,7 @@ class LawSection(Section):
     port: Name
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of a law of an unknown kind, or with numbers that it cannot have."""
+        """Yield the rules on a law: its kind is known, and its numbers are allowed for it."""
         kinds = [law.kind for law in LAWS]
         yield (
             self.kind not in kinds,

@@ -84,6 +84,7 @@ class Motion:
         acceleration = forces - restoring - self.velocity @ modal.damping.T
         if len(self.laws):
             acceleration -= self.port_forces @ self.laws.port_rows(modal.actions, self.q.shape[1])
+        # samples before the release, while the structure is held
         acceleration[: self.held_samples] = 0.0
         return acceleration
 
@@ -207,7 +208,7 @@ def simulate_motion(
 def _motion_from_record(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int
 ) -> Motion:
-    """Return the motion from the first stamp of a record that is no ring-down."""
+    """Return the motion under recorded inputs, from the first time stamp of the record on."""
     times = excitation.sample_times
     first_stamp = float(excitation.time[0])
     begin = state_at_first_stamp(system, excitation, laws)
@@ -307,6 +308,7 @@ def _with_held_samples(
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
+        """Return the row `before` for each held sample, followed by the rows `after`."""
         return np.vstack((np.tile(before, (held_count, 1)), after))[:count]
 
     return ModalMotion(
@@ -339,7 +341,7 @@ def _integrate_from(
     first : float
         Time of the state `begin` [s].
     stamps : (N,) array
-        Times at which the motion is wanted [s].
+        Times at which the motion is computed [s].
     begin : InitialMotion
         The state at `first`.
     refinement : int

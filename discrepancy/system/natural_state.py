@@ -47,6 +47,7 @@ def natural_state_magnitudes(
     for column, equation in enumerate(equations):
         is_used = trial.used[:, column]
         readings = trial.values[is_used, column] - equation.constant
+        # an output with a direct part of a load does not show the state alone
         if equation.feedthrough is not None or not readings.size:
             continue
         largest_reading = float(np.max(np.abs(readings)))

@@ -27,7 +27,7 @@ class GlobalScales(NamedTuple):
 
 
 class LargestMotion(NamedTuple):
-    """Largest magnitudes of displacement [m], speed [m/s] and load [N]; zero without any."""
+    """Largest magnitudes of displacement [m], speed [m/s] and load [N]; zero if there are none."""
 
     displacement: float
     speed: float

@@ -62,7 +62,7 @@ def ported_system(
         :, :displacement_mode_count
     ]
     generator[displacement_mode_count:, displacement_mode_count:] = -by_damping
-    # rows of outputs, with accelerations from the equation of motion
+    # rows of outputs: q'' = M^-1 (-K q - D q' - sum_p acts_p g_p) replaces the accelerations
     output_rows = rows_in_coordinates(equations, shapes)
     of_position = (output_rows.position - output_rows.acceleration @ by_stiffness)[
         :, :displacement_mode_count

@@ -134,7 +134,10 @@ def observe(
 def _find_turned_gauges(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch
 ) -> TurnedGauges:
-    """Return the strain channels, if a patch turns gauges, and the outputs the model has to give.
+    """Return the strain channels of a trial and all outputs that the model has to compute.
+
+    If no primitive of the patch turns gauges, there are no strain channels in the result, and the
+    outputs are those of the channels. Otherwise the transverse and shear strains are added.
 
     Raises
     ------
@@ -176,7 +179,7 @@ def _response_in_clocks(
     model, campaign, trial, patch, conditions
         As in `observe`.
     gauges : TurnedGauges
-        Outputs that are asked of the model.
+        Strain channels, and the outputs that the model computes.
     """
     without_sensors = patch.without(*SENSORS)
     patch_rate, patch_zero = clock_of(patch)
@@ -250,7 +253,10 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
 
 
 def _sensors_by_channel(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
-    """Return sensor primitives by channels: one that names an output, for each of its channels."""
+    """Return sensor primitives that name channels, not model outputs.
+
+    A primitive that names a model output is replaced by one for each channel that measures it.
+    """
     primitives: list[Primitive] = []
     for primitive in sensors:
         name = getattr(primitive, "channel", EVERY_CHANNEL)

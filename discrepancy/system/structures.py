@@ -131,7 +131,7 @@ class StructureModel(SystemModel):
         self.ports = tuple(self.port_rows)
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
-        """Return the rows of the displacements along which a force acts, by name."""
+        """Return the rows (n,) of the displacement outputs along which a force acts, by name."""
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
         unit_loads = [self._unit_load(mean_state, force) for force in self.forces]
         rows: dict[str, FloatArray] = {}
@@ -222,7 +222,7 @@ class StructureModel(SystemModel):
         return self._unit_load(state, LOAD_FACTOR)[None]
 
     def excitation(self, case: PatchedTrial) -> Excitation:
-        """Return what acts in a trial, with constant loads and controls that no trial records."""
+        """Return the excitation of a trial, with the constant loads and unrecorded controls."""
         excitation = super().excitation(case)
         recorded = [name for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls]
         constant_load = self._load_of_controls(case.state, dict.fromkeys(recorded, 0.0))
@@ -232,7 +232,7 @@ class StructureModel(SystemModel):
         return replace(excitation, loads=(*excitation.loads, Load(constant_load, always)))
 
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the structure in a state, in the coordinates of `ReducedStructure`.
+        """Return the linear system in a state, in the coordinates of `ReducedStructure`.
 
         Raises
         ------
@@ -306,7 +306,7 @@ def _cholesky_solver(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray
 
 
 class WingModel(SystemModel):
-    """The wing in the states and under the structural patches that are asked for, each made once.
+    """The model of a wing; its system in each state and under each patch is computed once.
 
     Parameters
     ----------
@@ -391,7 +391,7 @@ class WingModel(SystemModel):
     # ------------------------------------------------------------ outputs, ports and loads
 
     def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if there is no such output."""
+        """Return the quantity of an output, or None if there is no such output."""
         if self._output_row(output) is None:
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
@@ -440,7 +440,7 @@ class WingModel(SystemModel):
         return self.wing.force_row(place, change)
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
-        """Return the parts (2, n) of the lift."""
+        """Return the loads (2, n) of the load factor and of its square."""
         return self.wing.manoeuvre_loads(change)
 
     def distributed_scales(
@@ -454,7 +454,7 @@ class WingModel(SystemModel):
         return {PLANFORM: replace(ports["span"], distribution=distribution)}
 
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the wing in a state."""
+        """Return the linear system of the wing in a state."""
         stiffness_factor, servo_mass, pitot_mass, alpha, beta = state.parameters
         values = np.array((stiffness_factor, *state.losses, servo_mass, pitot_mass, 0.0, 0.0))
         structure = self.wing.structure_at(values, state.structure, state.temperature_rise)

@@ -186,7 +186,7 @@ class SystemModel(Model):
         return PatchedTrial(trial, conditions, patch, state)
 
     def excitation(self, case: PatchedTrial) -> Excitation:
-        """Return what acts in a trial."""
+        """Return the excitation of a trial: its loads and prescribed motions, or its release."""
         trial = case.trial
         initial = case.conditions.initial
         excitation = Excitation(
@@ -211,7 +211,7 @@ class SystemModel(Model):
         )
 
     def excited_system(self, case: PatchedTrial) -> ExcitedSystem:
-        """Return the system that moves in a dynamic trial, and what acts on it."""
+        """Return the linear system in a dynamic trial, and its excitation."""
         excitation = self.excitation(case)
         drives = tuple(excitation.prescribed_motions)
         return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
@@ -248,7 +248,7 @@ class SystemModel(Model):
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
     def _outputs_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
-        """Return what outputs show (N, C) in a static trial, row by row along its load path.
+        """Return the outputs (N, C) in the N rows of a static trial, in the order of its loading.
 
         The order matters: dry friction remembers how the present load was reached.
         """
@@ -422,16 +422,17 @@ class SystemModel(Model):
     def _add_trials(
         self, estimator: PortScaleEstimator, campaign: Campaign, *, is_held: bool
     ) -> LargestMotion:
-        """Add the motions of all trials to an estimator, and return the largest of them.
+        """Add the motions of all trials to an estimator, and return their largest magnitudes.
 
         Parameters
         ----------
         estimator : PortScaleEstimator
-            What collects the motions of the ports.
+            Collects the motions of the ports; changed in place.
         campaign : Campaign
             The campaign.
         is_held : bool
-            Whether springs hold the structure, so that it has displacements at rest.
+            Whether springs hold the structure. Only then static trials and ring-downs are added, by
+            their displacements at rest.
         """
         parameters = self.prior_mean(campaign)
         largest = LargestMotion(0.0, 0.0, 0.0)
@@ -441,6 +442,7 @@ class SystemModel(Model):
                 motion = self._motion_under_inputs(campaign, trial)
                 measured_force = largest_measured_force(campaign, trial)
                 loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                # from modal coordinates (N, M + P) to the displacements of the structure
                 shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
                 largest = LargestMotion(
                     displacement=larger_magnitude(largest.displacement, motion.q @ shapes),
@@ -459,7 +461,8 @@ class SystemModel(Model):
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
         load_row = self.force_row(self.reference or places[0], state)
         participation = float(load_row @ system.shapes[:, 0]) ** 2
-        # mass of the first mode, referred to the load point
+        # Mass of the first mode, referred to the load point: its shape is scaled to a modal mass of
+        # 1, so a unit displacement of the load point needs the modal coordinate 1 / (row . shape).
         modal_mass = 1.0 / participation if participation else float(np.trace(system.mass))
         return GlobalScales(
             stiffness=1.0 / float(load_row @ system.equilibrium_under(load_row[None])[0]),
@@ -489,12 +492,16 @@ class SystemModel(Model):
         return motion
 
     def _static_displacements(self, case: PatchedTrial) -> FloatArray:
-        """Return the displacements (L, N) at rest, or from which a ring-down is released."""
+        """Return the displacements of all unknowns in each row of a static trial.
+
+        For a ring-down there is one row: the displacements from which the structure is released.
+        """
         system = self.system_in_state(case.state)
         excitation = self.excitation(case)
         if excitation.release is None:
             directions, levels = excitation.load_levels
             return np.asarray(levels @ system.equilibrium_under(directions))
+        # shape under a force at the release point, scaled to the displacement of that point
         row = excitation.release.row
         shape = system.equilibrium_under(row[None])
         displacement = excitation.release.release.displacement
@@ -507,7 +514,7 @@ def _depends_on_temperature(patch: ModelPatch) -> bool:
 
 
 def _is_moved_by_inputs(trial: Trial) -> bool:
-    """Return whether a trial is a motion under recorded inputs, and no release or rest."""
+    """Return whether a trial is a motion under recorded inputs, not a release or at rest."""
     return trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN
 
 

@@ -56,7 +56,7 @@ class LoadsAndMotions(NamedTuple):
 
 
 class ExcitedSystem(NamedTuple):
-    """The system that moves in a dynamic trial, and what acts on it."""
+    """The linear system of a dynamic trial, and its excitation."""
 
     system: LinearSystem
     excitation: Excitation

@@ -14,7 +14,7 @@ from fe.runtime.expression import Expression
 
 SMOOTH_PARTS = 8
 """Time steps in a sampling interval if an input is a spline. Straight lines over these steps
-approximate it to 1e-6 of its size."""
+approximate the spline to 1e-6 of its amplitude."""
 
 
 class LoadHistory(Protocol):
@@ -70,8 +70,19 @@ class RecordedHistory:
         return recorded
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return values (N,) at times, or a time derivative; at a jump, that of just before it."""
+        """Return the values (N,) at times [s], or a time derivative of them.
+
+        If a value or slope jumps at a time, the one just before the jump is returned.
+
+        Parameters
+        ----------
+        time : (N,) ndarray
+            Times [s].
+        derivative : int
+            Order of the time derivative. Without a smooth course it is 0 or 1.
+        """
         if self.hold is Hold.SMOOTH:
+            # a load keeps its first and last value outside of the record; a motion goes on
             is_load = self.motion_order is None
             inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
             return np.asarray(self._spline(inside, derivative))
@@ -80,10 +91,11 @@ class RecordedHistory:
         if derivative == 0:
             step_values = self.values
         else:
-            # the slopes of the straight lines between the samples
+            # slopes of the straight lines between the samples; zero after the last sample, by a
+            # rise of zero over an infinite interval
             rises = np.diff(self.values, append=self.values[-1])
             step_values = rises / np.diff(self.time, append=np.inf)
-        # at a jump the value before it is wanted: look it up slightly earlier
+        # the last sample before each time; slightly earlier, because times at a jump are rounded
         just_before = time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time)
         next_sample = np.searchsorted(self.time, just_before)
         return np.asarray(step_values[np.maximum(next_sample - 1, 0)])
@@ -138,12 +150,12 @@ def equivalent_ramps(
     begin, end : (K, ...) arrays
         The values of the lines at the start and at the end of each step.
     """
-    middle = 0.5 * (time[1:] + time[:-1])
+    middle_time = 0.5 * (time[1:] + time[:-1])
     half_step = 0.5 * np.diff(time)
     # The two points lie at a distance of half_step / sqrt(3) from the middle, so that a line rises
     # over half a step by sqrt(3) / 2 times its rise between them.
-    at_first_point = values_at(middle - half_step / sqrt(3.0))
-    at_second_point = values_at(middle + half_step / sqrt(3.0))
+    at_first_point = values_at(middle_time - half_step / sqrt(3.0))
+    at_second_point = values_at(middle_time + half_step / sqrt(3.0))
     mean = 0.5 * (at_first_point + at_second_point)
     half_rise = 0.5 * sqrt(3.0) * (at_second_point - at_first_point)
     return mean - half_rise, mean + half_rise
