@@ -55,7 +55,7 @@ class ModesSection(Section):
     identification: what changes between records, and the error of the model."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: bands, numbers and features."""
+        """Yield (is present, message) of each possible fault: bands, numbers and features."""
         has_empty_band = any(high <= low for low, high in self.bands)
         yield (
             has_empty_band,
@@ -247,7 +247,7 @@ class ObservationSection(Section):
         return 1.0, self.sensor_units
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: numbers of values."""
+        """Yield (is present, message) of each possible fault: numbers of values."""
         for key in ("unit", "standard_deviation", "titles"):
             value = getattr(self, key)
             # No titles at all, an empty tuple, are as right as one for each sensor.

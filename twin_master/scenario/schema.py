@@ -161,7 +161,7 @@ class Scenario(ScenarioTables):
         return self.model_dump(mode="json")
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: tables that do not fit."""
+        """Yield (is present, message) of each possible fault: tables that do not fit."""
         yield from self._control_faults()
         yield from self._action_faults()
         yield from self._growth_faults()
@@ -172,7 +172,7 @@ class Scenario(ScenarioTables):
         yield from self._mode_faults()
 
     def _reference_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names of references."""
+        """Yield (is present, message) of each possible fault: names of references."""
         names = [entry.figure for entry in self.reference]
         for name in names:
             yield unknown_name_fault(

@@ -79,7 +79,7 @@ class Transition(Section):
     def faults_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names and tables.
+        """Yield (is present, message) of each possible fault: names and tables.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class Transition(Section):
     def _probability_faults(
         self, controls: tuple[str, ...], states: tuple[str, ...]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names of probabilities."""
+        """Yield (is present, message) of each possible fault: names of probabilities."""
         key = "transition.probability"
         yield incomplete_table_fault(self.probability, controls, key, "control")
         for control, probability in self.probability.items():
@@ -111,7 +111,7 @@ class Transition(Section):
     def _table_faults(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names and rows of tables."""
+        """Yield (is present, message) of each possible fault: names and rows of tables."""
         yield incomplete_table_fault(self.tables, controls, "transition.tables", "control")
         for control, tables in self.tables.items():
             key = f"transition.tables.{control}"
@@ -153,7 +153,7 @@ class Span(Section):
     last_step: Step | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: an early end."""
+        """Yield (is present, message) of each possible fault: an early end."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
             ends_early,
@@ -186,7 +186,7 @@ class SensorFault(Span):
     rate: Number | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: span and rate."""
+        """Yield (is present, message) of each possible fault: span and rate."""
         yield from super().faults()
         needs_rate = self.kind == "drift"
         has_rate = self.rate is not None
@@ -226,7 +226,7 @@ class TruthSection(Section):
     """How the record of each step is made, if modes are observed."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: keys of another kind."""
+        """Yield (is present, message) of each possible fault: keys of another kind."""
         is_inside_asset = self.kind == "asset"
         has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
         if self.record is not None:
@@ -290,7 +290,7 @@ class Action(Section):
     """Whether the mission ends with that step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: readings and effect."""
+        """Yield (is present, message) of each possible fault: readings and effect."""
         inspects = bool(self.inspects)
         has_deviation = self.standard_deviation is not None
         yield (
@@ -340,7 +340,7 @@ class Planner(Section):
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: keys of another policy."""
+        """Yield (is present, message) of each possible fault: keys of another policy."""
         yield (
             self.limit_probability is not None and self.policy != "belief",
             "`planner.limit_probability` needs `planner.policy` `belief`",
@@ -419,7 +419,7 @@ class Learning(Section):
     not learnt."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: transition factors."""
+        """Yield (is present, message) of each possible fault: transition factors."""
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)
