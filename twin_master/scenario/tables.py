@@ -29,14 +29,14 @@ ROW_SUM_TOLERANCE = 1e-12
 
 
 class FigureGroup(NamedTuple):
-    """A group of figures of the summary, as `figures.toml` has it.
+    """A group of figures of the summary, whose names and titles are in `figures.toml`.
 
     Attributes
     ----------
     name : str
-        The table of `figures.toml`.
+        The name of the group's table in `figures.toml`.
     fields : dict of str to str
-        What stands in the braces in the names of its figures.
+        The texts that replace the fields in braces in the names of the figures.
     """
 
     name: str
@@ -123,6 +123,7 @@ class Transition(Section):
                     has_other_size,
                     f"`{key}.{state}` must be {size} rows of {size} probabilities",
                 )
+                # how far the worst row is from a sum of 1
                 departure = max(abs(sum(row) - 1.0) for row in rows)
                 yield (
                     departure > ROW_SUM_TOLERANCE,
@@ -352,15 +353,16 @@ class Planner(Section):
 
 
 def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the table of a scenario in which each action is a control as well.
+    """Return the table of a scenario with a further control for each action.
 
-    The action has the values, the probabilities and, less its cost, the reward of its control. A
-    malformed table is returned as it is: the schema refuses it with a sentence.
+    This control has the input values and probabilities of the action's base control. Its reward is
+    lower by the cost of the action. A malformed table is returned unchanged, and the schema refuses
+    it later.
 
     Parameters
     ----------
     table : mapping
-        The table of a scenario with actions, as the file has it.
+        The table of a scenario with actions, as in the file; it is not changed.
     """
     extended = deepcopy(dict(table))
     try:
@@ -372,7 +374,10 @@ def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
-    """Add a control, its reward and its probabilities for an action; those that exist stay."""
+    """Add a control, its reward and probabilities for an action to a scenario's table, in place.
+
+    Entries of that name are kept: the user gave them, or the table was extended before.
+    """
     name = action["name"]
     base_name = action["control"]
     controls = {control["name"]: control for control in table["control"]}
@@ -381,12 +386,14 @@ def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
         table["control"].append(controls[base_name] | {"name": name, "title": title})
 
     rewards = table["rewards"]
-    # With a weight of 0 costs have no meaning; the schema refuses them.
+    # The planner multiplies the reward by the weight, so that the cost is divided by it. With a
+    # weight of 0 a cost has no effect; the schema refuses it.
     weight = rewards.get("control_weight", 1.0) or 1.0
     rewards["control"].setdefault(name, rewards["control"][base_name] - action["cost"] / weight)
 
     transition = table["transition"]
     truth = table.get("truth", {})
+    # the probabilities of the control on which the action is based
     for values_by_control in (
         transition.get("probability"),
         transition.get("tables"),
@@ -430,7 +437,7 @@ class Learning(Section):
         )
 
     def figure_groups(self) -> list[FigureGroup]:
-        """Return the groups of figures on what is learnt beside the parameter."""
+        """Return the groups of figures on all learnt quantities except the parameter."""
         groups = []
         if self.transition_factors:
             groups.append(FigureGroup("learnt", {"quantity": "transition_factor"}))
