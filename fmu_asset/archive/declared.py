@@ -236,8 +236,8 @@ class FmuDescription(FmuIdentity):
     path : Path
         The FMU file.
     shown_as : str
-        The name of the FMU in messages, where that is not the path: the FMU of an SSP file lies in
-        a temporary folder.
+        The name of the FMU in messages; empty if that is the path. The FMU of an SSP file needs a
+        name, as it lies in a temporary folder.
     sha256 : str
         The hash of the file.
     file_size : int
@@ -263,8 +263,8 @@ class FmuDescription(FmuIdentity):
     fixed_step : float or None
         The internal step size that FMI 3 declares [s].
     can_interpolate_inputs : bool
-        Whether inputs can move in straight lines between communication points: in model exchange,
-        and where co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
+        Whether inputs can change linearly between communication points. This is so in model
+        exchange, and in co-simulation if the FMU declares `canInterpolateInputs` (FMI 1 and 2).
     """
 
     path: Path

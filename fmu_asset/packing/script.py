@@ -50,7 +50,7 @@ def build_script_fmu(
     ----------
     script : path-like
         A Python file with one subclass of pythonfmu's `Fmi2Slave`. It may use the standard library
-        and what is installed where the FMU runs.
+        and the packages that are installed on the machine that runs the FMU.
     path : path-like
         Where to write, with the suffix .fmu.
     replace : bool

@@ -293,7 +293,7 @@ class AssetSource:
         return FlownAndBelieved(self.description, self.description, self.differ)
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws of the parameter come from, in words, and their number."""
+        """Return the origin of the parameter's draws, in words, and their number."""
         calibration = self._scenario.calibration
         return calibration.source.replace("_", " "), calibration.draw_count
 
@@ -475,7 +475,7 @@ class PairedSource(AssetSource):
         return self._asset.open()
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws of the believed model come from, in words, and their number."""
+        """Return the origin of the believed model's draws, in words, and their number."""
         return self._believed.draw_summary()
 
     def draws(self, seed: int) -> ParameterDraws:

@@ -30,15 +30,15 @@ class ParameterDraws:
     Attributes
     ----------
     name : str
-        The parameter.
+        The name of the parameter.
     values : (E,) array
-        The draws, SI.
+        The E draws, SI.
     mean, standard_deviation : float
-        Those of the distribution that was drawn from.
+        The moments of the distribution from which the draws were taken, SI.
     source : str
-        Where the distribution comes from.
+        The origin of the distribution, in words.
     record : mapping or None
-        The whole calibration as plain data.
+        The whole calibration as plain data; None if the scenario states the distribution.
     others : mapping of str to (E,) array
         The expectation of each other calibrated parameter at each draw, SI.
     """

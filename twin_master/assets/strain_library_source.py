@@ -39,7 +39,7 @@ REGION_NAMES = ("z1", "z2")
 PERCENT = 1e-2
 MICROSTRAIN = 1e-6
 _MEAN_ENTRY = "mean"
-"""Key of the strains at the mean of Young's modulus, beside those of the draws."""
+"""Key of the strains at the mean of Young's modulus; the other keys are the draws."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ class StrainLibrarySource(AssetSource):
             )
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws come from, in words, and their number."""
+        """Return the origin of the parameter's draws, in words, and their number."""
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
