@@ -105,7 +105,10 @@ class VariableInfo:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The declared range, within the range of the type: C would wrap what does not fit."""
+        """The least and largest value: the declared range, limited to that of the type.
+
+        In C, an integer beyond the range of its type would wrap around.
+        """
         low, high = self._bounds_of_type()
         if self.minimum is not None:
             low = max(low, self.minimum)
@@ -129,14 +132,15 @@ class VariableInfo:
         return "" if self.unit in (None, "1") else f" {self.unit}"
 
     def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
-        """Return the variable with the shape that other values of structural parameters give it.
+        """Return the variable with its array resized by new values of structural parameters.
 
-        A start value that all elements share holds for the new elements too.
+        If all elements have the same start value, the new elements have it as well.
 
         Parameters
         ----------
         lengths : mapping of str to int
-            The values of structural parameters, by name.
+            The new values of structural parameters, by name. A parameter without an entry keeps its
+            value.
 
         Raises
         ------
@@ -154,7 +158,7 @@ class VariableInfo:
 
     @property
     def numeric(self) -> bool:
-        """Whether its values are numbers."""
+        """Whether the values of the variable are numbers."""
         return self.kind in NUMERIC_KINDS
 
     @property
@@ -166,12 +170,12 @@ class VariableInfo:
 
     @property
     def single(self) -> bool:
-        """Whether it is a single number at any time: not a text, an array or a clocked variable."""
+        """Whether the variable always has one number: it is no text, array or clocked variable."""
         return self.numeric and not self.shape and not self.clocked
 
     @property
     def is_text_parameter(self) -> bool:
-        """Whether it is a parameter with one text as its value."""
+        """Whether the variable is a parameter with one text as its value."""
         is_one_value = not self.shape and not self.clocked
         return self.kind == "String" and self.causality == "parameter" and is_one_value
 
@@ -182,13 +186,13 @@ class VariableInfo:
 
     @property
     def startable(self) -> bool:
-        """Whether it is an output or local variable whose start value initialisation may set."""
+        """Whether the start value of an output or local variable can be set at initialisation."""
         is_result = self.causality in ("output", "local")
         return is_result and self.variability != "constant" and self.start is not None
 
     @property
     def continuous(self) -> bool:
-        """Whether it is a real number that may change at any time."""
+        """Whether the variable is a real number that may change at any time."""
         return self.kind in FLOAT_KINDS and self.variability == "continuous"
 
 
@@ -232,8 +236,8 @@ class FmuDescription(FmuIdentity):
     path : Path
         The FMU file.
     shown_as : str
-        The name of the FMU in messages, where that is not the path: the FMU of an SSP file lies in
-        a temporary folder.
+        The name of the FMU in messages; empty if that is the path. The FMU of an SSP file needs a
+        name, as it lies in a temporary folder.
     sha256 : str
         The hash of the file.
     file_size : int
@@ -259,8 +263,8 @@ class FmuDescription(FmuIdentity):
     fixed_step : float or None
         The internal step size that FMI 3 declares [s].
     can_interpolate_inputs : bool
-        Whether inputs can move in straight lines between communication points: in model exchange,
-        and where co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
+        Whether inputs can change linearly between communication points. This is so in model
+        exchange, and in co-simulation if the FMU declares `canInterpolateInputs` (FMI 1 and 2).
     """
 
     path: Path
@@ -306,15 +310,17 @@ class FmuDescription(FmuIdentity):
         return self._variable_by_name.get(name)
 
     def hint(self, name: str) -> str:
-        """Return the end of a message on an unknown name: the most similar variable, if any."""
+        """Return the end of a message on an unknown name: the most similar name, or a full stop."""
         similar = get_close_matches(name, [variable.name for variable in self.variables], 1)
         return f"; did you mean {similar[0]!r}?" if similar else "."
 
     @cached_property
     def feedthrough(self) -> dict[str, frozenset[str]]:
-        """For each variable that can be read, the inputs that it depends on directly.
+        """The inputs on which each variable depends directly, by the name of the variable.
 
-        An output without declared dependencies depends on all inputs, as FMI says.
+        Only variables that can be the source of a connection have an entry.
+
+        According to FMI, an output without declared dependencies depends on all inputs.
         """
         names = [variable.name for variable in self.variables if variable.causality == "input"]
         all_inputs = frozenset(names)
@@ -339,12 +345,12 @@ class FmuDescription(FmuIdentity):
         Returns
         -------
         float or None
-            The step size [s]; None if neither the user nor the FMU says one.
+            The step size [s]; None if neither the user nor the FMU states one.
 
         Raises
         ------
         BindingError
-            If it is not a positive number.
+            If the given step size is not a positive number.
         """
         if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
             raise BindingError(
@@ -353,7 +359,7 @@ class FmuDescription(FmuIdentity):
         return step_size or self.fixed_step or self.step_size
 
     def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
-        """Return the definitions of units that hold for a variable."""
+        """Return the unit definitions that apply to a variable: in one FMU, all of them."""
         return self.units
 
     def exchange_kind(self, variable: VariableInfo) -> str:
@@ -364,7 +370,7 @@ class FmuDescription(FmuIdentity):
 
 
 def checked_shape(name: str, shape: Sequence[int]) -> tuple[int, ...]:
-    """Return the shape of an array; refuse one that would fill the memory."""
+    """Return the shape of an array; refuse negative lengths and too many elements."""
     if any(length < 0 for length in shape) or math.prod(shape) > _MOST_ARRAY_ELEMENTS:
         lengths = " x ".join(str(length) for length in shape)
         raise FmuInputError(

@@ -29,8 +29,9 @@ from .declared import FmuDescription
 from .model_description import FmuFileFacts, read_declared
 
 LARGEST_EXTRACTED_BYTES = 4 * 1024**3
-"""The largest FMU that is extracted; some of hundreds of megabytes exist."""
+"""Largest size of the extracted files of an FMU [bytes]. FMUs of hundreds of megabytes exist."""
 
+# An archive made to fill the disk ("zip bomb") has a far larger ratio than any real file.
 _LARGEST_COMPRESSION_RATIO = 200
 _ANY_RATIO_UP_TO_BYTES = 256 * 1024**2
 _MOST_ENTRIES = 100_000
@@ -60,7 +61,12 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     path : path-like
         The FMU.
     interface : {"co-simulation", "model-exchange"}, optional
-        The interface to be used; by default co-simulation where the FMU offers it.
+        The interface to be used; by default co-simulation if the FMU offers it.
+
+    Returns
+    -------
+    FmuDescription
+        The declarations of the FMU.
 
     Raises
     ------
@@ -87,7 +93,7 @@ def inspect_fmu(
     path : path-like
         The FMU.
     interface : {"co-simulation", "model-exchange"}, optional
-        The interface to be used; by default co-simulation where the FMU offers it.
+        The interface to be used; by default co-simulation if the FMU offers it.
 
     Returns
     -------
@@ -105,10 +111,12 @@ def inspect_fmu(
         If the FMU is not of FMI 1, 2 or 3, or does not offer the interface.
     """
     file = Path(path)
+    # the archive
     size, sha256 = _size_and_hash(file)
     entry_names = check_archive(file, size)
     if "modelDescription.xml" not in entry_names:
         raise FmuFileError(_missing_description_sentence(file, entry_names))
+    # the model description: first safely by this module, then by fmpy
     root = _parsed_model_description(file)
     version = root.get("fmiVersion") or ""
     if version not in ("1.0", "2.0") and not version.startswith("3."):
@@ -132,6 +140,7 @@ def inspect_fmu(
             f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
             "function; the FMU is damaged or unsafe."
         )
+    # the binary for this platform; FMI 3 has other names of platforms than FMI 1 and 2
     platform_folder = platform_tuple if description.major_version == 3 else fmi_platform
     file_name = f"{description.model_identifier}{sharedLibraryExtension}"
     binary = f"binaries/{platform_folder}/{file_name}"
@@ -141,7 +150,7 @@ def inspect_fmu(
 
 
 def _platforms(entry_names: set[str]) -> tuple[str, ...]:
-    """Return the names of the folders that hold binaries, such as linux64."""
+    """Return the names of the platforms for which an FMU has binaries, such as linux64."""
     platforms = set()
     for name in entry_names:
         if re.match(r"binaries/[^/]+/.+", name):
@@ -150,7 +159,7 @@ def _platforms(entry_names: set[str]) -> tuple[str, ...]:
 
 
 def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
-    """Return the message on an archive in which modelDescription.xml is not where FMI has it."""
+    """Return the message that an archive has no modelDescription.xml in its top folder."""
     lacking = f"{file} is an archive without modelDescription.xml"
     if "./modelDescription.xml" in entry_names:
         return f"{lacking}, but with './modelDescription.xml': {_PACK_WITHOUT_DOT}"
@@ -166,7 +175,7 @@ def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
 def _missing_binary_sentence(
     file: Path, entry_names: set[str], binary: str, platforms: tuple[str, ...]
 ) -> str:
-    """Return the message on an FMU whose binary for this platform is not where FMI has it.
+    """Return the message that an FMU lacks the binary for this platform, or misnames it.
 
     Parameters
     ----------
@@ -177,7 +186,7 @@ def _missing_binary_sentence(
     binary : str
         The name that the binary should have.
     platforms : tuple of str
-        The platforms that it has binaries for.
+        The platforms for which the FMU has binaries.
     """
     if f"./{binary}" in entry_names:
         return f"{file} has no binary {binary}, but one named './{binary}': {_PACK_WITHOUT_DOT}"
@@ -205,12 +214,12 @@ def extract_fmu(description: FmuDescription) -> Path:
     Parameters
     ----------
     description : FmuDescription
-        The FMU; the file must not have changed since it was read.
+        The FMU as `read_fmu` returned it. The file must not have changed since.
 
     Returns
     -------
     Path
-        The folder; the caller removes it.
+        The folder, which the caller must remove.
 
     Raises
     ------
@@ -266,9 +275,14 @@ def check_archive(
     size : int
         Its size [bytes].
     archive_kind : str
-        What the archive should be, for the message.
+        The kind of file that the archive should be, for the message.
     remedy : str
-        How a user makes it again, as a verb for the message.
+        The verb for how a user makes the file again, for the message: "build".
+
+    Returns
+    -------
+    set of str
+        The names of the files in the archive, without its folders.
 
     Raises
     ------
@@ -312,7 +326,10 @@ def _check_extracted_size(file: Path, size: int, entries: list[zipfile.ZipInfo])
 
 
 def _check_duplicate_entries(file: Path, archive: zipfile.ZipFile) -> None:
-    """Refuse unequal entries of one name: readers of archives differ in which one they take."""
+    """Refuse two entries of the same name with different content.
+
+    Programs that read archives differ in which of the two they take.
+    """
     first_entries: dict[str, zipfile.ZipInfo] = {}
     for entry in archive.infolist():
         first_entry = first_entries.setdefault(entry.filename, entry)
@@ -363,7 +380,10 @@ class _NoDocumentTypeBuilder(TreeBuilder):
 
 
 def _parsed_model_description(file: Path) -> Element:
-    """Return the XML of the model description; refuse entities, which can grow or read files."""
+    """Return the XML of the model description; refuse entities.
+
+    Entities can be nested until they fill the memory, or include files of this machine.
+    """
     try:
         with zipfile.ZipFile(file) as archive:
             entry = archive.getinfo("modelDescription.xml")
@@ -377,7 +397,7 @@ def _parsed_model_description(file: Path) -> Element:
         if root.tag != "fmiModelDescription":
             raise FmuFileError(f"begins with <{root.tag}>; it is damaged")
     except (ParseError, ValueError, LookupError, zipfile.BadZipFile, OSError) as error:
-        # FmuFileError is a ValueError, too; raised above, it holds the end of the sentence below.
+        # An FmuFileError, which is a ValueError, was raised above with the end of this message.
         unread = f"cannot be read ({error})"
         reason = error.sentence if isinstance(error, FmuFileError) else unread
         raise FmuFileError(f"The model description of {file} {reason}.") from error
@@ -385,12 +405,12 @@ def _parsed_model_description(file: Path) -> Element:
 
 
 def design_record(design_hash: str) -> bytes:
-    """Return the content of `DESIGN_RECORD`, which tells later which design an FMU was made of."""
+    """Return the content of the file `DESIGN_RECORD`, which records the design of an FMU."""
     return (json.dumps({"design_hash": design_hash}) + "\n").encode()
 
 
 def packed_design_hash(path: str | os.PathLike[str]) -> str:
-    """Return the hash of the design that an FMU of ours was made of; empty if the FMU has none."""
+    """Return the hash of the design from which an FMU was built; empty if the FMU records none."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"resources/{DESIGN_RECORD}") as file:
             design_hash = json.loads(file.read(_LARGEST_DESIGN_RECORD_BYTES))["design_hash"]

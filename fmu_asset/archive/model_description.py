@@ -24,7 +24,10 @@ _XML_TRUE = ("true", "1")
 
 
 class FmuFileFacts(NamedTuple):
-    """What is known of an FMU file without its model description; see `FmuDescription`."""
+    """The facts about an FMU file that its model description does not declare.
+
+    The attributes are those of `FmuDescription`.
+    """
 
     path: Path
     sha256: str
@@ -35,18 +38,24 @@ class FmuFileFacts(NamedTuple):
 def read_declared(
     declared: ModelDescription, root: Element, file: FmuFileFacts, interface: Interface | None
 ) -> FmuDescription:
-    """Return the description of an FMU from what fmpy has read of it.
+    """Return the declarations of an FMU as the records of this package.
 
     Parameters
     ----------
     declared : fmpy.model_description.ModelDescription
-        The model description, read by fmpy; corrected here where fmpy misses something.
+        The model description as fmpy has read it. It is changed: missing ranges are added and
+        inverse display units removed.
     root : Element
-        The XML of the model description, for what fmpy leaves out.
+        The XML of the model description, for the declarations that fmpy does not read.
     file : FmuFileFacts
         Path, hash, size and platforms of the file.
     interface : {"co-simulation", "model-exchange"} or None
-        The interface to be used; by default co-simulation where the FMU offers it.
+        The interface to be used; if it is None, co-simulation if the FMU offers it.
+
+    Returns
+    -------
+    FmuDescription
+        The declarations.
 
     Raises
     ------
@@ -101,7 +110,10 @@ def read_declared(
 def _offered_interfaces(
     declared: ModelDescription, file: Path, wanted: Interface | None
 ) -> dict[Interface, CoSimulation | ModelExchange]:
-    """Return what an FMU declares of each interface that it offers, co-simulation first."""
+    """Return fmpy's record of each interface that an FMU offers, co-simulation first.
+
+    An FMU without interfaces, or without the wanted one, is refused.
+    """
     offered: dict[Interface, CoSimulation | ModelExchange] = {}
     if declared.coSimulation is not None:
         offered["co-simulation"] = declared.coSimulation
@@ -134,7 +146,7 @@ def _capabilities(
     root: Element,
     interface: Interface,
 ) -> _Capabilities:
-    """Return the capabilities of an interface that fmpy does not read for FMI 1."""
+    """Return the capabilities of an interface, which fmpy does not read for FMI 1."""
     can_vary_step = getattr(declared_interface, "canHandleVariableCommunicationStepSize", True)
     declares_interpolation = getattr(declared_interface, "canInterpolateInputs", False)
     can_interpolate = interface == "model-exchange" or declares_interpolation
@@ -150,7 +162,7 @@ def _capabilities(
 
 
 def _read_missing_ranges(declared: ModelDescription, root: Element) -> None:
-    """Add the ranges of unsigned integers, which fmpy 0.3.32 does not read."""
+    """Add the ranges of unsigned integers to fmpy's records, as fmpy 0.3.32 does not read them."""
     elements = {}
     for element in root.iterfind("ModelVariables/*"):
         if element.tag.startswith("UInt"):
@@ -162,9 +174,10 @@ def _read_missing_ranges(declared: ModelDescription, root: Element) -> None:
 
 
 def _remove_inverse_display_units(declared: ModelDescription, root: Element) -> None:
-    """Remove display units of FMI 3 that show one over the value, as s of Hz.
+    """Remove inverse display units of FMI 3 from fmpy's records.
 
-    fmpy does not read that they are inverse, and a linear conversion would be wrong.
+    They display the reciprocal of a value, such as a frequency in Hz as a period in s. fmpy does
+    not read this property, and its linear conversion would be wrong.
     """
     elements = root.iterfind(".//DisplayUnit[@inverse='true']")
     inverse_names = {element.get("name") for element in elements}
@@ -191,7 +204,7 @@ def _optional_number(record: object, attribute: str) -> float | None:
 
 
 def _variable_info(declared: ScalarVariable, dependencies: tuple[str, ...] | None) -> VariableInfo:
-    """Return a variable that fmpy has read, completed by its declared type."""
+    """Return the record of a variable; units and limits that it lacks are those of its type."""
     declared_type = declared.declaredType
     unit_owner = declared_type if declared.unit is None else declared
     display_owner = declared_type if declared.displayUnit is None else declared
@@ -225,7 +238,7 @@ def _variable_info(declared: ScalarVariable, dependencies: tuple[str, ...] | Non
 
 
 def _unit_info(declared: Unit) -> UnitInfo:
-    """Return a unit definition that fmpy has read."""
+    """Return the record of a unit definition."""
     displays = []
     for display in declared.displayUnits:
         displays.append(

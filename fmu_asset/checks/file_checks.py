@@ -11,7 +11,7 @@ from reporting.units import meaning_of
 from .finding import CheckResult, Finding
 
 _MOST_NAMES = 5
-"""Names that a sentence lists."""
+"""The largest number of names that a message lists."""
 _PYTHON_MEMBERS = {"resources/start.json", "resources/reduced_model.npz"}
 """Members of a Python FMU of a wing or structure that we have packed."""
 _COMPILED_MEMBERS = {"resources/reduced_model.bin", "sources/structure_variables.h"}
@@ -19,12 +19,12 @@ _COMPILED_MEMBERS = {"resources/reduced_model.bin", "sources/structure_variables
 
 
 def check_file(description: FmuDescription) -> Iterator[Finding]:
-    """Yield the findings about the file of an FMU.
+    """Yield the findings of the checks that read an FMU's file without running the FMU.
 
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The declarations of the FMU, whose path names the file.
     """
     checks: dict[str, Callable[[FmuDescription], list[CheckResult]]] = {
         "archive": _check_archive,
@@ -39,10 +39,12 @@ def check_file(description: FmuDescription) -> Iterator[Finding]:
 
 
 def _listed(names: list[str]) -> str:
+    """Return the first names of a list, for a message."""
     return ", ".join(names[:_MOST_NAMES])
 
 
 def _check_archive(description: FmuDescription) -> list[CheckResult]:
+    """Report version, interfaces, variables and platforms; `read_fmu` has checked the archive."""
     interfaces = " and ".join(description.interfaces)
     platforms = ", ".join(description.platforms)
     text = (
@@ -53,8 +55,8 @@ def _check_archive(description: FmuDescription) -> list[CheckResult]:
 
 
 def _check_schema(description: FmuDescription) -> list[CheckResult]:
-    """Check the model description by fmpy."""
-    # here, since it needs a grammar parser and an XML schema, which others should not load
+    """Check the model description against the XML schema and the rules of FMI, by fmpy."""
+    # Imported here, as it loads a grammar parser and an XML schema that nothing else needs.
     from fmpy.validation import validate_fmu
 
     problems = validate_fmu(str(description.path))
@@ -65,7 +67,10 @@ def _check_schema(description: FmuDescription) -> list[CheckResult]:
 
 
 def _check_content(description: FmuDescription) -> list[CheckResult]:
-    """Compare the GUID of a wing or structure FMU of ours with its content."""
+    """Check that a wing or structure FMU from this package is unchanged since its build.
+
+    Its GUID is the hash of its content. Other FMUs give no result.
+    """
     with zipfile.ZipFile(description.path) as archive:
         members = set(archive.namelist())
     if not (members >= _PYTHON_MEMBERS or members >= _COMPILED_MEMBERS):
@@ -88,7 +93,10 @@ def _check_content(description: FmuDescription) -> list[CheckResult]:
 
 
 def _check_units(description: FmuDescription) -> list[CheckResult]:
-    """Check that real variables have units that are known and mean what is usual."""
+    """Check that real variables have units that can be converted and have their usual meaning.
+
+    Time, the independent variable, is left out.
+    """
     reals = [
         variable
         for variable in description.variables

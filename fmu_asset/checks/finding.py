@@ -40,7 +40,7 @@ class CheckResult(NamedTuple):
 
 
 def one_line(error: FmuError) -> str:
-    """Return an error of an FMU, with the FMU's last message, in one line."""
+    """Return the message of an error and the last message of the FMU, as one line of text."""
     text = error.sentence
     if error.messages:
         text += f" The FMU says: {error.messages[-1]}"

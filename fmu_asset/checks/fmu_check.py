@@ -1,4 +1,4 @@
-"""The check of an FMU: rules of the standard, rules of ours, and its behaviour."""
+"""The check of an FMU: rules of the FMI standard, rules of this package, and its behaviour."""
 
 import os
 from dataclasses import dataclass
@@ -33,12 +33,12 @@ class FmuCheck:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """One sentence for each problem; empty if nothing is wrong."""
+        """The messages of the findings that are problems; empty if there are none."""
         return tuple(finding.text for finding in self.findings if finding.verdict == "problem")
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no problem; warnings are allowed."""
         return not self.problems
 
 
@@ -59,7 +59,7 @@ def check_fmu(
     path : path-like
         Any FMU.
     binding : Binding or path-like, optional
-        How it is run; drafted from the model description if absent.
+        The binding with which the FMU is run; by default it is drafted from the model description.
     cycles : int
         Number of instances that are made and freed one after the other in one process; 0 skips
         that check.
@@ -70,10 +70,15 @@ def check_fmu(
     progress : Progress, optional
         Where progress is shown.
 
+    Returns
+    -------
+    FmuCheck
+        The findings. A binding that does not fit the FMU is a finding, not an error.
+
     Raises
     ------
     FmuFileError, FmuUnsupportedError
-        If there is no FMU to check.
+        If the file is missing, damaged or not an FMU that can run here.
     BindingError
         If the binding file cannot be read.
     """
@@ -95,7 +100,7 @@ def check_fmu(
             text = f"{binding.name} fits."
         findings.append(Finding("binding", "ok", text))
         findings += runs.findings(cycles, reporter(progress))
-    # names of an FMU may hold control characters
+    # Names in an FMU may contain control characters, which a terminal would obey.
     printable = tuple(
         Finding(entry.check, entry.verdict, visible(entry.text)) for entry in findings
     )
@@ -103,19 +108,22 @@ def check_fmu(
 
 
 def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
-    """Return a binding of the whole FMU, with the FMU's end unless the checks run beyond it.
+    """Return a binding of the whole FMU, drafted from its model description.
+
+    It has the stop time of the FMU's default experiment, unless the steps of the checks would run
+    beyond that time.
 
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The declarations of the FMU.
     step_size : float or None
         Communication step size [s]; the FMU's own if None.
 
     Raises
     ------
     BindingError
-        If the FMU has no number to observe.
+        If the FMU has no numeric output to observe, or the step size is not positive.
     """
     binding = whole_binding(description, step_size=step_size)
     end = description.stop_time

@@ -1,4 +1,4 @@
-"""Checks of an FMU's behaviour: it runs repeatedly, resumed, at other steps, and at the edges."""
+"""Checks that run an FMU: repetition, resuming, step size, limits of inputs, reset and memory."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -21,17 +21,20 @@ from reporting.progress import Progress
 from .finding import CheckResult, Finding, one_line
 
 RUN_STEPS = 6
-"""Steps of a run."""
+"""Number of communication steps of a run."""
 _STEPS_BEFORE_SAVING = 2
+"""Number of steps after which the state is saved."""
 _EQUAL = 1e-9
 """Largest change of the outputs with half the step that counts as none, as a fraction of the
 largest output."""
 _CLOSE = 0.02
-"""Change above which a smaller step is advised."""
+"""Change with half the step, as a fraction of the largest output, above which a smaller step is
+advised."""
 _FAR = 0.5
-"""Change above which the FMU probably counts steps instead of time."""
+"""Change with half the step, as a fraction of the largest output, above which the FMU probably
+counts steps instead of time."""
 _LARGEST_TRIED_LIMIT = 1e9
-"""Magnitude from which a limit of a range is taken for no limit, and not tried."""
+"""Magnitude of a range's limit from which it is taken as unlimited, and not tried."""
 _KIBIBYTE = 1024
 _SMALL_GROWTH = 1.0
 """Largest growth of memory for each instance that is no leak [KiB]; allocators keep some memory."""
@@ -73,12 +76,14 @@ class RunChecks:
         self._binding = binding
         self._step_timeout = step_timeout
         self._memory_limit = memory_limit
-        # fails if the binding does not fit, before anything is started
+        # An asset checks the binding against the FMU when it is made, before a worker is started.
         self._description = self._asset(binding).description
         self._base_inputs = self._inputs_without_start_values()
 
     def findings(self, cycles: int, progress: Progress) -> Iterator[Finding]:
-        """Yield all findings; without a successful first run the other checks are skipped.
+        """Run the FMU once, then make all checks, and yield a finding for each.
+
+        If the first run fails, the other checks are skipped.
 
         Parameters
         ----------
@@ -127,16 +132,19 @@ class RunChecks:
         )
 
     def _inputs_without_start_values(self) -> RunInputs:
-        """Return zeros for resized arrays whose start values no longer fit, by role and name.
+        """Return zeros for the input arrays whose start values do not fit their length, by role.
 
-        Structural parameters of the binding change the sizes of arrays, but not their start values.
+        Structural parameters that the binding sets change the length of an array, but not the
+        number of its declared start values.
         """
         zeros: RunInputs = {role: {} for role in INPUT_ROLES}
+        # Without structural parameters all start values fit.
         if not self._binding.binding.structural_parameters:
             return zeros
         for role in INPUT_ROLES:
             for name, input_binding in self._binding.inputs(role).items():
                 selection = self._find_input(role, name, input_binding)
+                # One start value holds for all elements.
                 start_count = len((selection.variable.start or "0").split())
                 if start_count not in (1, selection.variable.size):
                     zeros[role][name] = [0.0] * len(selection.elements)
@@ -147,21 +155,21 @@ class RunChecks:
         return find_variable(self._description, input_binding.variable, f"{role}.{name}", "input")
 
     def _run(self) -> Float:
-        """Return the outputs (N, n) of a run from the start values, in a new worker."""
+        """Return the n outputs in each of N steps of a run, (N, n), in a new worker."""
         with closing(self._asset()) as asset:
             return self._run_from_start(asset)
 
     def _run_from_start(self, asset: FmiAsset) -> Float:
-        """Return the outputs (N, n) of an asset after a reset to its start values."""
+        """Reset an asset to its start values; return its n outputs in each of N steps, (N, n)."""
         asset.reset(**self._base_inputs)
         return _outputs_of_steps(asset, RUN_STEPS)
 
     # ------------------------------------------------------------------ checks
 
     def _check_sandbox(self) -> CheckResult:
-        """Run once more, and count the system calls that the sandbox refuses.
+        """Run once more, and report the system calls that the sandbox refuses.
 
-        A run that fails is counted up to its failure.
+        If the run fails, the calls before the failure are reported.
         """
         if not (self._binding.limits.sandbox and landlock_version()):
             text = "There is no sandbox: the binding turns it off, or the kernel has none."
@@ -184,7 +192,7 @@ class RunChecks:
         return CheckResult("problem", text)
 
     def _check_state(self) -> CheckResult:
-        """Check that a run can be resumed from a saved state in a new process."""
+        """Check that a run equals one that is resumed from a saved state in a new process."""
         steps_after = RUN_STEPS - _STEPS_BEFORE_SAVING
         with closing(self._asset()) as asset:
             asset.reset(**self._base_inputs)
@@ -192,9 +200,9 @@ class RunChecks:
             state = asset.save_state()
             method = asset.state_method
             expected = _outputs_of_steps(asset, steps_after)
-        with closing(self._asset()) as other:
-            other.restore_state(state)
-            resumed = _outputs_of_steps(other, steps_after)
+        with closing(self._asset()) as resumed_asset:
+            resumed_asset.restore_state(state)
+            resumed = _outputs_of_steps(resumed_asset, steps_after)
         if resumed.tobytes() != expected.tobytes():
             cause = "its outputs are not a function of its inputs"
             if method == "serialised":
@@ -214,18 +222,19 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_step_size(self) -> CheckResult:
-        """Check how much the outputs change with half the step size."""
+        """Check how much the outputs change with half the step size, at the same times."""
         header = self._binding.binding
         half_step = header.step_size / 2.0
-        # Twice the decimation keeps the times of the outputs.
+        # The decimation is the number of steps between two outputs: doubled, it keeps their times.
         binding = self._binding.with_header(step_size=half_step, decimation=2 * header.decimation)
         with closing(self._asset(binding)) as asset:
             try:
                 outputs = self._run_from_start(asset)
             except FmuCallError as error:
                 return self._refused_step(half_step, error)
-        largest = max(float(np.abs(self._first_outputs).max(initial=0.0)), 1e-300)
-        change = float(np.abs(outputs - self._first_outputs).max(initial=0.0)) / largest
+        # The change as a fraction of the largest output; 1e-300 avoids a division by zero.
+        largest_output = max(float(np.abs(self._first_outputs).max(initial=0.0)), 1e-300)
+        change = float(np.abs(outputs - self._first_outputs).max(initial=0.0)) / largest_output
         if change <= _EQUAL:
             return CheckResult("ok", "Half the step size gives the same outputs.")
         advice = ""
@@ -259,7 +268,7 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_range_edges(self) -> CheckResult:
-        """Check that the FMU takes each limit of the range of each scalar input, in one step."""
+        """Make one step at each limit of the range of each scalar input, and report failures."""
         limit_count = 0
         failures = []
         with closing(self._asset()) as asset:
@@ -284,13 +293,13 @@ class RunChecks:
         return CheckResult("skipped", "No input has a range.")
 
     def _step_with(self, asset: FmiAsset, role: str, name: str, value: float) -> None:
-        """Make the first step of a run with a given value of one input."""
+        """Reset an asset, and make one step with the given value of one input."""
         inputs = self._base_inputs | {role: self._base_inputs[role] | {name: value}}
         asset.reset(**self._base_inputs)
         asset.step(**inputs)
 
     def _check_reset(self) -> CheckResult:
-        """Check that a run after a reset equals the first one, and that the reset works."""
+        """Check that a run after a second reset equals the first, and that the FMU can be reset."""
         with closing(self._asset()) as asset:
             outputs = self._run_from_start(asset)
             outputs_again = self._run_from_start(asset)
@@ -330,7 +339,7 @@ class RunChecks:
         except FmuError as error:
             text = f"Instance {number + 1} of {cycles} in one process: {one_line(error)}"
             return CheckResult("problem", text)
-        # only the second half counts, since the first may fill caches
+        # Only the growth in the second half counts: in the first, the FMU may fill caches.
         growth = memory_at_end - memory_half_way
         growth_of_each = growth / _KIBIBYTE / max(cycles - half_of_cycles, 1)
         text = (
@@ -345,7 +354,7 @@ class RunChecks:
 
 
 def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
-    """Return the outputs (N, n) of N further steps with unchanged inputs."""
+    """Make N further steps with unchanged inputs, and return the n outputs of each, (N, n)."""
     rows = []
     for _ in range(steps):
         observation = asset.step()
@@ -354,8 +363,8 @@ def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
 
 
 def _first_difference(first: Float, second: Float) -> str:
-    """Return a text with the first values that differ between two arrays of equal shape."""
-    # compare bits, since 0.0 and -0.0 are equal numbers
+    """Return the first values that differ between two arrays of equal shape, for a message."""
+    # Compare bits, since 0.0 and -0.0 are equal numbers.
     differs = first.ravel().view(np.uint64) != second.ravel().view(np.uint64)
     position = np.flatnonzero(differs)[0]
     return f"first ({float(first.flat[position])!r}), then ({float(second.flat[position])!r})"

@@ -1,4 +1,4 @@
 """FMUs that fly beside the wing: the damage that grows, and the gauges that read its strains."""
 
 COMPANION_NAMES = ("damage_growth", "strain_gauges")
-"""What can be packed; see `fmu_asset.companions.build`."""
+"""The names of the companions; `fmu_asset.companions.build` packs them."""

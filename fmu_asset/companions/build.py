@@ -31,12 +31,12 @@ def load_contents(resources):
 
 
 def companion_bytes(name: str) -> bytes:
-    """Return a companion of the wing as the content of an FMU file.
+    """Pack a companion of the wing as an FMU, and return the bytes of the FMU file.
 
     Parameters
     ----------
     name : str
-        One of `COMPANION_NAMES`.
+        The name of the companion, one of `COMPANION_NAMES`.
     """
     folder = files("fmu_asset.companions")
     description = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
@@ -50,6 +50,7 @@ def companion_bytes(name: str) -> bytes:
         resources={"variables.json": variables.encode()},
         host="It runs in any Python host; the standard library is enough.",
     )
+    # the Python file with the behaviour
     packed_folder = f"resources/{name}_{PLACEHOLDER}_runtime/companions"
     members[f"{packed_folder}/__init__.py"] = b'"""The behaviour of the FMU."""\n'
     members[f"{packed_folder}/{name}.py"] = (folder / f"{name}.py").read_bytes()
@@ -57,16 +58,18 @@ def companion_bytes(name: str) -> bytes:
 
 
 def companion_declaration(name: str, description: Mapping[str, Any]) -> Declaration:
-    """Return the declaration of a companion, from the content of its TOML file.
+    """Return the model name, variables and dependencies of a companion from its TOML file.
 
     Parameters
     ----------
     name : str
         The model name.
     description : mapping
-        The TOML file: `description`, and `group`, a list of tables with `variables` and `repeat`. A
-        variable has the keys of `VariableTable.add`, with `low` and `high` for its range; an output
-        may name the input that it depends on directly as `of`.
+        The content of the TOML file: a text `description`, and a list of tables `group`. The
+        variables of a group are declared `repeat` times (by default once), with the number of the
+        repetition in the place of `{n}` in their texts. A variable has the keys of
+        `VariableTable.add`, with `low` and `high` for its range. An output may name the input on
+        which it depends directly by the key `of`.
     """
     table = VariableTable({})
     dependencies: dict[str, list[str]] = {"status": []}
@@ -81,24 +84,25 @@ def companion_declaration(name: str, description: Mapping[str, Any]) -> Declarat
 def _add_variable(
     table: VariableTable, dependencies: dict[str, list[str]], row: Mapping[str, Any], number: int
 ) -> None:
-    """Add a variable to the table, and its direct dependency if it is an output.
+    """Add a variable to the table, and if it is an output, its direct dependency.
 
     Parameters
     ----------
     table : VariableTable
-        The variables so far.
+        The variables so far; the variable is added.
     dependencies : dict of str to list of str
-        The inputs that each output depends on directly.
+        The inputs on which each output depends directly, by the name of the output; an entry is
+        added for an output.
     row : mapping
-        The variable in the TOML file.
+        The keys of the variable in the TOML file.
     number : int
-        The number that stands for `{n}` in its texts.
+        The number that replaces `{n}` in the texts of the variable.
     """
-    keys: dict[str, Any] = {}
+    attributes: dict[str, Any] = {}
     for key, value in row.items():
-        keys[key] = value.format(n=number) if isinstance(value, str) else value
-    source = keys.pop("of", None)
-    value_range = (keys.pop("low", None), keys.pop("high", None))
-    table.add(**keys, limits=value_range)
-    if keys["causality"] == "output":
-        dependencies[keys["name"]] = [] if source is None else [source]
+        attributes[key] = value.format(n=number) if isinstance(value, str) else value
+    input_name = attributes.pop("of", None)
+    value_range = (attributes.pop("low", None), attributes.pop("high", None))
+    table.add(**attributes, limits=value_range)
+    if attributes["causality"] == "output":
+        dependencies[attributes["name"]] = [] if input_name is None else [input_name]

@@ -1,8 +1,8 @@
-"""The parts that all FMUs built here have in common.
+"""The parts that all FMUs built by this package have in common.
 
-The files of an FMU are first written with a placeholder wherever its content hash will stand
-(identifier, GUID, module names). The hash is taken over them, and then takes the place of the
-placeholder.
+The identifier, the GUID and the module names of an FMU contain a hash of its content. The files are
+therefore first written with a placeholder in the place of the hash. The hash of these files then
+replaces the placeholder.
 """
 
 import os
@@ -21,7 +21,8 @@ from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes, hash_members, read_members
 
 PYTHONFMU_VERSION = "0.7.0"
-"""The only version whose wrapper these FMUs were tried with; its conventions are not public."""
+"""The only version of pythonfmu with whose binaries these FMUs were tested; what these binaries
+expect of a script is not a public interface."""
 
 BASE_CLASS_FILES = (
     "_version.py",
@@ -31,7 +32,7 @@ BASE_CLASS_FILES = (
     "logmsg.py",
     "variables.py",
 )
-"""Files of pythonfmu that its base class needs."""
+"""The files of pythonfmu that its base class for slaves needs."""
 
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 
@@ -39,7 +40,8 @@ _GUID_PATTERNS = {
     "modelDescription.xml": ('guid="{}"', 'instantiationToken="{}"'),
     "sources/structure_variables.h": ('STRUCTURE_GUID "{}"',),
 }
-"""Texts in which the placeholder stands for the GUID; elsewhere it stands for the tag."""
+"""For each file, the texts in which the placeholder stands for the GUID. Everywhere else it stands
+for the tag."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class ContentIdentity(NamedTuple):
     Attributes
     ----------
     tag : str
-        The first characters of the content hash, which end the names in the FMU.
+        The first characters of the content hash, which are added to identifiers in the FMU.
     guid : str
         The GUID of the FMU.
     """
@@ -98,20 +100,20 @@ def checked_target(
     suffix: str = ".fmu",
     error: type[FmuError] = FmuBuildError,
 ) -> Path:
-    """Return the path at which an FMU, or a file with another suffix, may be written.
+    """Check that a file may be written to a path, and return the path.
 
     Parameters
     ----------
     path : path-like
-        Where to write.
+        The path of the file to write.
     replace : bool
         Whether an existing file may be replaced.
     file_kind : str
-        What is written, with its article, for the message.
+        The kind of the file, with its article, for the message: "An FMU".
     suffix : str
         The suffix that the path must have.
     error : type of FmuError
-        The error to raise.
+        The class of the error to raise.
 
     Raises
     ------
@@ -130,18 +132,19 @@ def checked_target(
 
 
 def write_fmu(target: Path, fmu: SealedFmu, design_hash: str = "") -> FmuInfo:
-    """Write an FMU to a file, whole or not at all, and return what was written."""
+    """Write an FMU to a file, completely or not at all; return its path, GUID, hash and size."""
     atomic_write_bytes(target, fmu.content)
     return FmuInfo(path=target, guid=fmu.guid, design_hash=design_hash, size=len(fmu.content))
 
 
 def check_start_values(table: Iterable[FmuVariable]) -> None:
-    """Refuse variables whose start value lies outside their range; raises `FmuBuildError`."""
+    """Raise `FmuBuildError` if the start value of a variable lies outside its range."""
     for variable in table:
         low = -float("inf") if variable.minimum is None else variable.minimum
         high = float("inf") if variable.maximum is None else variable.maximum
         if variable.start is None or low <= variable.start <= high:
             continue
+        # Tunable variables are those of effects; all others belong to the reduced model.
         if variable.variability == "tunable":
             range_and_remedy = "that number of an effect; correct the patch"
         else:
@@ -163,7 +166,7 @@ def pythonfmu_version() -> str:
     Raises
     ------
     FmuBuildError
-        If there is none, or another one than `PYTHONFMU_VERSION`.
+        If pythonfmu is not installed, or its version is not `PYTHONFMU_VERSION`.
     """
     try:
         installed = version("pythonfmu")
@@ -178,12 +181,12 @@ def pythonfmu_version() -> str:
 
 
 def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the files of pythonfmu that an FMU contains, by their names in the archive.
+    """Return the binaries, Python files and licence of pythonfmu, by their names in the archive.
 
     Parameters
     ----------
     module : str
-        The FMU's identifier, also the name of its binaries and of the script that they load.
+        The identifier of the FMU. It is also the name of the binaries and of the script they load.
     folder : str
         The folder of the archive for the Python files.
     names : iterable of str
@@ -194,7 +197,8 @@ def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[st
     FmuBuildError
         If a file is missing from the installation.
     """
-    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
+    # Take the installed package and not the imported one: an FMU that runs in this process may have
+    # imported its own copy of pythonfmu.
     package_folder = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
     binaries = package_folder / "resources" / "binaries"
     linux_binary = (binaries / "linux64/libpythonfmu-export.so").read_bytes()
@@ -211,13 +215,16 @@ def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[st
 
 
 def package_members(package: str, folder: str) -> dict[str, bytes]:
-    """Return all Python files of a package of the project, by their names in the archive.
+    """Return all Python files of a package of this project, by their names in the archive.
+
+    In the archive, the package `fe.runtime` is called `fe` and lies in the same folder as the other
+    packages. Imports from `fe.runtime` are therefore changed to relative ones.
 
     Parameters
     ----------
     package : str
-        A package that imports nothing of the project but itself, packages packed beside it by `..`,
-        and `fe.runtime`, which is packed beside it as `fe`.
+        A package that imports from this project only itself, `fe.runtime`, and packages that are
+        packed into the same folder, by relative imports with `..`.
     folder : str
         The folder of the archive for the package.
     """
@@ -245,16 +252,16 @@ def python_members(
     resources: Mapping[str, bytes],
     host: str = "It runs in a Python host that has NumPy.",
 ) -> dict[str, bytes]:
-    """Return the files of a Python FMU, with the placeholder wherever the content hash will stand.
+    """Return the files of a Python FMU, with the placeholder in the place of the content hash.
 
     Parameters
     ----------
     declaration : Declaration
-        The model.
+        The model name, variables and dependencies.
     class_name : str
-        The name of the class in the FMU's script, to which the tag is added.
+        The name of the slave class in the FMU's script, to which the tag is added.
     imports : str
-        Lines that import `load_contents` into the package that the FMU brings.
+        Python lines that import or define the function `load_contents`, which reads the resources.
     resources : mapping of str to bytes
         The files that `load_contents` reads, by name.
     host : str
@@ -289,16 +296,18 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Return an FMU whose tag and GUID follow from its content.
+    """Replace the placeholder in the files of an FMU by their hash, and pack them into an archive.
 
-    The hash is over names and contents of the files, the placeholder standing for the hash itself.
+    The hash is taken over the names and contents of the files with the placeholder, so that equal
+    files give equal bytes.
 
     Parameters
     ----------
     template : mapping of str to bytes
         The files by name, with the placeholder.
     make_binaries : callable, optional
-        Makes further files from the files and the tag; they are not part of the hash.
+        A function that makes further files from the files with their hash, and the tag. These files
+        are not part of the hash.
     """
     content_hash = hash_members(template)
     tag = content_hash[: len(PLACEHOLDER)]
@@ -321,16 +330,17 @@ def with_identity(
     old, new : ContentIdentity
         The tag and GUID in the files, and those to be written instead.
     """
-    renamed = {}
+    renamed_members = {}
     for name, content in members.items():
-        text = content
+        new_content = content
         if name.endswith(_TEXT_SUFFIXES):
+            # The GUID is first: in a template it is the same placeholder as the tag.
             for pattern in _GUID_PATTERNS.get(name, ()):
                 old_guid, new_guid = pattern.format(old.guid), pattern.format(new.guid)
-                text = text.replace(old_guid.encode(), new_guid.encode())
-            text = text.replace(old.tag.encode(), new.tag.encode())
-        renamed[name.replace(old.tag, new.tag)] = text
-    return renamed
+                new_content = new_content.replace(old_guid.encode(), new_guid.encode())
+            new_content = new_content.replace(old.tag.encode(), new.tag.encode())
+        renamed_members[name.replace(old.tag, new.tag)] = new_content
+    return renamed_members
 
 
 # ---------------------------------------------------------------- scripts

@@ -1,7 +1,7 @@
-"""Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
+"""Patch files: physical effects that a model lacks, to be added to an FMU.
 
-A patch file says which physical effects a model lacks. It may hold more (posterior, data hash);
-what is read here, in the names of `discrepancy.files.verdict` or in shorter ones, is
+An effect has an id and a list of primitives, which are elementary changes of the model or of a
+sensor. A patch file may contain more, such as a posterior and a data hash. This module reads
 
 ```json
 {"schema": "uav-twin patch 2",
@@ -9,7 +9,8 @@ what is read here, in the names of `discrepancy.files.verdict` or in shorter one
  ...}]}], "channels": {"g17": "strain[17]"}}
 ```
 
-where `id` may also be called `identifier`, and `primitives` `patch`.
+where `channels` gives the output of the FMU for each channel. The key `id` may also be called
+`identifier`, and `primitives` may be called `patch`.
 """
 
 from __future__ import annotations
@@ -59,11 +60,11 @@ _REASONS_WITHOUT_MEANING = {
     RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
     "sensor_drift with exponent 0",
 }
-"""For kinds of primitives that mean nothing in an FMU, the reason."""
+"""The kinds of primitives that have no meaning in an FMU, each with the reason."""
 
 
 class PatchFileEffect(NamedTuple):
-    """An effect of a patch file: an identifier, and the changes of the model that it stands for."""
+    """An effect of a patch file: an identifier, and its changes of the model and the sensors."""
 
     id: str
     patch: ModelPatch
@@ -76,9 +77,9 @@ class PatchFile:
     Attributes
     ----------
     effects : tuple of PatchFileEffect
-        The effects in the order of the file; an id that comes again has `_2`, `_3`, ... appended.
+        The effects in the order of the file. The later ones of a repeated id get `_2`, `_3`, ...
     channels : mapping of str to str
-        The names of outputs by the names of channels.
+        The output of the FMU for each channel, by the name of the channel.
     """
 
     effects: tuple[PatchFileEffect, ...]
@@ -86,12 +87,12 @@ class PatchFile:
 
     @property
     def patch(self) -> ModelPatch:
-        """All effects together."""
+        """The changes of all effects in one patch."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
 
     @property
     def of_structure(self) -> PatchFile:
-        """The patch without the changes of sensors, which do not act on the structure."""
+        """The effects on structure and loads, without the changes of sensors."""
         effects = []
         for effect in self.effects:
             structural_patch = effect.patch.without(*SENSORS)
@@ -105,7 +106,7 @@ class PatchFile:
         return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
     def for_gauges(self, gauge_count: int, patch_label: str = "The patch") -> PatchFile:
-        """Return the patch with the names of outputs in the place of channels.
+        """Return the patch with each channel replaced by the name of an output of the FMU.
 
         Parameters
         ----------
@@ -132,12 +133,14 @@ class PatchFile:
     def _with_output(
         self, primitive: Primitive, outputs: Sequence[tuple[str, str]], effect_label: str
     ) -> Primitive:
-        """Return a primitive whose channel is an output of the FMU.
+        """Return a primitive with its channel replaced by the name of an output of the FMU.
+
+        A primitive for every channel is returned unchanged.
 
         Parameters
         ----------
         primitive : Primitive
-            A change of the model, or of a sensor.
+            An elementary change of the model, or of a sensor.
         outputs : sequence of (str, str)
             Name and quantity of each output of the FMU.
         effect_label : str
@@ -185,7 +188,7 @@ def _check_meaning_in_fmu(primitive: Primitive, label: str) -> None:
 
 
 def _listed_outputs(outputs: Sequence[tuple[str, str]]) -> str:
-    """Return the names of outputs for a message, the gauges as a range."""
+    """Return the names of outputs for a message; the strain gauges are shortened to a range."""
     gauges = [name for name, quantity in outputs if quantity == "strain"]
     names = [f"{gauges[0]} to {gauges[-1]}"] if gauges else []
     names += [name for name, quantity in outputs if quantity != "strain"]
@@ -198,7 +201,7 @@ def load_patch(path: str | os.PathLike[str]) -> PatchFile:
     Raises
     ------
     PatchFileError
-        If the file cannot be read, is not a patch file, or holds something that no patch can hold.
+        If the file cannot be read, is not a patch file, or has no valid effect.
     """
     record = read_json(Path(path), PatchFileError, what="patch file")
     return _patch_of_record(record, f"The patch file {path}")
@@ -210,7 +213,7 @@ def parse_patch(content: bytes, file_label: str = "The patch file") -> PatchFile
 
 
 def _patch_of_record(record: object, file_label: str) -> PatchFile:
-    """Return the patch in the JSON of a patch file; the label names the file in messages."""
+    """Return the patch from the parsed JSON of a patch file; messages name it by the label."""
     schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
     if not isinstance(record, dict) or schema not in (SCHEMA, FIRST_SCHEMA):
         raise PatchFileError(f'{file_label} must have "schema": "{SCHEMA}", but has {schema!r}.')
@@ -229,7 +232,7 @@ def _patch_of_record(record: object, file_label: str) -> PatchFile:
 def _read_effects(
     rows: Sequence[Mapping[str, Any]], file_label: str
 ) -> tuple[PatchFileEffect, ...]:
-    """Return the effects of a patch file, each under an id of its own."""
+    """Return the effects of a patch file, with unique ids: a repeated id gets `_2`, `_3`, ..."""
     effects: list[PatchFileEffect] = []
     taken_ids: set[str] = set()
     for number, row in enumerate(rows, start=1):
@@ -245,14 +248,14 @@ def _read_effects(
 
 
 def _read_effect(row: Mapping[str, Any], number: int, file_label: str) -> PatchFileEffect:
-    """Return an effect of a patch file, under the id that the file gives it.
+    """Return an effect of a patch file, with the id that the file states.
 
     Parameters
     ----------
     row : mapping
-        The effect in JSON.
+        The effect as a table of the JSON file.
     number : int
-        Its number in the file, from 1.
+        The number of the effect in the file, from 1.
     file_label : str
         The name of the file in messages.
 

@@ -4,13 +4,13 @@ pythonfmu's own builder takes the same scripts, but leaves out units and ranges,
 and a random GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script
 may say more in two class attributes, both optional:
 
-- `unit_table`: for each unit its exponents of `kg, m, s, A, K, mol, cd, rad`, a `factor` and an
-`offset` to
-  them (1 and 0 by default), and `displays`, the factors of display units;
-- `variable_table`: for each variable causality, unit, least, largest and start value (or None), and
-meaning.
+- `unit_table`: for each unit its exponents of the base units `kg, m, s, A, K, mol, cd, rad`, the
+  `factor` and `offset` of the conversion to them (1 and 0 by default), and `displays`, the factors
+  of display units;
+- `variable_table`: for each variable a tuple of its causality, unit, least, largest and start value
+  (each may be None), and meaning.
 
-The script runs once in this process, to be asked for its variables.
+The script is run once in this process, since only an instance of its model lists the variables.
 """
 
 import os
@@ -50,7 +50,7 @@ def build_script_fmu(
     ----------
     script : path-like
         A Python file with one subclass of pythonfmu's `Fmi2Slave`. It may use the standard library
-        and what is installed where the FMU runs.
+        and the packages that are installed on the machine that runs the FMU.
     path : path-like
         Where to write, with the suffix .fmu.
     replace : bool
@@ -66,7 +66,7 @@ def build_script_fmu(
 
 
 def script_fmu(script: str | os.PathLike[str]) -> SealedFmu:
-    """Return a script as an FMU in memory; see `build_script_fmu`."""
+    """Pack a script as an FMU, and return the bytes and the GUID; see `build_script_fmu`."""
     file = Path(script)
     if not file.stem.isidentifier() or file.suffix != ".py":
         raise FmuBuildError(
@@ -116,9 +116,10 @@ def _model_class(file: Path) -> "type[Fmi2Slave]":
 
 
 def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: str) -> bytes:
-    """Return the model description of a script as XML.
+    """Return the model description of a script's FMU as XML.
 
-    It is pythonfmu's, with units, ranges and initial unknowns, and without the time of the build.
+    pythonfmu writes it. Units, ranges and initial unknowns are added, and the time of the build is
+    removed, so that equal scripts give equal bytes.
 
     Parameters
     ----------
@@ -139,12 +140,14 @@ def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: 
     tool = f"uav-twin with {root.get('generationTool')}"
     root.attrib.update(modelName=file.stem, guid=PLACEHOLDER, generationTool=tool)
     root.attrib.pop("generationDateAndTime", None)
+    # units, which the standard requires after the interface
     interface = _required_child(root, "CoSimulation")
     interface.set("modelIdentifier", identifier)
     units: Mapping[str, Mapping[str, Any]] = getattr(model_class, "unit_table", {})
     if units:
         after_interface = list(root).index(interface) + 1
         root.insert(after_interface, _unit_definitions(file, units))
+    # ranges of the variables, and the outputs as initial unknowns
     variables = _required_child(root, "ModelVariables")
     variable_table = getattr(model_class, "variable_table", {})
     _set_units_and_ranges(file, variables, variable_table, units)
@@ -157,14 +160,14 @@ def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: 
 
 
 def _required_child(root: Element, name: str) -> Element:
-    """Return an element that every model description by pythonfmu has."""
+    """Return a child element that every model description by pythonfmu contains."""
     child = root.find(name)
     assert child is not None
     return child
 
 
 def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:
-    """Return the element of a model description that holds the units of a script's `unit_table`."""
+    """Return the XML element `UnitDefinitions` with the units of a script's `unit_table`."""
     known_keys = {*BASE_UNITS, "factor", "offset", "displays"}
     definitions = Element("UnitDefinitions")
     for name, entry in units.items():
@@ -191,17 +194,18 @@ def _set_units_and_ranges(
     table: Mapping[str, tuple[Any, ...]],
     units: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Write units and ranges from a script's `variable_table` into its model description.
+    """Add units and ranges from a script's `variable_table` to its model description, in place.
 
     Parameters
     ----------
     file : Path
         The script.
     variables : Element
-        The element of the model description that holds the variables; it is changed.
+        The XML element of the model description with the variables; it is changed.
     table, units : mapping
         The script's `variable_table` and `unit_table`.
     """
+    # The first child of a variable's element is that of its type, such as `Real`.
     type_elements = {str(variable.get("name")): variable[0] for variable in variables}
     for name, (_, unit, low, high, _, _) in table.items():
         if name not in type_elements:
@@ -222,5 +226,5 @@ def _set_units_and_ranges(
 
 
 def _attribute_text(value: str | float) -> str:
-    """Return a bound of a variable as an attribute of XML; a float keeps its bits."""
+    """Return a limit of a variable as an XML attribute; a float is written with all its digits."""
     return value if isinstance(value, str) else repr(float(value))

@@ -1,8 +1,8 @@
 """Packing a wing or any reduced structure as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
-The content of the compiled kind is made in `fmu_asset.compiled`. The Python kind has the slave base
-class and the binaries of pythonfmu; its archive is packed here and not by pythonfmu's builder,
-which stamps times, a random GUID, and module names that two FMUs in one process would share.
+The files of the compiled kind are made in `fmu_asset.compiled`. The Python kind uses the slave base
+class and the binaries of pythonfmu. Its archive is not packed by pythonfmu's builder, which writes
+times, a random GUID, and module names that two FMUs in one process would share.
 """
 
 import json
@@ -50,7 +50,8 @@ from reporting.progress import Progress
 from .patch_file import PatchFile
 
 FmuKind = Literal["python", "compiled", "source"]
-"""Run by Python, compiled for this machine, or the sources of the compiled one alone."""
+"""The evaluation of the model: by Python, by compiled C, or by C sources that are yet to be
+compiled."""
 
 _WING_DESCRIPTION = (
     "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite "
@@ -93,25 +94,25 @@ def build_fmu(
     model : ReducedModel
         The reduced wing or structure.
     path : path-like
-        Where to write, with the suffix .fmu.
+        The file to write, with the suffix .fmu.
     state : DigitalState, optional
-        Start values of parameters and health of a wing; the nominal ones if absent.
+        The start values of parameters and health of a wing; by default the nominal ones.
     start : mapping of str to float, optional
-        Start values by variable name, which go before those of `state`.
+        Start values by the names of variables; they take precedence over those of `state`.
     kind : {"python", "compiled", "source"}
-        How the model is evaluated: by Python in the host, by C that is compiled now, or by C that
-        is compiled elsewhere.
+        The evaluation of the model: by Python in the host, by C that is compiled now, or by C
+        sources that are compiled elsewhere.
     note : str
-        Added to the description, such as what the wing was calibrated with; XML text without
+        A text that is added to the description, such as the calibration of the wing; it has no
         control characters.
     resources : mapping of str to bytes, optional
         Further files of the archive's folder `resources`, by name.
     patch : PatchFile, optional
-        Missing effects that the FMU carries as tunable parameters.
+        Missing effects that the FMU carries, with tunable parameters.
     activate : bool
         Whether these effects are switched on from the start.
     arrays : PatchArrays, optional
-        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed where an
+        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed if an
         effect changes structure or loads, or turns a gauge.
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.
@@ -122,18 +123,24 @@ def build_fmu(
     replace : bool
         Whether an existing file may be replaced.
 
+    Returns
+    -------
+    FmuInfo
+        The path, GUID, design hash and size of the FMU.
+
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value is of no variable or lies outside the
-        model's validity box, a name is taken by a variable of the FMU, a resource would take the
-        place of another file, the kind is not of that version of FMI, the wrong pythonfmu is
-        installed, or there is no C compiler for a compiled one.
+        If the file exists or has the wrong suffix; if a start value names no variable or lies
+        outside the valid range of the model; if two variables have the same name; if a resource has
+        the name of another file; if the kind is not possible with that version of FMI; or if the
+        right pythonfmu, or a C compiler for the kind `compiled`, is not installed.
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     InvalidChoiceError
         If a kind, a version of FMI, an interface or a platform is not one of those above.
     """
+    # the form of the FMU
     target = checked_target(path, replace=replace)
     kind = options.get("kind", "python")
     fmi = options.get("fmi", 2)
@@ -172,7 +179,7 @@ def build_fmu(
 
 
 def _requested_start_values(model: ReducedModel, options: FmuOptions) -> dict[str, float]:
-    """Return the start values that the options `state` and `start` give, by variable name."""
+    """Return the start values from the options `state` and `start`, by variable name."""
     state = options.get("state")
     values = {} if state is None else start_values(model, state)
     for name, value in (options.get("start") or {}).items():
@@ -181,7 +188,7 @@ def _requested_start_values(model: ReducedModel, options: FmuOptions) -> dict[st
 
 
 def _model_description(model: ReducedModel) -> str:
-    """Return the sentence on the model in the model description."""
+    """Return the sentence that describes the wing or structure in the model description."""
     return _WING_DESCRIPTION if is_wing(model) else _STRUCTURE_DESCRIPTION.format(model.name)
 
 
@@ -195,7 +202,7 @@ def _python_structure_members(
     model : ReducedModel
         The reduced structure.
     declaration : Declaration
-        The declaration of its FMU.
+        The name, description and variables of the FMU.
     start : mapping of str to float
         The start values that differ from the defaults, by variable name.
     """
@@ -211,7 +218,7 @@ def _python_structure_members(
 
 
 def _add_resources(template: dict[str, bytes], resources: Mapping[str, bytes]) -> None:
-    """Add a user's files to the folder `resources` of an archive; refuse names that are taken."""
+    """Add a user's files to `resources` in the template of an archive; refuse names in use."""
     for file, content in resources.items():
         name = f"resources/{file}"
         if name in template or "/" in file or not file:
@@ -240,7 +247,7 @@ def _patched_members(
     PatchFileError
         If the arrays are missing or belong to another wing, or the wing cannot carry an effect.
     """
-    # The order of keys is that of the variables.
+    # Keys are not sorted: their order in the file sets the order of the FMU's variables.
     text = json.dumps(effects, indent=1, allow_nan=False)
     members = {"resources/effects.json": f"{text}\n".encode()}
     primitives = []
@@ -259,10 +266,12 @@ def _patched_members(
             f"The wing for patches is of the design {arrays.design_hash:.12}, and the reduced "
             f"model of {model.design_hash:.12}; make both of one design."
         )
-    # The modes of the patched wing show whether the wing can carry the patch.
+    # Compute the modes of the patched wing, only to raise an error if the wing cannot carry the
+    # patch.
     with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
         _ = PatchedWing(arrays).structure_at(model.nominal, patch).modes
-    # Strips are most of the bytes, and local losses of stiffness alone need them.
+    # The stiffness of strips along the span takes most of the bytes. Only local losses of stiffness
+    # use it; without them it is left out.
     if not len(patch.of(LocalStiffnessLoss)):
         arrays = dataclass_copy(
             arrays,
@@ -274,7 +283,7 @@ def _patched_members(
 
 
 def stem_of(model: ReducedModel) -> str:
-    """Return the name of a structure as an identifier of C."""
+    """Return the name of a structure as an identifier of C, with at most 40 characters of it."""
     plain_name = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:_LONGEST_STEM]
     if plain_name[:1].isalpha():
         return plain_name
@@ -289,9 +298,9 @@ def check_form(
     patched: bool = False,
     platforms: Sequence[Platform] = (PLATFORM,),
 ) -> None:
-    """Refuse a form of FMU that cannot be made here.
+    """Refuse a combination of kind, FMI version, interface and platform that cannot be built here.
 
-    Commands call this before a model is reduced, which can take minutes.
+    Commands call this function before they reduce a model, which can take minutes.
 
     Parameters
     ----------
@@ -330,7 +339,7 @@ def check_form(
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
-    """Return the start values of a wing's FMU that a digital state gives, by variable name."""
+    """Return a digital state of a wing as start values of its FMU, by variable name."""
     values = {
         "young_modulus_factor": float(state.young_modulus_factor),
         "damping.alpha": float(state.damping_alpha),
@@ -344,23 +353,25 @@ def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
 
 
 def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
-    """Return the GUID that an FMU of ours declares, and the GUID that its content has today.
+    """Return the GUID that an FMU of this package declares, and the GUID computed from its content.
 
-    The two differ if the file was changed after it was built. A compiled binary is not part of the
-    content, since every compiler makes another one of the same sources.
+    The two differ if the file was changed after it was built. Compiled binaries are left out of the
+    hash, since different compilers make different binaries from the same sources.
 
     Parameters
     ----------
     path : path-like
-        An FMU that was packed here.
+        An FMU that this package has built.
 
     Returns
     -------
-    declared, actual : str
-        The GUIDs.
+    declared : str
+        The GUID in the model description.
+    actual : str
+        The GUID that follows from the content.
     """
     with zipfile.ZipFile(path) as archive:
-        # Archives that other tools have packed again list their folders, too.
+        # If another tool has packed the archive again, it lists folders too; they are no files.
         names = [name for name in archive.namelist() if not name.endswith("/")]
         members = {name: archive.read(name) for name in names}
     description = members["modelDescription.xml"].decode("utf-8")
@@ -371,6 +382,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         identifier = description.split('modelIdentifier="', 1)[1].split('"', 1)[0]
     else:
         identifier = members["resources/slavemodule.txt"].decode("ascii").strip()
+    # Put the placeholder back in the place of tag and GUID, and take the hash as in `sealed`.
     tag = identifier[-len(PLACEHOLDER) :]
     match = re.search(r'(?:guid|instantiationToken)="([^"]*)"', description)
     declared_guid = "" if match is None else match[1]
@@ -392,14 +404,14 @@ def pack_wing(
     Parameters
     ----------
     design : WingDesign
-        The wing. For a calibrated wing it is the tailored design, with the options that
-        `calibration.result.file.tailoring` gives.
+        The design of the wing. A calibrated wing has the design of its calibration, and the options
+        that `calibration.result.file.tailoring` returns.
     path : path-like
-        Where to write, with the suffix .fmu.
+        The file to write, with the suffix .fmu.
     replace, **options
         See `fmu_asset.packing.structure_fmu.build_fmu`.
     progress : Progress, optional
-        Shows what takes long.
+        Receives reports on the progress.
 
     Raises
     ------

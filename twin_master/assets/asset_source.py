@@ -48,7 +48,7 @@ HASHED_COPIES = {
     "ssp": SSP_COPY,
     "strain_library": LIBRARY_COPY,
 }
-"""The copies inside a run folder whose hashes the run states, by the names of the hashes."""
+"""The copies of files in a run folder of which the run records the hash, by the hash's name."""
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
 NO_ASSET = (
@@ -133,12 +133,12 @@ Predict = Callable[[Mapping[str, float], Mapping[str, float]], Float]
 
 
 def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -> Float:
-    """Return the observation in every state under every control.
+    """Return the predicted observation in every joint state under every control.
 
     Parameters
     ----------
     scenario : Scenario
-        The scenario, with the names of the state factors and with the controls.
+        The scenario, which names the F state factors and the U controls.
     states : (S, F) array
         The value of each state factor in each state.
     predict : callable
@@ -147,7 +147,7 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
     Returns
     -------
     (S, U, G) array
-        One row for each state, in it one row for each of the U controls of the scenario.
+        The G observed values, by state and control.
     """
     table = []
     for levels in states.tolist():
@@ -166,17 +166,19 @@ def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> 
     states : (S, F) array
         The value of each state factor in each state.
     asset : Asset
-        The asset; each observation begins in its present state.
+        The asset. Each observation is one step from the state that the asset has now. On return,
+        the asset is in the state after the last of these steps.
 
     Returns
     -------
     (S, U, G) array
-        NaN where the FMU refuses a state under a control.
+        The G values by state and control; NaN if the FMU refuses a state under a control.
     """
     present_state = asset.save_state()
 
     def predict(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        asset.restore_state(present_state)  # an asset with hidden effects may have a memory
+        # An asset with hidden effects may remember the steps of the other states.
+        asset.restore_state(present_state)
         with suppress(FmuCallError):
             return asset.step(control, health).values
         return np.full(scenario.observation.count, np.nan)
@@ -206,7 +208,7 @@ class FlownAndBelieved:
 def calibration_sentence(
     record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return which model a campaign calibrated, and whether the twin believes that one.
+    """Return a sentence on the model that was calibrated, and whether it is the believed one.
 
     Parameters
     ----------
@@ -215,18 +217,19 @@ def calibration_sentence(
     asset, believed : str
         What flies and what the twin believes, in words.
     hashes : mapping of str to str
-        The hashes of what went into the run.
+        The hashes of the files and designs of the run, by name.
 
     Returns
     -------
     str or None
-        None if nothing was calibrated from a campaign.
+        The sentence; None if the calibration does not come from a measurement campaign.
     """
     if "campaign" not in record:
         return None
     roles = f"flown and believed is the {asset}"
     if asset != believed:
         roles = f"flown is the {asset}, and the twin believes the {believed}"
+    # Without a believed design of its own, the twin believes what flies.
     believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
     if believed_hash is not None and believed_hash == record.get("design_hash"):
         comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
@@ -236,10 +239,10 @@ def calibration_sentence(
 
 
 class AssetSource:
-    """Prepares what flies, or predicts the observations that a twin expects of it.
+    """Prepares the asset that flies, or predicts the observations that a twin expects.
 
     A subclass may do one of the two or both. This class copies files into the run folder, and draws
-    the parameter from the calibration of the scenario.
+    the uncertain parameter from the calibration of the scenario.
 
     Parameters
     ----------
@@ -270,7 +273,7 @@ class AssetSource:
         return {**section_files, **self._scenario.calibration.all_files()}
 
     def path(self, copy: str) -> Path:
-        """Return the path of a file: that of its copy, or of the original before `prepare`.
+        """Return the path of a file: its copy in the run folder, or its original before `prepare`.
 
         Parameters
         ----------
@@ -290,7 +293,7 @@ class AssetSource:
         return FlownAndBelieved(self.description, self.description, self.differ)
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws of the parameter come from, in words, and their number."""
+        """Return the origin of the parameter's draws, in words, and their number."""
         calibration = self._scenario.calibration
         return calibration.source.replace("_", " "), calibration.draw_count
 
@@ -308,7 +311,7 @@ class AssetSource:
         return read_files(self.file_paths)
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy the files into a run folder, build what follows from them, and return the hashes.
+        """Copy the files into a run folder, build the FMU or model, and return the hashes.
 
         Parameters
         ----------
@@ -316,6 +319,11 @@ class AssetSource:
             The run folder.
         progress : Progress
             Receives reports on the progress.
+
+        Returns
+        -------
+        dict of str to str
+            The SHA-256 of each copied file and of each FMU or design, by the name of the hash.
 
         Raises
         ------
@@ -335,11 +343,14 @@ class AssetSource:
         self._folder = folder
 
     def _build(self, progress: Progress) -> dict[str, str]:
-        """Build what follows from the copied files; return the hashes of it by name."""
+        """Build the FMU or model from the copied files; return their hashes by name."""
         return {}
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the calibrated parameter."""
+        """Return draws of the calibrated parameter; store the mean of their distribution.
+
+        The field of a design or structure is later written at this mean.
+        """
         draws = draw_parameter(self._scenario.calibration, seed, self.model)
         self._drawn_means[draws.name] = draws.mean
         return draws
@@ -362,14 +373,16 @@ class AssetSource:
         raise NotImplementedError
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return the predicted values at the sensors without the effects of the sensors themselves.
+        """Return the predicted values at the sensors, without the errors of the sensors themselves.
 
-        The health limits apply to these. The arguments are those of `observation_table`.
+        The health limits apply to these values, not to the readings. The arguments are those of
+        `observation_table`.
 
         Returns
         -------
         (E, S, U, G) array or None
-            None if they are the predicted observations.
+            The values by draw, state, control and sensor; None if the sensors have no errors in the
+            model, so that the values are those of `observation_table`.
         """
         return None
 
@@ -380,7 +393,7 @@ class AssetSource:
     def write_field(
         self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
     ) -> bool:
-        """Write the field of displacement and strain, if the source has one.
+        """Write the field of displacement and strain, if the model of the source has a mesh.
 
         Parameters
         ----------
@@ -394,7 +407,7 @@ class AssetSource:
         Returns
         -------
         bool
-            Whether there is a field.
+            Whether the file was written.
         """
         return False
 
@@ -445,7 +458,11 @@ class PairedSource(AssetSource):
         return {**self._asset.files(), **self._believed.files()}
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Prepare both sources in a run folder; return the hashes of both."""
+        """Prepare both sources in a run folder; return the hashes of both.
+
+        The two models are marked as different if their designs have different hashes.
+        """
+        # The asset is first: an observation library is compared with the FMU of the asset.
         asset_hashes = self._asset.prepare(folder, progress)
         hashes = {**asset_hashes, **self._believed.prepare(folder, progress)}
         flown_hash = hashes.get(FLOWN_DESIGN_HASH)
@@ -458,7 +475,7 @@ class PairedSource(AssetSource):
         return self._asset.open()
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws of the believed model come from, in words, and their number."""
+        """Return the origin of the believed model's draws, in words, and their number."""
         return self._believed.draw_summary()
 
     def draws(self, seed: int) -> ParameterDraws:
@@ -476,12 +493,12 @@ class PairedSource(AssetSource):
     def write_field(
         self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
     ) -> bool:
-        """Write the field of the believed model; return whether there is one."""
+        """Write the field of the believed model; return whether the file was written."""
         return self._believed.write_field(path, state, control)
 
 
 class WatchedSection(AssetSection):
-    """The asset of a scenario without `[asset]`: it is watched, and no model of it flies."""
+    """The asset of a scenario without `[asset]`: a real one, whose observations are received."""
 
     kind: Literal["watched"] = "watched"
 

@@ -63,7 +63,7 @@ class ComponentSection(FileSection):
         return super()._is_shipped(key, name)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: no FMU, or two."""
+        """Yield (is present, message) of each possible fault: no FMU, or two."""
         has_fmu = self.fmu is not None
         has_design = self.design is not None
         yield (
@@ -111,9 +111,10 @@ class CoupledSection(SeveralSection):
     connection: tuple[ConnectionSection, ...] = ()
 
     def all_files(self) -> dict[str, Path]:
-        """Return all files, by the paths of their copies inside a run folder.
+        """Return the files to copy into a run folder, by the paths of their copies.
 
-        The shipped files of components are left out: these components are packed in the run folder.
+        Of a component only a user's own file is copied. A companion or a shipped design is not:
+        its FMU is packed inside the run folder.
         """
         files = super().all_files()
         for component in self.component:
@@ -136,22 +137,22 @@ class CoupledSection(SeveralSection):
         return CoupledSource(scenario, self)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names of components."""
+        """Yield (is present, message) of each possible fault: names of components."""
         yield from super().faults()
         names = [component.name for component in self.component]
         yield repeated_name_fault("component", names)
 
 
 class SeveralSource(FmuSource):
-    """Several FMUs as one asset.
+    """The source of an asset that consists of several FMUs.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
     section : SeveralSection
-        Its table `asset`. The variables of the binding are connectors of the system, or
-        `component.variable`.
+        The table `asset` of the scenario. A variable of the binding is a connector of the system,
+        or an FMU's own variable, which is written `component.variable`.
     """
 
     section: SeveralSection
@@ -161,13 +162,17 @@ class SeveralSource(FmuSource):
         raise NotImplementedError
 
     def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
-        """Pack the components that are no FMUs yet; return all FMUs by the names of the hashes."""
+        """Pack the FMUs that do not exist yet; return the files of all FMUs, by `fmu_<component>`.
+
+        The FMUs of an SSP file exist already, and the hash of that file covers them.
+        """
         return {}
 
     def _build(self, progress: Progress) -> dict[str, str]:
         """Pack the FMUs and check that they fit together; return their hashes."""
         fmus = self._pack_fmus(progress)
         hashes = {name: hash_file(fmu) for name, fmu in fmus.items()}
+        # Opening the system raises an error if the FMUs, connections and binding do not fit.
         self._open_session(self.binding(), self.parameters()).close()
         return hashes
 
@@ -176,7 +181,7 @@ class SeveralSource(FmuSource):
     ) -> "Session":
         """Return the coupled FMUs, ready to be started.
 
-        The system is that of `wiring()`, or the given one.
+        The system is `wiring` if it is given, and otherwise that of the method `wiring`.
         """
         from fmu_asset.coupling.asset import CoupledAsset
 
@@ -212,13 +217,13 @@ class SspSource(SeveralSource):
         return join_ssp(read_ssp(self.path(SSP_COPY), folder or self.path(COMPONENT_FOLDER)))
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding, after it is checked with the system of the file."""
+        """Check the binding against the system of the file, and return it unchanged."""
         from fmu_asset.ssp.check import left_out_sentence
 
         wiring = self.wiring(scratch)
-        sentence = left_out_sentence(wiring, self.path(SSP_COPY))
-        if sentence:
-            raise MissionInputError(sentence)
+        left_out_message = left_out_sentence(wiring, self.path(SSP_COPY))
+        if left_out_message:
+            raise MissionInputError(left_out_message)
         self._open_session(binding, self.parameters(), wiring)
         return binding
 
@@ -234,7 +239,10 @@ class CoupledSource(SeveralSource):
         return f"{len(self.section.component)} coupled FMUs"
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding, after it is checked with the FMUs if none must be packed."""
+        """Check the components and connections, and return the binding unchanged.
+
+        If no component is packed from a design, the binding is also checked against the FMUs.
+        """
         from fmu_asset.coupling.wiring import Wiring
 
         components = self.section.component
@@ -243,8 +251,8 @@ class CoupledSource(SeveralSource):
                 load_design(component.design_path)
         needs_packing = any(component.design is not None for component in components)
         if needs_packing:
-            # Packing takes too long for a check. Components and connections are checked with a
-            # path in the place of each FMU.
+            # Packing takes too long for a check. Components and connections are checked without
+            # the FMUs: the scratch folder stands for the file of each, which is not read.
             self._system_structure({component.name: scratch for component in components})
         else:
             fmus = {
@@ -255,7 +263,7 @@ class CoupledSource(SeveralSource):
         return binding
 
     def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
-        """Pack the components that are no FMUs yet; return all FMUs by the names of the hashes."""
+        """Pack the FMUs that do not exist yet; return all FMU files, by `fmu_<component>`."""
         fmus = {}
         with progress.stage("Packing the FMUs"):
             for component in self.section.component:
@@ -263,7 +271,11 @@ class CoupledSource(SeveralSource):
         return fmus
 
     def _pack_fmu(self, component: ComponentSection, progress: Progress) -> Path:
-        """Return the FMU of a component in the run folder; it is packed unless it is there."""
+        """Return the file of a component's FMU in the run folder; make the file if it is missing.
+
+        An FMU file of the user was copied there by `prepare`. A companion, or a wing from a design
+        or from the calibration of the scenario, is packed now.
+        """
         from fmu_asset.packing.structure_fmu import pack_wing
 
         fmu = self.path(component.copies()["fmu"])
@@ -274,8 +286,10 @@ class CoupledSource(SeveralSource):
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration, tailoring
 
+            # A scenario with this design has a calibration file: `resolve_scenario` checks it.
             calibration = load_calibration(Path(self._scenario.calibration.file or ""))
             design = calibration.wing_design
+            # `tailoring` gives the options of `pack_wing` that set the calibrated values.
             pack_wing(design, fmu, replace=True, progress=progress, **tailoring(calibration))
         else:
             design = load_design(component.design_path)
@@ -292,7 +306,7 @@ class CoupledSource(SeveralSource):
         return Wiring(self._system_structure(fmus))
 
     def _system_structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
-        """Return the system of the components and connections of the scenario.
+        """Return the components, connections and connectors of the system of the scenario.
 
         Parameters
         ----------
@@ -300,6 +314,7 @@ class CoupledSource(SeveralSource):
             The file of each component's FMU, by the name of the component.
         """
         names = [component.name for component in self.section.component]
+        # A pattern such as `wing.strain[{1..24}]` stands for several connections.
         connections: list[Connection] = []
         for entry in self.section.connection:
             connections += expand_connection(**entry.model_dump(), components=names)
@@ -319,8 +334,8 @@ class CoupledSource(SeveralSource):
 def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
     """Return the connectors of the system itself, each once: first its outputs, then its inputs.
 
-    A connection whose target has no component leads to an output of the system; one whose source
-    has none comes from an input.
+    A connection leads to an output of the system if its target names no component. It comes from
+    an input of the system if its source names no component.
     """
     outputs = []
     inputs = []
@@ -333,7 +348,7 @@ def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
 
 
 def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path:
-    """Return the FMU of a component: its file, or a companion that is packed in a folder."""
+    """Return the file of a component's FMU; a companion is first packed into the folder."""
     from fmu_asset.companions.build import companion_bytes
 
     assert component.fmu is not None
@@ -343,15 +358,20 @@ def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path
 
 
 def _component_settings(component: ComponentSection) -> dict[str, ComponentSetting]:
-    """Return the parameters of a component by name; patterns are expanded."""
+    """Return the parameters of a component, by name.
+
+    A pattern such as `gain[{1..4}]` gives its value to each of the parameters it stands for.
+    """
     settings: dict[str, ComponentSetting] = {}
-    where = f"the component `{component.name}`"
+    component_label = f"the component `{component.name}`"
     for pattern, value in component.parameters.items():
-        before = f"the parameters of {where} cannot be read: "
-        with MissionInputError.instead_of(ValueError, before=before, after="."):
+        message_start = f"the parameters of {component_label} cannot be read: "
+        with MissionInputError.instead_of(ValueError, before=message_start, after="."):
             names = expand(pattern)
         for name in names:
             if name in settings:
-                raise MissionInputError(f"{where} is given `{name}` twice: keep one of the two.")
+                raise MissionInputError(
+                    f"{component_label} is given `{name}` twice: keep one of the two."
+                )
             settings[name] = ComponentSetting(value)
     return settings

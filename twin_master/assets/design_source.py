@@ -102,7 +102,10 @@ class CalibrationBelief(DesignBelief):
 
 
 class _Wing(NamedStructure):
-    """A wing from its design, or from the design inside a calibration file."""
+    """What the FMU and the reduced model of a wing share: the design, the patch and their checks.
+
+    The design comes from a design file, or from inside a calibration file.
+    """
 
     section: DesignSection | DesignBelief
     effects_label: ClassVar = "effects"
@@ -163,7 +166,7 @@ class _Wing(NamedStructure):
         return [parameter.name for parameter in self.design.parameter]
 
     def load_reduced_model(self, progress: Progress) -> "ReducedModel":
-        """Return the reduced model; it comes from the cache if it is there."""
+        """Return the reduced model of the wing, from the cache if the cache has it."""
         from fe.reduction.model_cache import reduced_model
 
         return reduced_model(self.wing_design, progress=progress)
@@ -184,8 +187,8 @@ class _Wing(NamedStructure):
         Raises
         ------
         PatchFileError, MissionInputError
-            If the file is not a patch, the wing cannot carry it, or an effect that the twin is to
-            believe depends on time or on the loads before.
+            If the file is not a patch, the wing cannot carry it, or the twin is to believe an
+            effect that depends on time or on the history of the load.
         """
         from fmu_asset.packing.patch_file import load_patch
 
@@ -204,10 +207,11 @@ class _Wing(NamedStructure):
     def write_field(
         self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
     ) -> bool:
-        """Write displacement and strain of the wing as VTU, if it has the states and controls.
+        """Write the field of displacement and strain of the wing as a VTU file.
 
-        Young's modulus is that of the true wing if the scenario states it, and otherwise the mean
-        of the calibration.
+        Nothing is written if a state factor or a control input of the scenario is not an input of
+        the wing. The factor on Young's modulus is that of the true wing if the scenario states it,
+        and otherwise the mean of the distribution from which the twin drew it; 1 without a draw.
 
         Parameters
         ----------
@@ -230,33 +234,34 @@ class _Wing(NamedStructure):
         """
         from fe.reduction.model_cache import wing_fields, write_wing_vtu
 
+        # The estimated health and the controls must all be inputs of the wing.
         input_names = set(wing_input_names(self.wing_design.regions))
         if not {*state, *control} <= input_names:
             return False
-        name = "young_modulus_factor"
+        modulus_name = "young_modulus_factor"
         asset = self._scenario.asset
-        mean = self._drawn_means.get(name, 1.0)
-        values = {
-            name: asset.true_parameters.get(name, mean),
+        mean_modulus_factor = self._drawn_means.get(modulus_name, 1.0)
+        parameters_and_loads = {
+            modulus_name: asset.true_parameters.get(modulus_name, mean_modulus_factor),
             "tip_force": asset.constant_load.get("tip_force", 0.0),
             **control,
         }
         wing = wing_fields(self.wing_design)
-        write_wing_vtu(path, wing, wing.vector(values, state))
+        write_wing_vtu(path, wing, wing.vector(parameters_and_loads, state))
         return True
 
 
 class _SpanLocation(NamedTuple):
-    """Where a change of the model is along the span [m from the root].
+    """The location of a change of the model along the span of a wing.
 
     Attributes
     ----------
     start : float
-        Its location, or where it begins.
+        The distance of the change, or of its inner end, from the root [m].
     length : float
-        Its length; 0 for a point.
+        The length of the change along the span [m]; 0 for a point.
     limit : float
-        How far out it may begin.
+        The largest distance from the root at which `start` may be [m].
     """
 
     start: float
@@ -265,9 +270,10 @@ class _SpanLocation(NamedTuple):
 
 
 def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation | None:
-    """Return where a change of the model is along the span; None if it has no location."""
+    """Return the location of a change of the model along the span; None if it has none."""
     span = wing.planform.semi_span
-    farthest = (1.0 + OVERHANG) * span  # masses and forces may be somewhat beyond the tip
+    # Masses and forces may lie beyond the tip, by the fraction OVERHANG of the span.
+    farthest = (1.0 + OVERHANG) * span
     if isinstance(primitive, LocalStiffnessLoss):
         return _SpanLocation(primitive.start, primitive.length, span)
     if isinstance(primitive, PointMass):
@@ -295,9 +301,10 @@ def _check_location(
 
 
 def _check_has_no_memory(effect: "PatchFileEffect", primitive: "Primitive") -> None:
-    """Refuse an effect that depends on time or on the loads before.
+    """Refuse an effect that depends on time, or on the history of the load.
 
-    The twin predicts each state and control once, without an order in time.
+    The twin predicts the readings of each state under each control once, for all times and for any
+    history.
     """
     dependence = ""
     if isinstance(primitive, SensorDrift) and primitive.exponent != 0.0:
@@ -326,7 +333,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return super().binding().with_regions(self.wing_design.regions)
 
     def _effect_parameters(self) -> tuple[str, ...]:
-        """Return the names of the parameters that switch and size the effects of the patch."""
+        """Return the names of the parameters that switch the effects on, and set their sizes."""
         from fmu_asset.slaves.effects import effect_rows
 
         if self.patch is None:
@@ -334,7 +341,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return tuple(variable.name for variable in effect_rows(self.patch.plain, 0, {}))
 
     def _check_calibration(self, binding: Binding) -> None:
-        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
+        """Refuse a kind of FMU that cannot be built, and calibrated parameters that are unknown."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed, patched=self.patch_path is not None)
@@ -346,7 +353,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
     def _pack(self, progress: Progress) -> None:
-        """Pack the wing, with the figures of its calibration, as the FMU in the run folder."""
+        """Pack the wing as the FMU in the run folder, at its calibrated values if it has any."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
         options: dict[str, Any] = {}
@@ -381,13 +388,17 @@ class DesignSource(_Wing, ReducedModelSource):
             )
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted strains (E, S, U, G) with all effects of the patch."""
+        """Return the predicted strains (E, S, U, G) with all effects of the patch.
+
+        The axes are the draw of the parameter, the state, the control and the gauge.
+        """
         return self._predict_strains(draws, model, self.patch)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return the strains of the structure (E, S, U, G), without the effects of its gauges.
+        """Return the strains (E, S, U, G) of the structure, without the errors of its gauges.
 
-        Without such effects it is None: the predicted strains are those of the structure.
+        The axes are the draw, state, control and gauge. If the patch has no effects on gauges, the
+        result is None: the predicted readings are then the strains of the structure.
         """
         if self.patch is None:
             return None
@@ -400,6 +411,8 @@ class DesignSource(_Wing, ReducedModelSource):
         self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None"
     ) -> Float:
         """Return the strains (E, S, U, G) that the twin predicts with the effects of a patch.
+
+        Without effects, they are the strains of the reduced model alone.
 
         Raises
         ------
@@ -469,17 +482,20 @@ def strain_predictor(
     from fmu_asset.slaves.effects import SwitchableEffects, effect_rows, switch_name
     from fmu_asset.slaves.table import structure_table
 
-    # The same code as inside the FMU of the wing.
+    # The prediction runs the behaviour that is packed into the FMU of a wing, so that model and
+    # FMU agree.
     effects = patch.plain
     gauge_count = len(wing.gauges)
     variables, roles = structure_table(wing, {})
     switchable_effects = SwitchableEffects(effects, gauge_count, patch_arrays)
     behaviour = StructureBehaviour(wing, variables, roles, switchable_effects)
+    # Switch all effects on, at the sizes that the patch states.
     switched_on = {switch_name(effect): 1.0 for effect in effects}
     effect_values = {}
     for variable in effect_rows(effects, 0, switched_on):
         effect_values[variable.name] = float(variable.start or 0.0)
     behaviour.tune(effect_values, 0.0)
+    # A value that a prediction does not set stays at its start value.
     nominal = {variable.name: variable.start or 0.0 for variable in variables}
     input_names = [variable.name for variable in variables if variable.causality == "input"]
 
@@ -494,6 +510,6 @@ def strain_predictor(
         inputs = [values[name] for name in input_names]
         parameters = {**nominal, "young_modulus_factor": young_modulus_factor}
         outputs = behaviour.start(parameters, 0.0, inputs)
-        return np.array(outputs[:gauge_count])
+        return np.array(outputs[:gauge_count])  # the strains are the first outputs
 
     return predict

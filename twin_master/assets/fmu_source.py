@@ -71,7 +71,7 @@ class FmuSection(AssetSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: parameters that are seeds."""
+        """Yield (is present, message) of each possible fault: parameters that are seeds."""
         for name in self.seeds:
             yield (
                 name in self.parameters,
@@ -101,7 +101,10 @@ class ScriptSection(FmuSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
 
     def portable(self) -> FmuFileSection:
-        """Return the table of the packed FMU, with the paths of the copies inside a run folder."""
+        """Return the table as one of the kind `fmu`, as the run folder contains the packed FMU.
+
+        The paths of files become those of the copies inside the run folder.
+        """
         common_keys = [name for name in FmuSection.model_fields if name != "kind"]
         table = {name: getattr(self, name) for name in common_keys}
         table["binding"] = super().portable().model_dump()["binding"]
@@ -115,16 +118,18 @@ class ScriptSection(FmuSection):
 
 @dataclass(frozen=True)
 class TruthOutputs:
-    """The outputs in which an asset with damage and sensors of its own reports the truth.
+    """The outputs that report the truth, of an asset whose damage and sensors are inside the FMU.
 
     Attributes
     ----------
     state_monitors : mapping of str to str
-        The monitor of the binding that holds the true value of each state factor, by its name.
+        The monitor of the binding that holds the true value of a state factor, by the factor's
+        name.
     observation : slice
-        The positions of the values without noise among the observations of the binding.
+        The positions of the noise-free values among the observed values of the binding.
     received : slice or None
-        The positions of the values that are 0 for a lost sensor; None if none is lost.
+        The positions of the values that are 0 if the reading of a sensor is lost; None if no
+        reading is ever lost.
     """
 
     state_monitors: Mapping[str, str]
@@ -140,11 +145,11 @@ class FmuAsset(Asset):
     session : FmiAsset or CoupledAsset
         The FMU or the FMUs, in their initial state.
     observation : slice
-        The positions of the observed quantity among the observations of the binding.
+        The positions of the observed quantity among the observed values of the binding.
     load : mapping of str to float
         The load inputs, the same in every step.
     truth_outputs : TruthOutputs, optional
-        Given if the asset has damage and sensors of its own.
+        The outputs that report the truth, if damage and sensors are inside the asset.
     """
 
     def __init__(
@@ -168,7 +173,18 @@ class FmuAsset(Asset):
         self.units = units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make one communication step with the control and the health of the step (SI)."""
+        """Make one communication step, and return what the FMU observed at its end.
+
+        If the asset has damage and sensors of its own, the reading contains the true state, and the
+        lost sensors are NaN.
+
+        Parameters
+        ----------
+        control : mapping of str to float
+            The value of each control input, SI.
+        health : mapping of str to float
+            The true value of each state factor, SI.
+        """
         observation = self._session.step(control, health, self._load)
         sensed = observation.values[self._observation]
         monitors = {self._stored_names[name]: value for name, value in observation.extra.items()}
@@ -197,9 +213,10 @@ class FmuAsset(Asset):
 
 
 def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[str, str]:
-    """Return for each name one under which a run can store a variable.
+    """Return for each FMU variable a name under which the run's NetCDF file can store it.
 
-    It has no `/`, which would make a group, and differs from the reserved and from the other names.
+    `/` would make a group in that file; it and unprintable characters become `_`. A name that is
+    reserved or used already gets `_` at its end until it is unique.
     """
     used_names = set(reserved_names)
     stored_names = {}
@@ -214,14 +231,14 @@ def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[s
 
 
 class FmuSource(AssetSource):
-    """An FMU from a file.
+    """The source of an asset that is one FMU.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
     section : FmuSection
-        Its table `asset`.
+        The table `asset` of the scenario.
     """
 
     # An FMU may hold any model, also that of the believed design, so that it is not known whether
@@ -234,7 +251,7 @@ class FmuSource(AssetSource):
         return load_binding(self.path(BINDING_COPY))
 
     def check(self) -> None:
-        """Check the files in their original places; nothing is copied or started.
+        """Check that the files, the binding and the scenario fit together; nothing is copied.
 
         Raises
         ------
@@ -260,23 +277,27 @@ class FmuSource(AssetSource):
             _check_calibrated_units(binding, calibration)
 
     def _check_calibration(self, binding: Binding) -> None:
-        """Refuse a calibration file that does not fit the FMU."""
+        """Refuse a calibration file of unknown parameters, or of another design than the FMU's.
+
+        The design is compared only if the twin believes the FMU itself and the FMU records it.
+        """
         calibration = self._scenario.calibration
         believes_fmu = isinstance(self._scenario.belief, AssetBelief)
         design_hash = ""
         if believes_fmu and FMU_COPY in self.file_paths:
             design_hash = packed_design_hash(self.path(FMU_COPY))
-        where = f"the binding {binding.name}"
-        check_calibration(calibration, binding.parameter, where, design_hash=design_hash)
+        binding_label = f"the binding {binding.name}"
+        check_calibration(calibration, binding.parameter, binding_label, design_hash=design_hash)
 
     def _effect_parameters(self) -> tuple[str, ...]:
-        """Return the names of the FMU's parameters of effects, which the binding does not have."""
+        """Return the FMU's parameters of missing effects, which the binding does not list."""
         return ()
 
     def _check_names(self, binding: Binding) -> None:
         """Refuse names of the scenario that the binding does not have."""
         scenario = self._scenario
         section = self.section
+        # If the damage is inside the asset, the binding has no health inputs.
         states = () if scenario.truth.kind == "asset" else scenario.state_names
         given_parameters = (*section.parameters, *section.seeds)
         known_parameters = (*binding.parameter, *self._effect_parameters())
@@ -289,42 +310,43 @@ class FmuSource(AssetSource):
         check_names("the scenario has the", f"the binding {binding.name}", names_by_sort)
 
     def _fit_binding(self, binding: Binding) -> Binding:
-        """Return the binding with the lengths of arrays that the FMU has, after both are checked.
+        """Check the binding against the FMU; return it with the lengths of the FMU's arrays.
 
-        If the FMU refuses a parameter, the error also names those that the calibration sets.
+        If the FMU refuses the value of a parameter, the error also names the parameters that the
+        calibration file sets, since one of them may be the cause.
         """
         try:
             with scratch_folder() as scratch:
                 return self._fit_to_fmu(binding, scratch)
         except FmuInputError as error:
-            calibrated = []
+            calibrated_values = []
             for name, mean in calibrated_means(self._scenario.calibration).items():
                 if name not in self.section.parameters:
-                    calibrated.append(f"{name} = {mean:.6g}")
-            if not calibrated:
+                    calibrated_values.append(f"{name} = {mean:.6g}")
+            if not calibrated_values:
                 raise
             raise MissionInputError(
-                f"{error} The calibration has {', '.join(calibrated)}: give one of what is flown, "
-                "or name the parameter in `asset.parameters`."
+                f"{error} The calibration has {', '.join(calibrated_values)}: give one of what is "
+                "flown, or name the parameter in `asset.parameters`."
             ) from error
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding with the lengths of arrays that the FMU has.
+        """Check the binding against the FMU; return it with the lengths of the FMU's arrays.
 
-        A subclass may write into the scratch folder, which is removed afterwards.
+        A subclass may write into the scratch folder, which the caller removes.
         """
         return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
 
     def _check_state_units(self, binding: Binding) -> None:
-        """Refuse state factors with other units than in the binding."""
+        """Refuse a state factor whose unit differs from that of its monitor or health input."""
         state_monitors = self._scenario.truth.state
         for factor in self._scenario.state:
             if state_monitors:
                 bound_unit = binding.monitor[state_monitors[factor.name]].unit
             else:
                 bound_unit = binding.health[factor.name].unit
-            what = f"the state {factor.name}"
-            _check_unit(binding, what, bound_unit, "state.unit", factor.unit)
+            factor_label = f"the state {factor.name}"
+            _check_unit(binding, factor_label, bound_unit, "state.unit", factor.unit)
 
     def _build(self, progress: Progress) -> dict[str, str]:
         """Return the hashes of the FMU, and of the wing design inside it, if there is one."""
@@ -336,9 +358,10 @@ class FmuSource(AssetSource):
         return hashes
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the observations (E, S, U, G) of the FMU at every draw, state and control.
+        """Return the observations (E, S, U, G) of the FMU, by draw, state, control and sensor.
 
-        They are right for an FMU without a memory.
+        The FMU is reset once for each draw, and then makes one step for each state and control. An
+        FMU that remembers earlier steps would therefore give wrong predictions.
         """
         load = self.section.load
         tables = []
@@ -361,22 +384,23 @@ class FmuSource(AssetSource):
         return np.array(tables)
 
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
-        """Return the positions of a role among the observations of the binding.
+        """Return the positions of a role among the observed values of the binding.
 
-        By default it is the role that the scenario observes. The units must be the scenario's.
+        A role is the name of an observed quantity; if it is empty, that of the scenario is taken.
+        The number and the units of its values must be those of the scenario.
         """
         observation = self._scenario.observation
         role = role or observation.role
         positions = self._slice_of_role(binding, role)
         bound_units = binding.observation[role].units
-        pairs = zip(bound_units, observation.sensor_units, strict=True)
-        for number, (bound_unit, unit) in enumerate(pairs, 1):
-            what = f"value {number} of `{role}`"
-            _check_unit(binding, what, bound_unit, "observation.unit", unit)
+        unit_pairs = zip(bound_units, observation.sensor_units, strict=True)
+        for number, (bound_unit, unit) in enumerate(unit_pairs, 1):
+            value_label = f"value {number} of `{role}`"
+            _check_unit(binding, value_label, bound_unit, "observation.unit", unit)
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of a role, which must have as many values as the scenario."""
+        """Return the positions of a role; refuse another number of values than in the scenario."""
         expected = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
@@ -388,12 +412,13 @@ class FmuSource(AssetSource):
         return positions
 
     def _find_truth_outputs(self, binding: Binding) -> TruthOutputs | None:
-        """Return the outputs in which the asset reports the truth; None if the scenario states it.
+        """Return the outputs that report the truth; None if the scenario states the truth itself.
 
         Raises
         ------
         MissionInputError
-            If the binding has no such monitor or observation, or the twin is to believe the asset.
+            If the binding lacks a monitor or observation that `truth` names, or the twin is to
+            believe the asset.
         """
         truth = self._scenario.truth
         if truth.kind != "asset":
@@ -414,13 +439,13 @@ class FmuSource(AssetSource):
     def parameters(self) -> dict[str, float]:
         """Return the parameters of the FMU.
 
-        They are those of the scenario, the numbers that are drawn for its seeds, and the posterior
-        means of the other parameters that were calibrated from a campaign.
+        They are the parameters of the scenario, one random integer for each parameter in `seeds`,
+        and the posterior means of the calibration. A value of the scenario replaces a mean.
         """
         section = self.section
         random = generator(self._scenario.mission.seed, "asset")
-        drawn = random.integers(LARGEST_FMU_SEED, size=len(section.seeds))
-        seeds = {name: float(value) for name, value in zip(section.seeds, drawn, strict=True)}
+        integers = random.integers(LARGEST_FMU_SEED, size=len(section.seeds))
+        seeds = {name: float(seed) for name, seed in zip(section.seeds, integers, strict=True)}
         return calibrated_means(self._scenario.calibration) | section.parameters | seeds
 
     def _open_session(self, binding: Binding, parameters: Mapping[str, float]) -> "Session":
@@ -455,22 +480,36 @@ class FmuSource(AssetSource):
 
 
 def _check_calibrated_units(binding: Binding, calibration: "CalibrationRecord") -> None:
-    """Refuse parameters of a campaign's calibration with other units than in the binding."""
+    """Refuse a calibrated parameter whose unit differs from that in the binding."""
     for prior in calibration.priors:
         if prior.name in binding.parameter:
             bound_unit = binding.parameter[prior.name].unit
-            what = f"the parameter {prior.name}"
-            _check_unit(binding, what, bound_unit, "calibration.file", prior.unit)
+            parameter_label = f"the parameter {prior.name}"
+            _check_unit(binding, parameter_label, bound_unit, "calibration.file", prior.unit)
 
 
 def _check_unit(binding: Binding, what: str, bound_unit: str, key: str, unit: str) -> None:
     """Refuse a unit of the scenario that is not the unit in the binding.
 
-    The unit "1", the default of a scenario, fits any quantity but a fraction in another unit, such
-    as a percentage.
+    "1" is the default of a scenario, and so may stand for any unit. It is refused only for a
+    dimensionless quantity with a scale of its own, such as a percentage, whose values it would
+    misread.
+
+    Parameters
+    ----------
+    binding : Binding
+        The binding, for the message.
+    what : str
+        The quantity, for the message: "the state z1".
+    bound_unit : str
+        The unit of the quantity in the binding.
+    key : str
+        The key of the scenario that states the unit, for the message.
+    unit : str
+        The unit of the quantity in the scenario.
     """
     if bound_unit == unit:
-        return  # without the third of a second that the library of units takes to load
+        return  # saves the third of a second in which the library of units loads
     meaning = meaning_of(bound_unit)
     is_scaled_fraction = (
         meaning is not None and not any(meaning.exponents) and meaning.factor != 1.0
@@ -502,7 +541,7 @@ class ScriptSource(FmuSource):
         return {**read_files(other_files), FMU_COPY: script_fmu(script).content}
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding with the lengths of arrays of the FMU, packed in a scratch folder."""
-        packed = scratch / "asset.fmu"
-        packed.write_bytes(self.files()[FMU_COPY])
-        return FmiAsset(packed, binding, parameters=self.parameters()).binding
+        """Pack the FMU in the scratch folder; return the binding with its lengths of arrays."""
+        packed_fmu = scratch / "asset.fmu"
+        packed_fmu.write_bytes(self.files()[FMU_COPY])
+        return FmiAsset(packed_fmu, binding, parameters=self.parameters()).binding

@@ -60,7 +60,7 @@ class ObservationLibrary:
     values : (E, S, U, G) array
         The observations, in the units of the sensors.
     role : str
-        The observation of the binding.
+        The observed quantity, by its name in the binding.
     sensors, sensor_units : tuple of str
         The FMU variable and the unit of each sensor.
     states : StateSpace
@@ -74,7 +74,7 @@ class ObservationLibrary:
     parameter : str
         The uncertain parameter; empty without one.
     draws : (E,) array
-        Its values; NaN without a parameter.
+        The values of the parameter; NaN without a parameter.
     load, parameters : dict of str to float
         The loads and the other parameters of the FMU.
     settling_steps : int
@@ -115,7 +115,7 @@ class ObservationLibrary:
         self.values = self._read_observations(state_names)
 
     def _read_observations(self, state_names: list[str]) -> Float:
-        """Return the observations (E, S, U, G), which cannot be written to."""
+        """Return the observations (E, S, U, G) as a read-only array with one axis for states."""
         observation = self.dataset["observation"]
         # One axis for each state factor, between those of the draw and the control.
         table = observation.transpose("draw", *state_names, "control", "sensor").values
@@ -146,13 +146,18 @@ class ObservationLibrary:
                 f"the observation library has the states {comma_list(self.states.names)}, and the "
                 f"scenario asks for {comma_list(names)}: {_ADVICE}"
             )
+        # The columns in the order of the library.
         states = coordinates[:, [names.index(name) for name in self.states.names]]
-        before = "the observation library lacks a state: "
-        with MissionInputError.instead_of(InvalidModelError, before=before, after=f"; {_ADVICE}"):
+        message_start = "the observation library lacks a state: "
+        with MissionInputError.instead_of(
+            InvalidModelError, before=message_start, after=f"; {_ADVICE}"
+        ):
             return [self.states.index(state) for state in states]
 
     def control_index(self, name: str, values: Mapping[str, float]) -> int:
-        """Return the index of the control whose inputs have given values.
+        """Return the index of the sampled control whose inputs have the given values.
+
+        Controls are matched by these values, because their names in a library are labels only.
 
         Parameters
         ----------
@@ -172,9 +177,12 @@ class ObservationLibrary:
                 f"{comma_list(self.control_values)}, and the scenario sets {comma_list(values)}: "
                 f"{_ADVICE}"
             )
-        sampled = np.column_stack([self.control_values[key] for key in values])
-        wanted = list(values.values())
-        is_same = np.isclose(sampled, wanted, rtol=_RELATIVE_TOLERANCE, atol=0.0).all(axis=1)
+        sampled_controls = np.column_stack([self.control_values[key] for key in values])
+        wanted_values = list(values.values())
+        # One truth value for each of the U sampled controls.
+        is_same = np.isclose(
+            sampled_controls, wanted_values, rtol=_RELATIVE_TOLERANCE, atol=0.0
+        ).all(axis=1)
         if not is_same.any():
             settings = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise MissionInputError(
@@ -184,9 +192,9 @@ class ObservationLibrary:
         return int(np.argmax(is_same))
 
     def check_parameter(self, name: str) -> None:
-        """Refuse a parameter that is not the uncertain one of the library.
+        """Refuse a parameter other than the one over which the library was sampled.
 
-        A library without an uncertain parameter passes: one draw of any parameter can use it.
+        A library without an uncertain parameter is accepted: a twin with a single draw can use it.
 
         Raises
         ------
@@ -206,30 +214,33 @@ class ObservationLibrary:
     def observations_at(self, name: str, draws: Float) -> Float:
         """Return the observations at given values of the parameter.
 
-        They are interpolated linearly between the values that were sampled.
+        Observations are interpolated linearly between the sampled values. A library without a
+        parameter serves a single draw of any parameter.
 
         Parameters
         ----------
         name : str
             The parameter.
         draws : (N,) array
-            Its values.
+            The values of the parameter.
 
         Returns
         -------
         (N, S, U, G) array
+            The observations by value, state, control and sensor.
 
         Raises
         ------
         MissionInputError
-            If the library has another parameter, or a value is outside the sampled ones.
+            If the library has another parameter, or a value lies outside the range of the sampled
+            ones.
         """
         if not self.parameter and len(draws) == 1:
             return self.values
         if name != self.parameter:
             raise self._other_parameter_error(name)
         order = np.argsort(self.draws, kind="stable")
-        nodes = self.draws[order]
+        nodes = self.draws[order]  # the sampled values, in rising order
         tolerance = _RELATIVE_TOLERANCE * float(np.abs(nodes).max())
         if draws.min() < nodes[0] - tolerance or draws.max() > nodes[-1] + tolerance:
             raise MissionInputError(
@@ -237,8 +248,11 @@ class ObservationLibrary:
                 f"observation library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this "
                 f"scenario and seed, or over a wider range with --grid parameter.{name}=..."
             )
-        # The weight of a node is the piecewise linear function that is 1 there: (nodes, N).
-        weights = np.array([np.interp(draws, nodes, unit) for unit in np.eye(len(nodes))])
+        # The weight of a node is the piecewise linear function that is 1 at this node and 0 at the
+        # others; the array is (nodes, N).
+        weights = np.array(
+            [np.interp(draws, nodes, node_values) for node_values in np.eye(len(nodes))]
+        )
         return np.tensordot(weights.T, self.values[order], axes=1)
 
 
@@ -255,7 +269,9 @@ def _read_finite_values(dataset: xr.Dataset, name: str) -> Float:
 
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
-    """Write a library as a whole; equal libraries give equal bytes.
+    """Write a library to a NetCDF file, completely or not at all.
+
+    Equal libraries give equal bytes.
 
     Parameters
     ----------
@@ -278,7 +294,7 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
 
 
 def load_observation_library(path: Path) -> ObservationLibrary:
-    """Read a library.
+    """Read an observation library and check its layout.
 
     Parameters
     ----------
@@ -288,7 +304,7 @@ def load_observation_library(path: Path) -> ObservationLibrary:
     Raises
     ------
     MissionInputError
-        If the file does not exist, or is not a whole library of this version.
+        If the file does not exist, is damaged, or is not a library of this format.
     """
     if not path.is_file():
         raise MissionInputError(
@@ -343,16 +359,17 @@ class LibraryBelief(BeliefSection):
 
 
 class LibrarySource(AssetSource):
-    """Predicted observations from an observation library.
+    """The source of predicted observations from an observation library.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
     section : LibraryBelief
-        Its table `belief`.
+        The table `belief` of the scenario.
     flown : FmuSource
-        The FMU that flies. Without a design it draws the parameter and writes the field.
+        The source of the FMU that flies. It also draws the parameter and writes the field, unless
+        the section names a design.
     """
 
     def __init__(self, scenario: Scenario, section: LibraryBelief, flown: FmuSource) -> None:
@@ -377,12 +394,13 @@ class LibrarySource(AssetSource):
 
     @cached_property
     def library(self) -> ObservationLibrary:
-        """The library, which contains what the scenario needs.
+        """The library, which is read and checked against the scenario at the first use.
 
         Raises
         ------
         MissionInputError
-            If it is missing or damaged, or lacks something.
+            If the file is missing or damaged, or lacks a state, control, sensor or parameter of the
+            scenario.
         """
         library = load_observation_library(self.path(OBSERVATIONS_COPY))
         self._check_labels(library)
@@ -412,9 +430,14 @@ class LibrarySource(AssetSource):
     def _check_same_texts(
         self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]
     ) -> None:
-        """Refuse a library that has other texts than the scenario.
+        """Refuse a library whose labels differ from those of the scenario, in number or order.
 
-        The verb says in the message what the library has: "has the sensors".
+        Parameters
+        ----------
+        verb : str
+            What is compared, for the message: "has the sensors".
+        of_library, of_scenario : sequence of str
+            The labels of the library, and those that the scenario asks for.
         """
         if list(of_library) != list(of_scenario):
             raise MissionInputError(
@@ -425,12 +448,13 @@ class LibrarySource(AssetSource):
 
     def check(self) -> None:
         """Check that the library contains what the scenario needs."""
-        _ = self.library
+        _ = self.library  # reading the library checks it
 
     def _build(self, progress: Progress) -> dict[str, str]:
-        """Prepare the design, if there is one; find out how the library is related to the FMU.
+        """Prepare the design, and find out whether the library was sampled from the FMU that flies.
 
-        The FMU that flies is prepared before.
+        `PairedSource` prepares the FMU before. Another FMU, or other parameters of it, are written
+        into the description, and mark the two models as different.
         """
         assert self._folder is not None
         library = self.library
@@ -451,7 +475,10 @@ class LibrarySource(AssetSource):
         return hashes
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the parameter, from the calibration of the scenario."""
+        """Return draws of the parameter, from the calibration of the scenario.
+
+        If the library has to be interpolated at one of them, their source says so.
+        """
         draws = self._model_source.draws(seed)
         if not self.library.parameter or np.isin(draws.values, self.library.draws).all():
             return draws
@@ -459,21 +486,22 @@ class LibrarySource(AssetSource):
         return replace(draws, source=source)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the observations (E, S, U, G) for the states and controls of the scenario.
+        """Return the library's observations (E, S, U, G), by draw, state, control and sensor.
 
         Raises
         ------
         MissionInputError
-            If the library lacks a state, a control or a range of the parameter.
+            If the library lacks a state or a control of the scenario, or a draw lies outside the
+            sampled range of the parameter.
         """
-        states, controls = self._state_and_control_indices(self.library, model)
+        state_indices, control_indices = self._state_and_control_indices(self.library, model)
         observations = self.library.observations_at(draws.name, draws.values)
-        return observations[:, states][:, :, controls]
+        return observations[:, state_indices][:, :, control_indices]
 
     def write_field(
         self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
     ) -> bool:
-        """Write the field of the design or of what flies; return whether there is one."""
+        """Write the field of the design, or else of the FMU; return whether it was written."""
         return self._model_source.write_field(path, state, control)
 
     def _state_and_control_indices(

@@ -30,15 +30,15 @@ class ParameterDraws:
     Attributes
     ----------
     name : str
-        The parameter.
+        The name of the parameter.
     values : (E,) array
-        The draws, SI.
+        The E draws, SI.
     mean, standard_deviation : float
-        Those of the distribution that was drawn from.
+        The moments of the distribution from which the draws were taken, SI.
     source : str
-        Where the distribution comes from.
+        The origin of the distribution, in words.
     record : mapping or None
-        The whole calibration as plain data.
+        The whole calibration as plain data; None if the scenario states the distribution.
     others : mapping of str to (E,) array
         The expectation of each other calibrated parameter at each draw, SI.
     """
@@ -55,7 +55,10 @@ class ParameterDraws:
 def draw_parameter(
     calibration: Calibration, seed: int, model: "ReducedModel | None" = None
 ) -> ParameterDraws:
-    """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
+    """Return draws of the calibrated parameter from the distribution that the scenario names.
+
+    This is step 2 of the calibration in Kapteyn et al. 2021. The distribution comes from a
+    calibration file, a fixed value, a normal distribution, or the published load test.
 
     Parameters
     ----------
@@ -64,7 +67,13 @@ def draw_parameter(
     seed : int
         The seed of the run.
     model : ReducedModel, optional
-        The structural model, whose stiffness curve is used if the scenario asks for it.
+        The structural model, whose curve of tip stiffness over Young's modulus is used if
+        `calibration.curve` is not `published`.
+
+    Returns
+    -------
+    ParameterDraws
+        The draws, with the moments of their distribution.
 
     Raises
     ------
@@ -97,7 +106,10 @@ def draw_parameter(
 def _draws_of_record(
     calibration: Calibration, seed: int, record: "CalibrationRecord"
 ) -> ParameterDraws:
-    """Return draws from the samples of a calibration file, one from each of as many strata."""
+    """Return stratified draws from the posterior samples of a calibration file.
+
+    There are as many strata of equal probability as draws, with one draw from each.
+    """
     from calibration.result.file import run_record
 
     name = calibration.parameter
@@ -119,7 +131,8 @@ def _draws_of_normal(
 ) -> ParameterDraws:
     """Return stratified draws from the normal distribution that the scenario states.
 
-    If there is a calibration file, the other parameters follow from it.
+    If there is a calibration file, its samples give the expectation of each other parameter at
+    each draw.
     """
     from calibration.static.posterior import GaussianPrior, stratified
 
@@ -140,9 +153,10 @@ def _draws_of_normal(
 def _draws_of_load_test(
     calibration: Calibration, seed: int, model: "ReducedModel | None"
 ) -> ParameterDraws:
-    """Return draws of the Young's modulus factor from the published load test.
+    """Return draws of the factor on Young's modulus, given the published static load test.
 
-    The stiffness curve is that of a model, or the published line without one.
+    The posterior depends on the curve of tip stiffness over that factor: that of the model, or the
+    published straight line if the model is None.
     """
     # These modules take a while to load, and a scenario can be read without them.
     from calibration.paper.load_test import particle_filter, push_forward
@@ -162,6 +176,7 @@ def _draws_of_load_test(
     else:
         filter_seed = int(seeds.generate_state(1)[0])
         posterior = particle_filter(measurements, seed=filter_seed, curve=curve)
+    # The distribution of the tip stiffness that follows from that of the factor, for the record.
     stiffness = push_forward(posterior, curve)
     return ParameterDraws(
         name=calibration.parameter,
@@ -188,7 +203,7 @@ def _draws_of_load_test(
 
 
 def _plain_density(posterior: "ScalarPosterior") -> dict[str, Any]:
-    """Return the arguments of a posterior as plain data, without what follows from them."""
+    """Return the constructor arguments of a posterior as plain data, without derived attributes."""
     from calibration.static.posterior import ScalarPosterior
     from reporting.json_file import plain
 
@@ -222,9 +237,10 @@ def check_calibration(
     design_hash: str = "",
     advice: str = SAME_NAMES,
 ) -> None:
-    """Check that a campaign's calibration fits the model that flies or is believed.
+    """Check that a calibration of parameters fits the model that flies or is believed.
 
-    Nothing is checked if the scenario names no calibration file, or one of a wing.
+    Nothing is checked if the scenario names no calibration file. Nor is the calibration of a wing
+    checked: such a file contains its own design.
 
     Parameters
     ----------
@@ -233,20 +249,22 @@ def check_calibration(
     known : collection of str
         The parameters of the model, which must contain all parameters of the calibration.
     where : str
-        What has these parameters, for the sentence.
+        The name of the model or binding with these parameters, for the message.
     ranges : mapping of str to (float, float)
-        Where the model is valid, by parameter, SI; a parameter without an entry has no range.
+        The least and largest valid value of a parameter, by its name, SI; a parameter without an
+        entry has no limits.
     design_hash : str
-        The hash of the believed design; empty if it is not known, or the model only flies.
+        The hash of the believed design; empty if it is not known, or if the twin does not believe
+        the model.
     advice : str
-        What to do about an unknown parameter, for the sentence.
+        What the user can do about an unknown parameter, for the message.
 
     Raises
     ------
     CalibrationRecordError
         If the file is damaged or of another kind, or has no samples of the parameter.
     MissionInputError
-        If it has an unknown parameter, a parameter whose posterior mean is outside its range, or
+        If the calibration has an unknown parameter, a posterior mean outside the valid range, or
         another design.
     """
     record = read_calibration(calibration)
@@ -272,18 +290,25 @@ def check_calibration(
 
 
 def is_of_parameters(file: Path | str) -> bool:
-    """Return whether a file is a campaign's calibration of parameters, and not that of a wing."""
+    """Return whether a calibration file has parameters only, and no wing design.
+
+    The result is False for a damaged file; the error is raised when the file is used.
+    """
     from calibration.errors import CalibrationRecordError
     from calibration.result.file import load_calibration
 
     try:
         return load_calibration(file).design is None
-    except CalibrationRecordError:  # the use of the file raises it again
+    except CalibrationRecordError:
         return False
 
 
 def calibrated_means(calibration: Calibration) -> dict[str, float]:
-    """Return the posterior means of the parameters that were calibrated from a campaign, SI."""
+    """Return the posterior mean of each parameter of a calibration file, SI.
+
+    The result is empty without a file, and for the calibration of a wing, whose design contains
+    its calibrated values.
+    """
     record = read_calibration(calibration)
     if record is None or record.design is not None:
         return {}

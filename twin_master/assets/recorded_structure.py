@@ -26,7 +26,7 @@ def modal_features(
     section: ModesSection,
     damping: tuple[float, float] | None = None,
 ) -> Float:
-    """Return frequency, damping ratio and relative shape of the observed modes of a model.
+    """Return the natural frequency, damping ratio and relative shape of the observed modes.
 
     Parameters
     ----------
@@ -57,6 +57,7 @@ def modal_features(
     first_row = model.static_output_count
     rows = [first_row + model.accelerations.index(name) for name in section.accelerometers]
     shape = modes.output[rows][:, section.mode_indices]
+    # The amplitude of a mode shape is arbitrary; its ratio to the first accelerometer is not.
     relative_shapes = shape[1:] / shape[0]
     damping_ratio = rayleigh_damping_ratio(alpha, beta, frequency)
     return np.column_stack([frequency, damping_ratio, *relative_shapes])
@@ -65,8 +66,9 @@ def modal_features(
 class RecordedStructure(Asset):
     """The FMU of a structure in motion: each step records accelerations and identifies the modes.
 
-    Each record begins at rest. The sensor readings are the identified features with their
-    covariance; the observation without noise has the features of the packed model.
+    Each record begins in static equilibrium. The sensor readings are the identified features of
+    the modes with their covariance. The observation without noise has the features of the modes of
+    the model that was packed.
 
     Parameters
     ----------
@@ -112,7 +114,10 @@ class RecordedStructure(Asset):
         self._step = 0
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make the record of a step and identify its modes.
+        """Simulate the record of a step, and identify the modes from it.
+
+        The reading has the true features, the identified ones with their covariance, and the
+        standard error of each as a monitor.
 
         Raises
         ------
@@ -142,7 +147,10 @@ class RecordedStructure(Asset):
         return AssetReading(true_features, monitors, sensed=sensed)
 
     def _simulate_record(self, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        """Return the noisy accelerations (N, A) of the record of a step."""
+        """Return the noisy accelerations (N, A) of one step: N samples of A accelerometers [m/s^2].
+
+        The structure is excited by white noise, or released from a held load.
+        """
         record = self._record
         # A generator of its own for each step, so that a resumed run draws the same numbers.
         seeds = seed_sequence(self._scenario.mission.seed, "asset").generate_state(4).tolist()
@@ -162,7 +170,7 @@ class RecordedStructure(Asset):
         return acceleration + record.noise * random.standard_normal(acceleration.shape)
 
     def _true_features(self, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        """Return the features (M, 1 + A) of the packed model."""
+        """Return the features (M, 1 + A) of the M true modes, from the packed model."""
         model = self._model
         values = {**self._parameters, **control, **health}
         inputs = model.vector(
@@ -173,11 +181,14 @@ class RecordedStructure(Asset):
         return modal_features(model, inputs, self._section, damping)
 
     def save_state(self) -> bytes:
-        """Return the number of records that were made; each record begins at rest."""
+        """Return the number of records made, as bytes.
+
+        It is the whole state: each record begins in equilibrium, with noise seeded by its number.
+        """
         return str(self._step).encode()
 
     def restore_state(self, state: bytes) -> None:
-        """Continue after a number of records."""
+        """Continue after the number of records that `save_state` returned."""
         self._step = int(state)
 
     def close(self) -> None:

@@ -125,13 +125,13 @@ class NamedStructure(AssetSource):
         return [parameter.name for parameter in self.design.parameter] + free_masses
 
     def load_reduced_model(self, progress: Progress) -> "ReducedModel":
-        """Return the reduced model; it comes from the cache if it is there."""
+        """Return the reduced model of the structure, from the cache if the cache has it."""
         from fe.reduction.model_cache import reduced_model
 
         return reduced_model(self.file, progress=progress)
 
     def check_model(self) -> None:
-        """Check what the reduced model is made of, as far as that takes no time."""
+        """Check the mesh or matrices of the structure, without reducing it."""
         from fe.reduction.model_cache import check_structure
 
         check_structure(self.file)
@@ -174,7 +174,7 @@ class NamedStructure(AssetSource):
         return True
 
     def _frequency_count(self) -> int:
-        """Return how many natural frequencies are observed; refuse too many."""
+        """Return how many natural frequencies are observed; refuse more than a structure has."""
         observation = self._scenario.observation
         if observation.role != "frequency":
             return 0
@@ -245,7 +245,8 @@ class NamedStructure(AssetSource):
     def _check_parameter(self, *, believed: bool) -> None:
         """Refuse a calibration whose source, parameters or design are not those of the structure.
 
-        Its design is compared only if the structure is believed: what only flies may differ.
+        The design is compared only if the twin believes the structure; a structure that only flies
+        may differ from the calibrated one.
         """
         calibration = self._scenario.calibration
         if calibration.source == "static_test" and self.advice.static_test:
@@ -269,10 +270,10 @@ class NamedStructure(AssetSource):
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
         """Refuse values of the scenario outside the ranges of the structure's inputs.
 
-        Inputs that the structure does not have are passed over.
+        Values of inputs that the structure does not have are not checked.
         """
         for description, name, value in self._chosen_values(parameters):
-            low, high = self.design.ranges.get(name, (value, value))
+            low, high = self.design.ranges.get(name, (value, value))  # without a range any value
             if not low <= value <= high:
                 raise MissionInputError(
                     f"the {description} is {value:.6g}, but {self.full_name} gives {name} the "
@@ -381,10 +382,10 @@ class ReducedModelSource(NamedStructure):
         return slice(gauge_count, None)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted strains, displacements, frequencies or features of modes.
+        """Return the predicted observations: strains, displacements, or features of modes.
 
-        Kapteyn et al. 2021, eqs. (13), (15). Frequencies are in rising order. Frequencies and modes
-        do not depend on the control.
+        See Kapteyn et al. 2021, eqs. (13) and (15). Natural frequencies are in rising order.
+        Features of modes do not depend on the control, and are repeated for each control.
 
         Parameters
         ----------
@@ -409,7 +410,7 @@ class ReducedModelSource(NamedStructure):
         if not self._observes_modes:
             outputs = self.prepared_model.static_outputs(inputs)
             return outputs[:, self._observed_outputs].reshape(*shape, -1)
-        # One control is enough, as modes do not depend on it.
+        # Compute modes for the first control only: they do not depend on it.
         inputs_of_first_control = inputs.reshape(*shape, -1)[:, :, 0]
         rows = inputs_of_first_control.reshape(-1, inputs.shape[1])
         features = np.array([self._observed_features(row) for row in rows])
@@ -417,28 +418,40 @@ class ReducedModelSource(NamedStructure):
         return np.repeat(features, len(controls), axis=2)
 
     def _inputs_of_all_cases(self, draws: ParameterDraws, states: Float) -> Float:
-        """Return the model's inputs (E * S * U, V) in every draw, state and control.
+        """Return the V model inputs for all combinations of draw, state and control.
 
-        The control varies fastest. The states are (S, F).
+        Parameters
+        ----------
+        draws : ParameterDraws
+            The E draws of the parameter.
+        states : (S, F) array
+            The value of each state factor in each joint state, SI.
+
+        Returns
+        -------
+        (E * S * U, V) array
+            One row for each combination; the control varies fastest, the draw slowest.
         """
         reduced = self.prepared_model
         scenario = self._scenario
         controls = scenario.control
+        # The index of draw, state and control in each row.
         indices = np.indices((len(draws.values), len(states), len(controls)))
-        draw, state, control = (index.ravel() for index in indices)
-        columns: dict[str, Float | float] = {}
+        draw_of_row, state_of_row, control_of_row = (index.ravel() for index in indices)
+        # The values of each input, one for each row or one for all rows.
+        input_values: dict[str, Float | float] = {}
         for name, value in scenario.asset.constant_load.items():
             if name in reduced.input_names:
-                columns[name] = value
+                input_values[name] = value
         for name, values in draws.others.items():
             if name in reduced.input_names:
-                columns[name] = values[draw]
-        columns[draws.name] = draws.values[draw]
-        columns |= zip(scenario.state_names, states[state].T, strict=True)
+                input_values[name] = values[draw_of_row]
+        input_values[draws.name] = draws.values[draw_of_row]
+        input_values |= zip(scenario.state_names, states[state_of_row].T, strict=True)
         for name in controls[0].values:
             values_by_control = np.array([entry.values[name] for entry in controls])
-            columns[name] = values_by_control[control]
-        return reduced.vectors(columns)
+            input_values[name] = values_by_control[control_of_row]
+        return reduced.vectors(input_values)
 
     def _observed_features(self, inputs: Float) -> Float:
         """Return the observed frequencies or features of modes (G,) under the inputs (V,)."""

@@ -86,7 +86,7 @@ def resolve_scenario(
 ) -> Scenario:
     """Return the scenario with the overrides and with absolute paths.
 
-    Relative paths of a scenario file start at the folder of that file.
+    A relative path in a scenario file is relative to the folder of that file.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def resolve_scenario(
     MissionInputError
         If the overrides contradict each other, or the scenario.
     ScenarioError
-        If the scenario with the overrides breaks the schema.
+        If the scenario with the overrides has an unknown or missing key, or a wrong value.
     """
     overrides = as_overrides(overrides)
     folder = loaded.path.resolve().parent
@@ -113,10 +113,14 @@ def resolve_scenario(
     if overrides.calibration:
         table["calibration"]["source"] = "file"
         table["calibration"]["file"] = str(overrides.calibration.resolve())
+    # A calibration of a wing contains the calibrated design, which replaces those of the scenario.
     calibration_file = table["calibration"]["file"]
     if calibration_file and not is_of_parameters(calibration_file):
         _use_calibrated_design(table)
-    elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _design_tables(table)):
+    elif any(
+        design_table.get("design") == CALIBRATED_DESIGN_NAME
+        for design_table in _design_tables(table)
+    ):
         raise MissionInputError(
             "the design of a calibration is asked for, and there is no calibration file: give "
             '--calibration, or `source = "file"` in the table `calibration`.'
@@ -131,22 +135,24 @@ def resolve_scenario(
 
 
 def _override_asset(table: Table, overrides: Overrides) -> None:
-    """Change what flies in the table of a scenario.
+    """Replace the asset in the table of a scenario, in place, by that of the command line.
 
-    The keys of the asset stay as far as the kind that flies has them.
+    The keys of the scenario's asset are kept if the kind of the new asset has them.
     """
-    former = table["asset"]
+    former_asset = table["asset"]
     library = overrides.strain_library
     files_by_kind = {"ssp": overrides.ssp, "fmu": overrides.fmu, "strain_library": library}
     given_files = {kind: file for kind, file in files_by_kind.items() if file}
-    _check_asset_overrides(former, overrides, len(given_files))
+    _check_asset_overrides(former_asset, overrides, len(given_files))
     for kind, file in given_files.items():  # there is one at most
         keys_of_kind = AssetSection.kinds()[kind].model_fields
-        asset = {key: value for key, value in former.items() if key in keys_of_kind and value != ""}
+        asset = {
+            key: value for key, value in former_asset.items() if key in keys_of_kind and value != ""
+        }
         if kind == "strain_library" and file.is_dir():
             file = file / FILE_NAME
         table["asset"] = asset | {"kind": kind, "file": str(file.resolve())}
-    if library and former["kind"] != "strain_library":
+    if library and former_asset["kind"] != "strain_library":
         table["belief"] = {"kind": "asset"}
     if overrides.binding:
         table["asset"]["binding"] = str(overrides.binding.resolve())
@@ -157,7 +163,8 @@ def _override_asset(table: Table, overrides: Overrides) -> None:
 def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) -> None:
     """Refuse overrides that contradict each other, or the table of the asset.
 
-    The number of files is that of the overrides which replace what flies.
+    `file_count` is the number of overrides that replace the asset: an FMU, an SSP file, and a
+    strain library.
     """
     if file_count > 1:
         raise MissionInputError(
@@ -187,7 +194,8 @@ def _design_tables(table: Table) -> list[Table]:
 def _use_calibrated_design(table: Table) -> None:
     """Replace the designs in the table of a scenario by that of the calibration file.
 
-    The design of the asset is replaced, and every other one that the twin believes as well.
+    The design of the asset and the believed design are replaced. The design of a component is
+    replaced if it is the believed one. The table is changed.
     """
     asset = table["asset"]
     belief = table["belief"]
@@ -197,12 +205,12 @@ def _use_calibrated_design(table: Table) -> None:
             "calibration file."
         )
     believed_design = belief.get("design")
-    for part in _design_tables(table):
-        design = part.get("design")
-        if design and (part is asset or design == believed_design):
-            part["design"] = CALIBRATED_DESIGN_NAME
-            if part.get("kind") == "design":
-                part["kind"] = "calibration"
+    for design_table in _design_tables(table):
+        design = design_table.get("design")
+        if design and (design_table is asset or design == believed_design):
+            design_table["design"] = CALIBRATED_DESIGN_NAME
+            if design_table.get("kind") == "design":
+                design_table["kind"] = "calibration"
 
 
 _PREDICTION_COPIES = 8
@@ -213,9 +221,13 @@ _HISTORY_COPIES = 4
 
 
 def scenario_bytes(scenario: Scenario) -> dict[str, float]:
-    """Return the sizes of what the twin of a scenario keeps in memory [bytes].
+    """Estimate how much memory the arrays of a scenario's twin need.
 
-    The keys describe the parts in words, with their numbers.
+    Returns
+    -------
+    dict of str to float
+        The size of each group of arrays [bytes], by a description for the message: transitions,
+        predictions and beliefs.
     """
     state_count = prod(len(factor.levels) for factor in scenario.state)
     control_count = len(scenario.control)
@@ -252,7 +264,7 @@ def check_scenario_fits(scenario: Scenario) -> None:
 
 
 def asset_source(scenario: Scenario) -> AssetSource:
-    """Return the source of what a resolved scenario flies and of what its twin believes.
+    """Return the source of the asset that flies and of the predictions that the twin believes.
 
     Parameters
     ----------
@@ -262,8 +274,8 @@ def asset_source(scenario: Scenario) -> AssetSource:
     Raises
     ------
     MissionInputError
-        If the scenario has no asset; if it flies a strain library and names none, or one that is
-        missing, damaged or does not fit; or if the twin cannot believe what it is to believe.
+        If the scenario has no asset; if its strain library is not named, is missing or damaged, or
+        does not fit; or if the believed model does not go with the asset.
     InvalidModelError
         If the twin of the scenario does not fit in memory.
     """
@@ -278,7 +290,7 @@ def asset_source(scenario: Scenario) -> AssetSource:
 
 
 def believed_source(scenario: Scenario) -> AssetSource:
-    """Return the source of what the twin of a scenario believes.
+    """Return the source of the predictions that the twin of a scenario believes.
 
     Parameters
     ----------
@@ -288,7 +300,7 @@ def believed_source(scenario: Scenario) -> AssetSource:
     Raises
     ------
     MissionInputError
-        If the twin cannot believe what it is to believe.
+        If the believed model does not go with the asset.
     InvalidModelError
         If the twin of the scenario does not fit in memory.
     """
@@ -322,9 +334,10 @@ class LearntFile(Section):
 
 
 def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
-    """Replace what the twin of a scenario assumes by what a fleet has learnt.
+    """Replace assumptions of the twin in the table of a scenario by those that a fleet has learnt.
 
-    The truth of the scenario stays as it is.
+    These are the transitions, the sensor noise and the distribution of the parameter. The truth
+    of the scenario stays the same.
 
     Parameters
     ----------
@@ -333,12 +346,14 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
     path : Path
         The file of `uav-twin fleet learn`.
     group : str, optional
-        The group of assets. If the file does not have it, what was learnt for a new asset is used.
+        The group of assets. If the file does not have the group, the tables for a new asset are
+        used.
 
     Raises
     ------
     MissionInputError
-        If the file is not of this kind, or has other controls or another parameter.
+        If the file cannot be read or has other tables, or its controls or parameter are not those
+        of the scenario.
     """
     content = read_toml(path, MissionInputError, what="file of what was learnt")
     learnt_file = validate(
@@ -349,7 +364,8 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
         _check_learnt_transition(table, learnt["transition"], path)
         truth = table["truth"]
         if truth["kind"] == "random_growth" and not truth["probability"]:
-            # The truth had the probabilities of the twin by default, and keeps them.
+            # Without probabilities of its own the truth has those of the twin. It keeps the ones
+            # that the scenario states, although the twin now assumes the learnt ones.
             truth["probability"] = table["transition"]["probability"]
     if learnt.get("calibration"):
         learnt_parameter = learnt["calibration"].get("parameter")
@@ -375,9 +391,10 @@ def _check_learnt_transition(
 def _normal_calibration(
     calibration: Mapping[str, Any], learnt_parameter: object, path: Path
 ) -> Table:
-    """Return the table `calibration` of a normal distribution, still without its moments.
+    """Return the table `calibration` for a normal distribution, without parameter and moments.
 
-    The file of what was learnt has parameter, mean and standard deviation.
+    The caller adds these from the file of learnt tables. An other learnt parameter than that of the
+    scenario is refused.
     """
     if learnt_parameter != calibration["parameter"]:
         raise MissionInputError(

@@ -39,7 +39,7 @@ REGION_NAMES = ("z1", "z2")
 PERCENT = 1e-2
 MICROSTRAIN = 1e-6
 _MEAN_ENTRY = "mean"
-"""Key of the strains at the mean of Young's modulus, beside those of the draws."""
+"""Key of the strains at the mean of Young's modulus; the other keys are the draws."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class StrainLibrary:
     def strain_at(self, stiffness_loss: Sequence[float], control_index: int) -> Float:
         """Return the strain in a damage state that may lie between the levels.
 
-        It is interpolated in the stiffness losses, multilinearly, from the entry "mean".
+        The strains of the entry "mean" are interpolated linearly in the loss of each region.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class StrainLibrary:
             If the state lies outside the levels.
         """
         strain = self.strain[:, control_index].reshape(*self.states.shape, -1)
-        # Each pass interpolates in one region, and so removes the first axis.
+        # One axis for each region, then the gauges. Each pass sums over the first axis.
         for factor, loss in zip(self.states.factors, stiffness_loss, strict=True):
             levels = factor.levels
             if not levels[0] <= loss <= levels[-1]:
@@ -102,8 +102,11 @@ class StrainLibrary:
                     f"the strain library covers {factor.name} from {levels[0]:g} to "
                     f"{levels[-1]:g}, got {loss:g}"
                 )
-            # The weight of a level is the piecewise linear function that is 1 there.
-            weights = [np.interp(loss, levels, unit) for unit in np.eye(len(levels))]
+            # The weight of a level is the piecewise linear function that is 1 at this level and 0
+            # at the others.
+            weights = [
+                np.interp(loss, levels, level_values) for level_values in np.eye(len(levels))
+            ]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
 
@@ -183,7 +186,7 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
 
 
 def _is_finite_vector(row: Any, length: int) -> bool:
-    """Return whether a row consists of a number of finite numbers."""
+    """Return whether a row of the file is a list of `length` finite numbers."""
     if np.shape(row) != (length,):
         return False
     return bool(np.all(np.isfinite(np.asarray(row, dtype=np.float64))))
@@ -199,7 +202,7 @@ class StrainLibrarySection(AssetSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario) -> "StrainLibrarySource":
-        """Return the source of the library, which is read.
+        """Read the library and return its source.
 
         Raises
         ------
@@ -226,7 +229,7 @@ class StrainLibraryBelief(BeliefSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
-        """Return the source of the library, which is read.
+        """Read the library and return its source.
 
         Raises
         ------
@@ -279,7 +282,7 @@ class StrainLibrarySource(AssetSource):
             )
 
     def draw_summary(self) -> tuple[str, int]:
-        """Return where the draws come from, in words, and their number."""
+        """Return the origin of the parameter's draws, in words, and their number."""
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
@@ -294,7 +297,7 @@ class StrainLibrarySource(AssetSource):
         )
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the library's strains (E, S, U, G) for the states and controls of the scenario.
+        """Return the library's strains (E, S, U, G), by draw, state, control and gauge.
 
         Raises
         ------
@@ -306,9 +309,9 @@ class StrainLibrarySource(AssetSource):
         return self._library.strain_per_draw[:, rows][:, :, self._control_indices]
 
     def open(self) -> Asset:
-        """Return an asset with the strains at the mean of the parameter.
+        """Return an asset with the strains at the mean of the parameter, noise-free.
 
-        They are interpolated between the damage levels.
+        The strains are interpolated between the damage levels of the library.
         """
         names = self._scenario.state_names
         control_values = [control.values for control in self._scenario.control]
@@ -322,14 +325,17 @@ class StrainLibrarySource(AssetSource):
 
 
 def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
-    """Return the source of a library that is read from a file.
+    """Read a library from a file and return its source.
 
-    Beside another model, a control such as `3g` must have that load factor in the scenario.
+    If either the asset or the believed model is not the library, the load factor of each control is
+    checked: the library states it in the control's name, such as `3g`, and the scenario as an
+    input.
 
     Raises
     ------
     MissionInputError
-        If it has another one: asset and model would fly different turns.
+        If the two load factors of a control differ, so that asset and model would fly different
+        turns; or if the library is missing, damaged or does not fit the scenario.
     """
     if scenario.models_differ:
         for control in scenario.control:
@@ -337,6 +343,7 @@ def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
                 library_load_factor = float(control.name.removesuffix("g"))
             except ValueError:
                 continue  # the name of the control contains no load factor
+            # An input that the scenario does not state cannot contradict the name.
             load_factor = control.values.get("load_factor", library_load_factor)
             if abs(load_factor - library_load_factor) > _LOAD_FACTOR_TOLERANCE:
                 raise MissionInputError(

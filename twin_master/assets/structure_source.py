@@ -31,14 +31,14 @@ class StructureFiles(FileSection):
     """A table that names a structure file, which names a mesh or matrices beside it."""
 
     def all_files(self) -> dict[str, Path]:
-        """Return all files, those that the structure names too, by the paths of their copies.
+        """Return the structure file and the mesh or matrices that it names, by their copies' paths.
 
         Raises
         ------
         InvalidDesignError
             If the structure file cannot be read or is wrong.
         MissionInputError
-            If one of its files is not beside it.
+            If a file that it names is not in its folder or in one below that.
         """
         from fe.structure.design import load_structure
 
@@ -96,7 +96,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
     parameters = FmuSource.parameters
 
     def binding(self) -> Binding:
-        """Return the binding of the user, or that which follows from the structure."""
+        """Return the binding of the user, or else one with the structure's inputs and outputs."""
         if self._folder is not None or self.section.binding:
             return super().binding()
         from fmu_asset.structures import structure_binding
@@ -104,23 +104,26 @@ class StructureFmuSource(NamedStructure, FmuSource):
         return structure_binding(self.design, self._frequency_count())
 
     def _check_calibration(self, binding: Binding) -> None:
-        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
+        """Refuse a kind of FMU that cannot be built here, and a calibration that does not fit."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed)
         self._check_parameter(believed=isinstance(self._scenario.belief, AssetBelief))
 
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
-        """Return the positions of a role in the binding; none if features of modes are observed."""
+        """Return the positions of a role in the binding; none if features of modes are observed.
+
+        Features of modes are no outputs of the FMU. They are identified from its accelerations.
+        """
         if self._scenario.observation.modes is None:
             return super()._observation_slice(binding, role)
         self._check_observed()
-        return slice(0)  # the features are identified from accelerations
+        return slice(0)
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding, after the structure is checked; it is not packed for a check."""
+        """Check the structure without packing it, and return the binding unchanged."""
         has_user_binding = "binding" in self.section.user_files()
-        if not has_user_binding:  # the parameters then have the names of the structure
+        if not has_user_binding:  # the parameters of the scenario are then those of the structure
             self._check_ranges(self.section.parameters)
         self.check_model()
         return binding

@@ -38,8 +38,8 @@ def export_scenario(
 ) -> Path:
     """Write the asset of a scenario as an SSP file.
 
-    The parameter set of the file contains the parameters of the scenario, the values that are drawn
-    for its seeds, and its constant loads.
+    The file contains the FMUs, their connections, and a parameter set with the parameters of the
+    scenario, the integers drawn for its seeds, and its constant loads.
 
     Parameters
     ----------
@@ -132,7 +132,8 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
     fmu : Path
         The FMU.
     binding : Binding
-        Its binding, after which the component is named.
+        The binding of the FMU. The component has its name, with `_` for characters that are no
+        letters or digits.
     """
     component_name = re.sub(r"[^A-Za-z0-9_]", "_", binding.name)
     inputs = []
@@ -159,9 +160,9 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
 def _with_unbound_parameters(
     binding: Binding, fmu: Path, parameters: Mapping[str, float]
 ) -> Binding:
-    """Return a binding that also has the parameters which it lacks and the FMU has.
+    """Return the binding, completed by the parameters of a scenario that only the FMU has.
 
-    Effects add such parameters, which a scenario calls by their names in the FMU.
+    Missing effects add such parameters to an FMU. A scenario uses their names in the FMU.
     """
     description = read_fmu(fmu)
     bound_parameters = dict(binding.parameter)
@@ -178,7 +179,17 @@ def _with_unbound_parameters(
 def _with_values(
     wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
 ) -> Wiring:
-    """Return the system with values of parameters and loads, which are in the binding's units."""
+    """Return the system with the start values of parameters and loads at its components.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        The system.
+    binding : Binding
+        The binding of the system.
+    parameters, load : mapping of str to float
+        The values by their names in the binding, in its units.
+    """
     # The values of the system's connectors, in the units of the system.
     system = system_description(wiring)
     exchange = Exchange(system, binding)
@@ -202,9 +213,9 @@ def _with_values(
 
 
 def _parameter_names(wiring: Wiring, binding: Binding) -> dict[Endpoint, str]:
-    """Return the binding's names of the parameters and loads by their ends.
+    """Return the binding's name of each parameter and load, by the component variable it sets.
 
-    A parameter that leads to several components has no end of its own, and is left out.
+    A parameter that sets variables of several components is left out, as none of them is its own.
     """
     system = system_description(wiring)
     names = {}

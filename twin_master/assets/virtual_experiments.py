@@ -26,16 +26,17 @@ BINDING = "uav_wing_laboratory"
 class FmuTestBench(ExitStack):
     """The wing FMU as a `calibration.virtual_wing.TestBench`, loaded and released through FMI.
 
-    A weight is a tip force in the quasi-static response; the displacement of the load point is
-    read. A release is the parameter `initial_tip_displacement` of the transient response; each
-    sample of the record is a communication step. The FMU runs in a worker process of its own.
+    In the load test, a weight is a tip force in the quasi-static response, and the displacement of
+    the load point is read. In the ring-down test, the parameter `initial_tip_displacement` of the
+    transient response displaces the tip before its release, and each sample of the record takes one
+    communication step. The FMU runs in a worker process of its own.
 
     Parameters
     ----------
     fmu : Path
         The wing FMU.
     truth : DigitalState
-        The true state of the wing; its geometry is that of the FMU's wing.
+        The true parameters and damage of the wing. Its geometry is not used: the FMU has its own.
 
     Raises
     ------
@@ -63,7 +64,7 @@ class FmuTestBench(ExitStack):
         self.callback(self._static.close)
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement of the load point, 5 cm from the tip, under a load there.
+        """Return the displacement of the load point, 5 cm from the tip, under a load at that point.
 
         Parameters
         ----------
@@ -81,7 +82,7 @@ class FmuTestBench(ExitStack):
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Return the record of a gauge after the displaced tip is released.
+        """Return the signal of a strain gauge while the wing swings after its tip is released.
 
         Parameters
         ----------
@@ -112,8 +113,9 @@ class FmuTestBench(ExitStack):
             # The first sample is the initial state, and each step gives a further one.
             step_count = time.size - 1
             history = simulate_from_now(session, step_count, {})
+        # from strain to volts
         return time, SENSITIVITY * history.values[:, RECORDED_GAUGE - 1]
 
     def _open_session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
-        """Return the FMU with a binding, the true parameters and further ones."""
+        """Return the FMU with the true parameters of the wing, and those given in addition."""
         return FmiAsset(self._fmu, binding, parameters=self._parameters | parameters)

@@ -28,19 +28,20 @@ STEP_TIMEOUT = 60.0
 _LONGEST_BLOCK = 4096
 """Largest number of points in a block."""
 _LEAST_BLOCKS = 64
-"""Number of blocks of a grid that is not large, so that several workers share them."""
+"""Least number of blocks into which a grid of enough points is divided, so that several workers
+share them."""
 
 
 @dataclass(frozen=True)
 class SamplingGrid:
-    """The points at which an FMU is sampled: every draw, state and control.
+    """The points at which an FMU is sampled: all combinations of draw, state and control.
 
     Attributes
     ----------
     fmu, binding : str
-        The files.
+        The paths of the FMU and of its binding.
     role : str
-        The observation of the binding.
+        The observed quantity, by its name in the binding.
     parameter : str
         The uncertain parameter; empty without one.
     draws : tuple of float
@@ -54,7 +55,7 @@ class SamplingGrid:
     parameters : dict of str to float
         The other parameters that are the same at every point.
     others : dict of str to tuple of float
-        The parameters that have a value of their own at each draw.
+        For each other calibrated parameter, its value at each draw.
     settling_steps : int
         The number of steps from a fresh start at every point; 0 for an FMU without memory.
     step_timeout : float
@@ -87,9 +88,9 @@ class SamplingGrid:
 
     @property
     def blocks(self) -> tuple[tuple[int, int], ...]:
-        """The first point of each block, and the point after its last; they follow from the grid.
+        """The blocks of points that are sampled together: first point, and point after the last.
 
-        An interrupted sampling therefore finds the same blocks again.
+        They depend on the grid alone, so that an interrupted sampling continues with the same ones.
         """
         length = min(_LONGEST_BLOCK, max(1, math.ceil(self.size / _LEAST_BLOCKS)))
         firsts = range(0, self.size, length)
@@ -109,22 +110,23 @@ _ROLES = ("health", "control", "load", "parameter")
 
 
 def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the values of texts such as `NAME=VALUES`.
+    """Read the values of FMU inputs and parameters from texts of the form `NAME=VALUES`.
 
-    NAME is a name of the binding, or ROLE.NAME if several roles have it. VALUES are numbers with
-    commas, or FIRST:LAST:COUNT.
+    NAME is the name of an input or parameter in the binding; if several roles have the name, it is
+    written ROLE.NAME. VALUES are numbers separated by commas, or FIRST:LAST:COUNT for equally
+    spaced numbers.
 
     Parameters
     ----------
     texts : sequence of str
         The texts.
     binding : Binding
-        The binding that knows the names.
+        The binding of the FMU.
 
     Returns
     -------
     dict of str to dict of str to tuple of float
-        The values by role and name; every role is there.
+        The values by role and name. A role without values has an empty entry.
 
     Raises
     ------
@@ -150,7 +152,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
 
 
 def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
-    """Return role and name of the inputs of a binding that NAME or ROLE.NAME may mean."""
+    """Return role and name of each input of a binding that the text NAME or ROLE.NAME can mean."""
     role, _, inner_name = name.partition(".")
     if role in _ROLES and inner_name in getattr(binding, role):
         return [(role, inner_name)]
@@ -158,7 +160,7 @@ def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
 
 
 def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
-    """Return numbers with commas, or FIRST:LAST:COUNT; the whole text is for the message."""
+    """Return the numbers of VALUES in `NAME=VALUES`; `text` is all of it, for the message."""
     try:
         if ":" in values_text:
             first, last, count = values_text.split(":")
@@ -185,26 +187,26 @@ def grid_of_fmu(
     role: str | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid over given values of an FMU's inputs.
+    """Return the grid over the values of an FMU's inputs that a user gives.
 
     The controls are all combinations of the values of the control inputs.
 
     Parameters
     ----------
     fmu, binding_file : Path
-        The files.
+        The paths of the FMU and of its binding.
     texts : sequence of str
         The values, as `parse_grid` reads them.
     role : str, optional
-        The observation of the binding; it may be absent if the binding has one only.
+        The observed quantity, by its name in the binding; by default the only one of the binding.
     settling_steps : int
         The number of steps from a fresh start at every point; 0 for an FMU without memory.
 
     Raises
     ------
     MissionInputError
-        If a text is wrong, a name that can have one value has several, or the binding has several
-        observations and no role is given.
+        If a text cannot be read, a load or more than one parameter has several values, or the
+        binding has several observed quantities and no role is given.
     """
     binding = load_binding(binding_file)
     values_by_role = parse_grid(texts, binding)
@@ -242,13 +244,13 @@ def grid_of_fmu(
 def _combined_controls(
     inputs: Mapping[str, tuple[float, ...]],
 ) -> dict[str, dict[str, float]]:
-    """Return all combinations of the values of control inputs, by a name that lists them."""
+    """Return all combinations of the values of control inputs, by names such as "load = 2"."""
     if not inputs:
         return {}
-    combinations = math.prod(len(values) for values in inputs.values())
-    if combinations > LARGEST_COUNT:
+    control_count = math.prod(len(values) for values in inputs.values())
+    if control_count > LARGEST_COUNT:
         raise MissionInputError(
-            f"the values of {comma_list(inputs)} make {combinations} controls, and a library "
+            f"the values of {comma_list(inputs)} make {control_count} controls, and a library "
             f"holds at most {LARGEST_COUNT}: give fewer values."
         )
     controls = {}
@@ -260,7 +262,7 @@ def _combined_controls(
 
 
 def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
-    """Return the value of each load input, which can have only one."""
+    """Return the one value of each load input; refuse a load with several values."""
     for name, values in loads.items():
         if len(values) > 1:
             raise MissionInputError(f"the load {name} can have one value, and {len(values)} came.")
@@ -275,9 +277,10 @@ def grid_of_scenario(
     overrides: Overrides | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid that a scenario needs.
+    """Return the grid at whose points the twin of a scenario needs observations.
 
-    The draws are those of the scenario's calibration and seed.
+    The draws are those of the scenario's calibration and seed. The FMU of the scenario is prepared,
+    which may pack it.
 
     Parameters
     ----------
@@ -289,17 +292,19 @@ def grid_of_scenario(
         Other levels of the states and values of the uncertain parameter, as `parse_grid` reads
         them.
     overrides : Overrides, optional
-        What the command line states otherwise than the scenario.
+        The values of the command line that replace those of the scenario.
     settling_steps : int
         The number of steps from a fresh start at every point; 0 for an FMU without memory.
 
     Raises
     ------
     MissionInputError
-        If the scenario flies no single FMU, or a text gives a value of something else.
+        If the scenario does not fly a single FMU, or a text gives values of a control input, a
+        load, or a parameter other than the uncertain one.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         If the asset of the scenario cannot be prepared.
     """
+    # the FMU that flies
     scenario = resolve_scenario(_without_library(loaded), overrides)
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
@@ -312,6 +317,7 @@ def grid_of_scenario(
     source.check()
     source.prepare(folder, reporter())
 
+    # the values that the user gives instead of those of the scenario
     binding = load_binding(folder / BINDING_COPY)
     values_by_role = parse_grid(texts, binding)
     draws = source.draws(scenario.mission.seed)
@@ -324,12 +330,16 @@ def grid_of_scenario(
         )
     levels = {factor.name: factor.levels for factor in scenario.state}
     values = parameters.get(draws.name, tuple(draws.values.tolist()))
+    # Other calibrated parameters are correlated with the uncertain one, and have their conditional
+    # expectation at each of its values.
     calibration = read_calibration(scenario.calibration)
     dependent_parameters = {}
     if calibration is not None:
-        expected = calibration.given(draws.name, np.array(values))
+        expectations = calibration.given(draws.name, np.array(values))
         dependent_parameters = {
-            name: tuple(expected[name].tolist()) for name in expected if name in binding.parameter
+            name: tuple(expectations[name].tolist())
+            for name in expectations
+            if name in binding.parameter
         }
     fixed_parameters = flown.parameters()
     fixed_parameters.pop(draws.name, None)
@@ -350,9 +360,10 @@ def grid_of_scenario(
 
 
 def _without_library(loaded: LoadedScenario) -> LoadedScenario:
-    """Return a scenario that believes a library, which is yet to be sampled, without it.
+    """Return the scenario without the observation library that its twin believes.
 
-    The twin then believes the design that the library is of, or what is flown.
+    The library is yet to be sampled. In its place the twin believes the wing design that the table
+    `belief` names, or else the asset itself.
     """
     belief = loaded.scenario.belief
     if not isinstance(belief, LibraryBelief):

@@ -9,16 +9,18 @@ from twin_master.errors import MissionInputError
 from twin_master.library.grid import SamplingGrid
 
 MEMORY_TOLERANCE = 1e-8
-"""Two visits of a point that differ by more than this fraction of the value show that the FMU has
-a memory."""
+"""Largest difference of two observations at the same point of an FMU without memory, as a fraction
+of the value; a larger one shows that the FMU remembers earlier steps."""
 SETTLED_TOLERANCE = 1e-3
-"""Largest change, as a fraction of the value, if a point is given as many steps again to settle."""
+"""Largest change of a settled observation, as a fraction of the value, in another `settling_steps`
+steps."""
 
 
 class GridSampler:
     """An FMU that returns the observations of blocks of a grid.
 
-    Every block begins with a reset, so that its observations do not depend on the blocks before it.
+    Every block begins with a reset of the FMU, so that its observations do not depend on which
+    blocks were sampled before.
 
     Parameters
     ----------
@@ -41,7 +43,7 @@ class GridSampler:
         self._asset.close()
 
     def observe_block(self, first: int, last: int) -> Float:
-        """Return the observations of a block of points.
+        """Return the observations of a block of points, after a check that they are repeatable.
 
         Parameters
         ----------
@@ -51,35 +53,38 @@ class GridSampler:
         Returns
         -------
         (last - first, G) array
+            The values of the G sensors at each point.
 
         Raises
         ------
         MissionInputError
             If the FMU has a memory, or does not settle.
         FmuError
-            If the FMU failed. The sentence names the point.
+            If the FMU failed. The message names the point.
         """
         settles = self._grid.settling_steps > 0
-        # The points of a draw follow each other. An FMU without memory is started once for each
-        # draw, because it takes its parameters at the start only; one that settles at each point.
+        # The draw varies slowest over the points. Parameters can be set only at the start of the
+        # FMU, so that an FMU without memory is started once for each draw. An FMU that settles is
+        # started at each point.
         points_per_start = 1 if settles else self._grid.size // len(self._grid.draws)
-        parts = []
+        observations_per_start = []
         start = first
         next_start = first
         while next_start < last:
             start = next_start
             next_start = min((start // points_per_start + 1) * points_per_start, last)
             self._start_at(start)
-            parts.append(self._observe(start, next_start))
-        observations = np.concatenate(parts)
-        # The last point settles once more. Without settling, other points lie between the two
-        # visits of the point at the last start.
+            observations_per_start.append(self._observe(start, next_start))
+        observations = np.concatenate(observations_per_start)
+        # Repeat one observation, without a new start. An FMU that settles makes as many steps again
+        # at its last point. An FMU without memory returns to the point of its last start, and the
+        # points in between would change the observation if the FMU remembered them.
         repeated_point = last - 1 if settles else start
         self._check_repeated_point(repeated_point, observations[repeated_point - first])
         return observations
 
     def _start_at(self, point: int) -> None:
-        """Reset the FMU with the parameters of a point, and its inputs if it settles there."""
+        """Reset the FMU to the parameters of a point, and to its inputs if the FMU must settle."""
         grid = self._grid
         draw, state, control = grid.point(point)
         parameters = dict(grid.parameters)
@@ -96,7 +101,10 @@ class GridSampler:
             raise self._error_at(error, point) from error
 
     def _observe(self, first: int, last: int) -> Float:
-        """Return the observations (last - first, G) of points of one draw, after they settled."""
+        """Return the observations (last - first, G) at points of one draw, at the end of settling.
+
+        All points are simulated in one run, with `settling_steps` steps, at least one, at each.
+        """
         grid = self._grid
         steps_per_point = max(grid.settling_steps, 1)
         states = []
@@ -115,38 +123,45 @@ class GridSampler:
             if history.ended:
                 raise FmuEndedError(history.ended)
         except FmuInputError:
-            raise  # it comes before the first step, and names the value
+            raise  # a value is refused before the first step, and the error names it
         except FmuError as error:
             completed_steps = self._asset.step_index - steps_before
             if isinstance(error, FmuOutputError):
                 completed_steps -= 1  # the step was made; its outputs cannot be read
             failed_point = min(first + completed_steps // steps_per_point, last - 1)
             raise self._error_at(error, failed_point) from error
-        # The last step of each point.
+        # Only the last step at each point counts.
         return history.values[steps_per_point - 1 :: steps_per_point, self._observation_slice]
 
     def _error_at(self, error: FmuError, point: int) -> FmuError:
-        """Return an error with the name of the point at which it happened."""
-        # Of a worker that ends, only the last report is known, which may be some steps earlier.
+        """Return an error whose message begins with the point at which it happened."""
+        # A worker that ends abruptly has reported its progress some steps earlier.
         is_located = isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
         where = "at" if is_located else "at or soon after"
         sentence = f"{where} {self._point_name(point)}: {error.sentence}"
         return type(error)(sentence, error.messages)
 
     def _point_name(self, point: int) -> str:
-        """Return state, control and parameter of a point in words."""
+        """Return the state, control and parameter of a point in words, for messages."""
         grid = self._grid
         draw, state, control = grid.point(point)
-        parts = [f"{name} = {value:g}" for name, value in state.items()]
-        parts.append(f"control {control}")
+        settings = [f"{name} = {value:g}" for name, value in state.items()]
+        settings.append(f"control {control}")
         if grid.parameter:
-            parts.append(f"{grid.parameter} = {grid.draws[draw]:g}")
-        return ", ".join(parts)
+            settings.append(f"{grid.parameter} = {grid.draws[draw]:g}")
+        return ", ".join(settings)
 
     def _check_repeated_point(self, point: int, former: Float) -> None:
-        """Observe a point once more, and refuse the FMU if its observation (G,) changed.
+        """Observe a point again, and refuse the FMU if its observation changes too much.
 
-        An FMU without memory returns the same again, and one that has settled nearly the same.
+        An FMU without memory returns the same values, and an FMU that has settled nearly the same.
+
+        Parameters
+        ----------
+        point : int
+            The point.
+        former : (G,) array
+            The first observation at the point.
         """
         settling_steps = self._grid.settling_steps
         latter = self._observe(point, point + 1)[0]
@@ -154,19 +169,20 @@ class GridSampler:
         tolerance = SETTLED_TOLERANCE if settling_steps else MEMORY_TOLERANCE
         if not np.any(change > tolerance * np.maximum(np.abs(former), np.abs(latter))):
             return
-        worst = int(np.argmax(change))
-        sensor = self._asset.binding.observation[self._grid.role].variables[worst]
+        worst_sensor = int(np.argmax(change))
+        variable = self._asset.binding.observation[self._grid.role].variables[worst_sensor]
         fmu = self._grid.fmu
-        where = self._point_name(point)
-        before = f"{sensor} = {former[worst]:.9g}"
-        after = f"{latter[worst]:.9g}"
+        point_name = self._point_name(point)
+        former_value = f"{variable} = {former[worst_sensor]:.9g}"
+        latter_value = f"{latter[worst_sensor]:.9g}"
         if settling_steps:
             raise MissionInputError(
-                f"the FMU {fmu} has not settled after {settling_steps} steps: at {where} it shows "
-                f"{before}, and as many steps later {after}. Give a larger --settle."
+                f"the FMU {fmu} has not settled after {settling_steps} steps: at {point_name} it "
+                f"shows {former_value}, and as many steps later {latter_value}. Give a larger "
+                "--settle."
             )
         raise MissionInputError(
-            f"the FMU {fmu} remembers earlier steps: at {where} it shows {before} and, on a later "
-            f"visit, {after}. Give --settle STEPS, in which it settles from a fresh start at each "
-            "point."
+            f"the FMU {fmu} remembers earlier steps: at {point_name} it shows {former_value} and, "
+            f"on a later visit, {latter_value}. Give --settle STEPS, in which it settles from a "
+            "fresh start at each point."
         )

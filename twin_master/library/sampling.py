@@ -41,7 +41,7 @@ from twin_master.library.sampler import GridSampler
 from twin_master.network.transition import NUMBER, check_fits
 
 PLAN_NAME = "grid.json"
-"""File in the folder of blocks: what the library is a function of."""
+"""File in the folder of blocks: the grid and the hashes on which the library depends."""
 ROWS_NAME = "observations.npy"
 """File in the folder of blocks: the observations, NaN for blocks that are not finished."""
 _COPIES_IN_MEMORY = 3  # the blocks, all observations, and the library
@@ -88,7 +88,7 @@ def sample_library(
 ) -> SamplingOutcome:
     """Sample an FMU at every point of a grid and write the library.
 
-    The bytes of the file do not depend on the number of processes nor on interruptions.
+    The bytes of the file depend neither on the number of processes nor on interruptions.
 
     Parameters
     ----------
@@ -161,12 +161,25 @@ def _sample_blocks(
     worker_count: int,
     progress_stage: Stage,
 ) -> None:
-    """Fill the rows (N, G) of blocks; each thread has an FMU of its own.
+    """Sample blocks of points in several threads, each with an FMU in a process of its own.
 
-    If a thread fails, the others end, and the rows of finished blocks stay filled.
+    If a thread fails, the others end as well; finished blocks stay in `rows`.
+
+    Parameters
+    ----------
+    grid : SamplingGrid
+        The grid of N points.
+    rows : (N, G) array
+        The observations of the G sensors at all points; the rows of the blocks are filled in.
+    blocks : list of (int, int)
+        The first point of each block, and the point after its last; emptied at the end.
+    worker_count : int
+        The largest number of threads.
+    progress_stage : Stage
+        Receives the number of finished blocks.
     """
     samplers: list[GridSampler] = []
-    next_blocks = iter(blocks)  # all threads take their blocks from it
+    next_blocks = iter(blocks)  # shared: each block goes to the next free thread
 
     def sample_next_blocks() -> None:
         with closing(GridSampler(grid)) as sampler:
@@ -182,7 +195,7 @@ def _sample_blocks(
             for future in as_completed(futures):
                 future.result()
         finally:
-            blocks.clear()  # which also ends the iterator
+            blocks.clear()  # ends the shared iterator, and with it the other threads
             for sampler in samplers:
                 sampler.close()
 
@@ -219,7 +232,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
 
 def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
     """Return the number of sensors of the FMU; refuse a library that does not fit in memory."""
-    # Only the FMU knows the lengths of arrays.
+    # A binding may name a whole array, whose length only the FMU declares.
     fmu = FmiAsset(grid.fmu, binding)
     warn_without_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
@@ -233,7 +246,10 @@ def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
 
 
 def _library_record(grid: SamplingGrid) -> dict[str, Any]:
-    """Return what a library is a function of: the grid, hashes of the files, and the version."""
+    """Return everything that determines a library: the grid, hashes of its files, the version.
+
+    The time limit of a step has no influence, and is left out.
+    """
     record: dict[str, Any] = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
     record["fmu"] = hash_file(Path(grid.fmu))
@@ -245,7 +261,10 @@ def _library_record(grid: SamplingGrid) -> dict[str, Any]:
 def _prepare_folder(
     out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool
 ) -> Path:
-    """Return the folder of blocks, new or of an interrupted sampling of the same record."""
+    """Return the folder for finished blocks: a new one, or that of an interrupted sampling.
+
+    An interrupted sampling is continued only if `resume` is set and its record is the same.
+    """
     if out.suffix != ".nc":
         raise MissionInputError(
             f"an observation library must have the suffix .nc, and {out} was given."
@@ -277,24 +296,25 @@ def _prepare_folder(
 
 
 def _differing_keys(former_plan: bytes, record: dict[str, Any]) -> str:
-    """Return the keys in which a former plan differs from a record, in words."""
+    """Return the keys in which a former plan differs from a record, for the message."""
     try:
-        former = parse_json(former_plan, PLAN_NAME, MissionInputError)
-        keys = [key for key in record if former.get(key) != record[key]]
+        former_record = parse_json(former_plan, PLAN_NAME, MissionInputError)
+        keys = [key for key in record if former_record.get(key) != record[key]]
     except (MissionInputError, AttributeError):
         return "damaged"
     return ", ".join(keys).replace("_", " ")
 
 
 def _rows_on_disk(folder: Path, shape: tuple[int, int]) -> Float:
-    """Return the observations (N, G) as a file that is mapped into memory.
+    """Return the observations (N, G) as an array that is mapped to a file.
 
-    They are NaN if they were not sampled yet. Who fills them writes them to the file.
+    Values that are assigned to it are written to the file, so that they survive an interruption.
+    Points that were not sampled yet are NaN. A missing or damaged file is made anew.
     """
     path = folder / ROWS_NAME
     is_sound = False
     with suppress(OSError, EOFError, ValueError):  # there is no file, or it is damaged
-        # Opened for reading: opened for writing, a file that is too short would grow.
+        # Open it for reading, since NumPy would lengthen a truncated file opened for writing.
         is_sound = np.load(path, mmap_mode="r").shape == shape
     if not is_sound:
         content = io.BytesIO()

@@ -1,4 +1,4 @@
-"""All tables of a scenario, with the checks of the tables beside each other."""
+"""All tables of a scenario, with the checks that two or more tables agree with each other."""
 
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Literal, NamedTuple
@@ -31,13 +31,14 @@ from twin_master.scenario.tables import (
 )
 
 LARGEST_STRAIN_NOISE = 0.1
-"""Standard deviation of a strain gauge above which a unit was forgotten [1]."""
+"""Standard deviation of a strain gauge above which the number was meant in microstrain [1]. Usual
+gauges break at a strain of a few percent."""
 WATCHED_KIND = "watched"
 """Kind of the asset of a scenario without `[asset]`."""
 
 
 class InspectionReading(NamedTuple):
-    """A reading of an inspection.
+    """A reading of one state factor that is taken in an inspection.
 
     Attributes
     ----------
@@ -58,7 +59,7 @@ class InspectionReading(NamedTuple):
 
 
 class ScenarioTables(Section):
-    """All tables of a scenario, in SI, which are checked beside each other."""
+    """All tables of a scenario, in SI; each table is checked alone, and against the others."""
 
     format: Literal[2]
     mission: Mission
@@ -83,9 +84,10 @@ class ScenarioTables(Section):
     @model_validator(mode="before")
     @classmethod
     def _complete_table(cls, table: object) -> object:
-        """Return the table with actions as controls, and with the asset of a watched scenario.
+        """Add a control for each action, and the tables of an asset that is only watched.
 
-        A scenario without `[asset]` and `[truth]` is of a real asset, which is watched.
+        A scenario without `[asset]` and `[truth]` is for a real asset, whose observations are
+        received from outside. It gets an asset of the kind `watched` and a truth that is not used.
         """
         if not isinstance(table, Mapping):
             return table
@@ -125,10 +127,11 @@ class ScenarioTables(Section):
         return tuple(readings)
 
     def _control_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: states and controls."""
+        """Yield (is present, message) of each possible fault: states and controls."""
         controls = self.control_names
         yield repeated_name_fault("state", self.state_names)
         yield repeated_name_fault("control", controls)
+        # names, and the inputs of the controls
         inputs = tuple(sorted(self.control[0].values))
         for control in self.control:
             yield (
@@ -155,7 +158,10 @@ class ScenarioTables(Section):
         yield from self.transition.faults_beside(controls, level_counts)
 
     def _several_incomplete_tables_fault(self) -> Fault:
-        """Return the fault that two or more tables lack an entry for a control, in one message."""
+        """Return the fault that several tables lack an entry for a control, with one joint message.
+
+        The separate checks would report only the first of these tables.
+        """
         tables: dict[str, Mapping[str, object]] = {"rewards.control": self.rewards.control}
         if self.transition.kind == "independent_worsening":
             tables["transition.probability"] = self.transition.probability
@@ -173,7 +179,7 @@ class ScenarioTables(Section):
         return len(messages) > 1, "; ".join(messages)
 
     def _action_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names and costs of actions."""
+        """Yield (is present, message) of each possible fault: names and costs of actions."""
         controls = self.control_names
         # `with_controls_of_actions` added the controls of the actions at the end.
         controls_of_file = controls[: -len(self.action)] if self.action else controls
@@ -197,7 +203,7 @@ class ScenarioTables(Section):
                 yield unknown_name_fault(state, self.state_names, key, "state")
 
     def _growth_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: random growth and repairs."""
+        """Yield (is present, message) of each possible fault: random growth and repairs."""
         truth = self.truth
         is_random = truth.kind == "random_growth"
         if truth.probability:
@@ -219,7 +225,7 @@ class ScenarioTables(Section):
             )
 
     def _truth_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: origin of the true state."""
+        """Yield (is present, message) of each possible fault: origin of the true state."""
         truth = self.truth
         if truth.kind == "asset":
             yield (
@@ -236,7 +242,7 @@ class ScenarioTables(Section):
             yield unknown_name_fault(gain.state, self.state_names, "truth.gains.state", "state")
 
     def _reward_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: sensors of the rewards."""
+        """Yield (is present, message) of each possible fault: sensors of the rewards."""
         rewards = self.rewards
         sensor_count = self.observation.count
         limited_count = sensor_count
@@ -253,7 +259,7 @@ class ScenarioTables(Section):
         yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
 
     def _sensor_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: what is stated by sensor."""
+        """Yield (is present, message) of each possible fault: what is stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
             yield value_count_fault(
@@ -286,9 +292,17 @@ class ScenarioTables(Section):
             )
 
     def _strain_noise_fault(self, key: str, noise: float | tuple[float, ...]) -> Fault:
-        """Return the fault that noise of strains is in microstrain, and its key does not say so.
+        """Return the fault that a noise of strains is given in microstrain without that unit.
 
-        Smaller mistakes show when the predictions are there.
+        A standard deviation above `LARGEST_STRAIN_NOISE` as a strain can only be a number in
+        microstrain. Smaller mistakes are found later, when the predicted strains are known.
+
+        Parameters
+        ----------
+        key : str
+            The key of the noise, for the message.
+        noise : float or (G,) tuple of float
+            The standard deviation of all G sensors, or of each sensor, SI.
         """
         deviations = np.broadcast_to(noise, self.observation.count)
         largest = 0.0
@@ -303,7 +317,7 @@ class ScenarioTables(Section):
         return is_absurd, message
 
     def _mode_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: observation of modes."""
+        """Yield (is present, message) of each possible fault: observation of modes."""
         modes = self.observation.modes
         record = self.truth.record
         if modes is None:
@@ -338,7 +352,7 @@ class ScenarioTables(Section):
             return
         inputs = tuple(sorted(self.control[0].values))
         yield unknown_name_fault(record.input, inputs, "truth.record.input", "control input")
-        highest_frequency = 0.5 * record.sampling_rate  # Nyquist
+        highest_frequency = 0.5 * record.sampling_rate  # the Nyquist frequency
         _low, highest_of_bands = modes.bands[-1]
         yield (
             highest_of_bands > highest_frequency,

@@ -53,7 +53,7 @@ class FileSection(Section):
         return self.copy_paths
 
     def user_files(self) -> dict[str, str]:
-        """Return the paths of the files that are not shipped, by key."""
+        """Return the paths of the user's own files, by the keys that name them."""
         user_files = {}
         for key in self.copies():
             name = getattr(self, key)
@@ -62,7 +62,10 @@ class FileSection(Section):
         return user_files
 
     def all_files(self) -> dict[str, Path]:
-        """Return all files, shipped ones too, by the paths of their copies inside a run folder."""
+        """Return all files, shipped ones too, by the paths of their copies inside a run folder.
+
+        The design inside a calibration file has no file of its own.
+        """
         files = {}
         for key, copy in self.copies().items():
             name = getattr(self, key)
@@ -77,7 +80,7 @@ class FileSection(Section):
         return self.model_copy(update=paths)
 
     def portable(self) -> "FileSection":
-        """Return the table with the paths of the copies inside a run folder."""
+        """Return the table with the paths of user files replaced by those of a run's copies."""
         copies = self.copies()
         return self.model_copy(update={key: copies[key] for key in self.user_files()})
 
@@ -103,7 +106,7 @@ class KindSection(FileSection):
 
     @classmethod
     def kinds(cls) -> dict[str, type[Self]]:
-        """Return the subclasses by their kinds."""
+        """Import the modules that define kinds; return the subclasses by their kinds."""
         for module in iter_modules([str(KIND_FOLDER)]):
             if module.name.endswith("_source"):
                 import_module(f"{KIND_PACKAGE}.{module.name}")
@@ -116,14 +119,17 @@ class KindSection(FileSection):
 
     @classmethod
     def kind_of_class(cls) -> str | None:
-        """Return the kind of this class; None for a class of several kinds."""
+        """Return the kind of this class; None for a base class, which has no kind of its own."""
         kind = cls.model_fields["kind"].default
         return kind if isinstance(kind, str) else None
 
     @model_validator(mode="wrap")
     @classmethod
     def _validate_as_kind(cls, table: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        """Return the table as a record of the subclass that its `kind` names."""
+        """Return the table as a record of the subclass that its `kind` names.
+
+        A subclass with a kind of its own, and an existing record, are validated as usual.
+        """
         if cls.kind_of_class() is not None or not isinstance(table, Mapping):
             return handler(table)
         kinds = cls.kinds()
@@ -146,13 +152,14 @@ class BeliefSection(KindSection):
         Parameters
         ----------
         scenario : Scenario
-            The scenario; its type is defined above this module.
+            The scenario. Its class is defined in a module that imports this one.
         flown : AssetSource
-            The source of what flies.
+            The source of the asset that flies.
 
         Returns
         -------
         AssetSource
+            The source; `flown` itself if the twin believes the asset.
         """
 
 
@@ -174,16 +181,17 @@ class AssetSection(KindSection):
 
     @abstractmethod
     def source(self, scenario: Any) -> Any:
-        """Return what flies.
+        """Return the source of the asset that flies.
 
         Parameters
         ----------
         scenario : Scenario
-            The scenario; its type is defined above this module.
+            The scenario. Its class is defined in a module that imports this one.
 
         Returns
         -------
         AssetSource
+            The source, which prepares and opens the asset.
         """
 
 

@@ -38,7 +38,7 @@ class StateFactor(Section):
     prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: levels and prior."""
+        """Yield (is present, message) of each possible fault: levels and prior."""
         does_not_increase = any(second <= first for first, second in pairwise(self.levels))
         listed = ", ".join(str(level) for level in self.levels)
         yield (
@@ -104,7 +104,7 @@ class Calibration(FileSection):
         return 1 if self.source == "fixed" else self.draws
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: keys of the source."""
+        """Yield (is present, message) of each possible fault: keys of the source."""
         has_file = bool(self.file)
         yield (
             self.source == "file" and not has_file,

@@ -32,7 +32,10 @@ class ModalFeature(NamedTuple):
 
 
 def row_width(sensors: int) -> int:
-    """Return the length of a row of values followed by the lower triangle of their covariance."""
+    """Return the length of a row with n values and the lower triangle of their covariance.
+
+    The triangle includes the diagonal, and so has n (n + 1) / 2 entries.
+    """
     return sensors + sensors * (sensors + 1) // 2
 
 
@@ -55,7 +58,7 @@ class ModesSection(Section):
     identification: what changes between records, and the error of the model."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: bands, numbers and features."""
+        """Yield (is present, message) of each possible fault: bands, numbers and features."""
         has_empty_band = any(high <= low for low, high in self.bands)
         yield (
             has_empty_band,
@@ -124,7 +127,7 @@ class ModesSection(Section):
         }
 
     def observed_features(self, values: Float) -> Float:
-        """Return the observed features of all modes in one row.
+        """Select the observed features of all modes, and put them in one row, mode by mode.
 
         Parameters
         ----------
@@ -134,23 +137,26 @@ class ModesSection(Section):
         Returns
         -------
         (..., G) array
+            The G observed features.
         """
         return values[..., self.feature_indices].reshape(*values.shape[:-2], -1)
 
     def observed_covariance(self, mode_covariances: Float) -> Float:
-        """Return the covariance (G, G) of the observed features; modes are uncorrelated.
+        """Return the covariance (G, G) of the G observed features of all modes.
+
+        It is block diagonal, since the errors of different modes are taken as uncorrelated.
 
         Parameters
         ----------
         mode_covariances : (M, 1 + A, 1 + A) array
-            The covariance of all features of each mode.
+            The covariance of all features of each of the M modes.
         """
-        size = len(self.feature_indices)
-        covariance = np.zeros((len(mode_covariances) * size,) * 2)
-        block = np.ix_(self.feature_indices, self.feature_indices)
+        feature_count = len(self.feature_indices)
+        covariance = np.zeros((len(mode_covariances) * feature_count,) * 2)
+        observed_block = np.ix_(self.feature_indices, self.feature_indices)
         for mode, mode_covariance in enumerate(mode_covariances):
-            rows = slice(mode * size, (mode + 1) * size)
-            covariance[rows, rows] = mode_covariance[block]
+            rows = slice(mode * feature_count, (mode + 1) * feature_count)
+            covariance[rows, rows] = mode_covariance[observed_block]
         return covariance
 
 
@@ -247,9 +253,9 @@ class ObservationSection(Section):
         return 1.0, self.sensor_units
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: numbers of values."""
+        """Yield (is present, message) of each possible fault: numbers of values."""
         for key in ("unit", "standard_deviation", "titles"):
             value = getattr(self, key)
-            # No titles at all, an empty tuple, are as right as one for each sensor.
+            # Without titles the tuple is empty, which is allowed and not a wrong number of titles.
             yield value_count_fault(f"observation.{key}", value or None, self.count)
         yield value_count_fault("observation.model_error_percent", self.model_error, self.count)

@@ -1,4 +1,4 @@
-"""Reading scenario files: from TOML to a checked `Scenario`, or one clear sentence on a fault."""
+"""Reading scenario files: from TOML to a checked `Scenario`; a fault raises a `ScenarioError`."""
 
 import hashlib
 from collections.abc import Mapping
@@ -36,28 +36,38 @@ _KEYS_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "s
 
 
 def from_format_1(table: Mapping[str, Any]) -> Table:
-    """Return a table of format 1 as one of format 2.
+    """Convert the table of a scenario from format 1 to format 2.
 
-    In format 1 the table `asset` also said what the twin believes. A fault of the table stays in
-    it, so that the schema refuses it.
+    In format 1 the table `asset` also named the model that the twin believes. In format 2 the
+    table `belief` names it. A wrong value is converted unchanged; the schema refuses it later.
 
     Parameters
     ----------
     table : mapping
-        The scenario as a file of format 1 has it.
+        The content of a scenario file of format 1.
+
+    Returns
+    -------
+    dict
+        The content in format 2; the given table is not changed.
     """
-    former = table.get("asset")
-    if not isinstance(former, Mapping):
+    former_asset = table.get("asset")
+    if not isinstance(former_asset, Mapping):
         return {**table, "format": 2, "belief": {"kind": "asset"}}
-    asset = {key: value for key, value in former.items() if value not in (None, [], (), {})}
+    # An empty value means the same as a missing key.
+    asset = {key: value for key, value in former_asset.items() if value not in (None, [], (), {})}
     belief = _belief_of_format_1(asset)
+    # These keys name the believed model, which is in `belief` now.
     for key in ("observation_model", "library", "model_patch"):
         asset.pop(key, None)
     return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
 
 
 def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
-    """Return the table `belief` that the table `asset` of a file of format 1 implies."""
+    """Return the table `belief` of format 2 from the table `asset` of format 1.
+
+    The twin believes a library or a design if the keys name one, and otherwise the asset itself.
+    """
     model = asset.get("observation_model")
     library = asset.get("library")
     design = asset.get("design")
@@ -72,10 +82,11 @@ def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
 
 
 def _asset_of_format_1(former: Mapping[str, Any]) -> Table:
-    """Return the table `asset` of format 2 for one of format 1, without the keys on the belief.
+    """Convert the table `asset` from format 1 to format 2.
 
-    In format 1 the kind `fmu` also stood for scripts and wing designs, the kind `coupled` also for
-    SSP files, and a table could have keys of other kinds, which were not used.
+    The caller has removed the keys on the believed model, except `design`. In format 1 the kind
+    `fmu` was also used for scripts and wing designs, and the kind `coupled` for SSP files. A table
+    could have keys of other kinds, which had no effect; they are removed.
     """
     asset = dict(former)
     design = asset.pop("design", None)
@@ -98,7 +109,7 @@ def _asset_of_format_1(former: Mapping[str, Any]) -> Table:
 
 
 def _table_of_design(design: object) -> Table:
-    """Return the table of a wing design by its name; None is a design without a name."""
+    """Return the table that names a wing design; without a name, the schema reports its absence."""
     if design == CALIBRATED_DESIGN_NAME:
         return {"kind": "calibration"}
     if design is None:
@@ -137,7 +148,7 @@ class LoadedScenario:
 
 
 def find_scenario(name: str) -> Path:
-    """Return the file of a scenario.
+    """Return the path of a scenario file.
 
     Parameters
     ----------
@@ -147,7 +158,7 @@ def find_scenario(name: str) -> Path:
     Raises
     ------
     ScenarioError
-        If it is neither.
+        If the name is neither that of a shipped scenario nor the path of a file.
     """
     shipped = scenario_files()
     if name in shipped:
@@ -162,22 +173,28 @@ def find_scenario(name: str) -> Path:
 
 
 def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
-    """Read and check a scenario.
+    """Read and check a scenario file, and switch the alarms of its twin on by default.
 
-    If the file does not mention `notice`, the twin gives notices, provided that it can. A run's
-    `config.json` is read by `parse_scenario`, which adds nothing to what was flown.
+    A file without the key `notice` gets the default table `notice`, unless `obstacle_to_notices`
+    names a reason against it; the reason is then the remark of the result. The scenario of a past
+    run (`config.json`) is read by `parse_scenario` instead, which adds no defaults of this kind.
 
     Parameters
     ----------
     given : LoadedScenario, str or Path
-        The name of a shipped scenario, or the path of a file. A scenario that was read already is
-        returned as it is.
+        The name of a shipped scenario, or the path of a file. A `LoadedScenario` is returned
+        unchanged.
+
+    Returns
+    -------
+    LoadedScenario
+        The scenario with its path, the hash of the file, and a remark for the user.
 
     Raises
     ------
     ScenarioError
-        If there is no such scenario, or the file cannot be read, is not TOML, or breaks the schema.
-        The sentence names the file and the key.
+        If there is no such scenario, the file cannot be read or is not TOML, or a key of it is
+        unknown, missing or has a wrong value. The message names the file and the key.
     """
     if isinstance(given, LoadedScenario):
         return given
@@ -199,7 +216,7 @@ def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
 
 
 def obstacle_to_notices(scenario: Scenario) -> str:
-    """Return why a scenario has no notices by default; an empty text if it has them."""
+    """Return the reason why a scenario gives no alarms by default; empty if it does give them."""
     observation = scenario.observation
     if observation.modes is not None:
         return "observations of modes have a covariance of their own"
@@ -210,35 +227,47 @@ def obstacle_to_notices(scenario: Scenario) -> str:
             "the average over the draws is taken `inside`, so that each sensor has a parameter of "
             "its own"
         )
-    joint_states = prod(len(factor.levels) for factor in scenario.state)
-    draws = min(scenario.calibration.draw_count, MOST_DRAWS)
-    numbers = joint_states * draws * observation.count * GAINS_PER_SENSOR
-    if numbers > MOST_NUMBERS_BY_DEFAULT:
+    # The belief about the sensors has one number for each joint state, draw of the parameter,
+    # sensor and compared gain error; all of them are updated in each step.
+    state_count = prod(len(factor.levels) for factor in scenario.state)
+    draw_count = min(scenario.calibration.draw_count, MOST_DRAWS)
+    belief_size = state_count * draw_count * observation.count * GAINS_PER_SENSOR
+    if belief_size > MOST_NUMBERS_BY_DEFAULT:
         return (
-            f"they take {numbers:,} numbers a step, more than {MOST_NUMBERS_BY_DEFAULT:,} "
+            f"they take {belief_size:,} numbers a step, more than {MOST_NUMBERS_BY_DEFAULT:,} "
             "(`[notice]` takes them)"
         )
     return ""
 
 
 def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
-    """Return the scenario that a table describes.
+    """Check the content of a scenario file, and return it as a `Scenario`.
+
+    Files of earlier versions are converted first: those of format 1, and those with former names
+    of keys.
 
     Parameters
     ----------
     table : mapping
-        The content of a TOML file, or the scenario of a run's `config.json`.
+        The content of a TOML file, or the scenario in the `config.json` of a run.
     source : str
-        The name of the file, for the sentence.
+        The name of the file, with which an error message begins.
+
+    Returns
+    -------
+    Scenario
+        The scenario, in SI units.
 
     Raises
     ------
     ScenarioError
-        If the table breaks the schema.
+        If a key is unknown, missing or has a wrong value, or two keys contradict each other.
     """
     file_format = table.get("format")
-    # In Python `True == 1`; the format `true` is left to the schema, which refuses it.
+    # In Python `True == 1`; the format `true` is not converted here, so that the schema refuses it.
     is_format_1 = file_format == 1 and file_format is not True
+    # Only format 2 has the table `belief`. A file with it that says 1 has a wrong number, which the
+    # schema refuses.
     if is_format_1 and "belief" not in table:
         table = from_format_1(table)
     table = with_present_names(table, PRESENT_NAMES, source, ScenarioError)

@@ -93,7 +93,9 @@ class Scenario(ScenarioTables):
         return groups
 
     def scripted_history(self) -> Float:
-        """Return the scripted true state of each step, which includes the gain of that step.
+        """Return the scripted true state in each step of the mission.
+
+        The state of a step already includes the gains of that step.
 
         Returns
         -------
@@ -107,10 +109,10 @@ class Scenario(ScenarioTables):
             column = self.state_names.index(entry.state)
             gain[entry.first_step : last_step + 1, column] += entry.gain
         history = np.cumsum(gain, axis=0)
-        # round off the errors of the sums
+        # Round off the errors of the sums, so that ten gains of 2 % and 40 % are exactly 60 %.
         for factor_history in history.T:
             largest = np.abs(factor_history).max()
-            # The power of ten of the largest value, which is negative or zero below 1.
+            # Below 1, as many more decimals as the largest value has zeros after the point.
             exponent = math.ceil(math.log10(largest)) if 0.0 < largest < 1.0 else 0
             factor_history[:] = np.round(factor_history, _GAIN_DECIMALS - exponent)
         return history
@@ -119,8 +121,8 @@ class Scenario(ScenarioTables):
     def models_differ(self) -> bool:
         """Whether the model that flies is known to differ from the one that the twin believes."""
         believes_asset = self.belief.kind == "asset"
-        departs = self.asset.is_known_to_differ or self.belief.is_known_to_differ
-        return departs and not believes_asset
+        has_known_difference = self.asset.is_known_to_differ or self.belief.is_known_to_differ
+        return has_known_difference and not believes_asset
 
     def with_paths_from(self, folder: Path) -> Self:
         """Return the scenario with its relative paths joined to a folder."""
@@ -131,7 +133,7 @@ class Scenario(ScenarioTables):
         return self.model_copy(update=tables)
 
     def portable(self) -> Self:
-        """Return the scenario with the paths of the copies inside a run folder."""
+        """Return the scenario with the paths of user files replaced by those of a run's copies."""
         tables = {name: table.portable() for name, table in self._file_tables().items()}
         return self.model_copy(update=tables)
 
@@ -161,7 +163,7 @@ class Scenario(ScenarioTables):
         return self.model_dump(mode="json")
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: tables that do not fit."""
+        """Yield (is present, message) of each possible fault: tables that do not fit."""
         yield from self._control_faults()
         yield from self._action_faults()
         yield from self._growth_faults()
@@ -172,7 +174,7 @@ class Scenario(ScenarioTables):
         yield from self._mode_faults()
 
     def _reference_faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names of references."""
+        """Yield (is present, message) of each possible fault: names of references."""
         names = [entry.figure for entry in self.reference]
         for name in names:
             yield unknown_name_fault(

@@ -61,7 +61,7 @@ class Section(toml_file.Section):
     @model_validator(mode="before")
     @classmethod
     def _convert_units(cls, table: object) -> object:
-        """Return the table with keys that have no unit, and values in SI."""
+        """Remove the units from the names of the keys, and convert the values to SI."""
         if not isinstance(table, Mapping):
             return table
         converted: dict[str, object] = {}
@@ -82,7 +82,8 @@ class Section(toml_file.Section):
     def _check_required_keys(cls, table: Mapping[str, object]) -> None:
         """Refuse a table that lacks a required key which may carry a unit.
 
-        Pydantic refuses the other tables that lack a key, but does not know the units.
+        Pydantic refuses a table without any other required key. It does not know the units, which
+        the message here names.
         """
         required = [name for name, field in cls.model_fields.items() if field.is_required()]
         missing = [name for name in required if name not in table]
@@ -105,7 +106,7 @@ class Section(toml_file.Section):
 
 
 def _check_percentage(key: object, value: object) -> None:
-    """Refuse a number, or a list with a number, that is no percentage."""
+    """Refuse a number, or a number in a list, that is below -100 or above 100 percent."""
     entries = value if isinstance(value, list | tuple) else [value]
     for entry in entries:
         if isinstance(entry, bool) or not isinstance(entry, int | float):
@@ -127,14 +128,15 @@ def _convert_to_si(value: object, divisor: float) -> object:
 
 
 def value_count_fault(key: str, value: object, count: int) -> Fault:
-    """Return the fault that a key has neither one value nor one for each of `count` sensors.
+    """Return the possible fault that a key has neither one value nor one value for each sensor.
 
     Parameters
     ----------
     key : str
         The key, for the message.
     value : object
-        Its value; a tuple has one entry for each sensor.
+        The value of the key. A tuple must have one entry for each sensor; anything else is one
+        value for all.
     count : int
         The number of sensors.
     """
@@ -146,14 +148,14 @@ def value_count_fault(key: str, value: object, count: int) -> Fault:
 
 
 def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
-    """Return the fault that two things of a kind have the same name.
+    """Return the possible fault that a name is given more than once.
 
     Parameters
     ----------
     what : str
-        The kind of thing, in the singular, for the message: "state".
+        What is named, in the singular, for the message: "state".
     names : sequence of str
-        The names of all of them.
+        All names.
     """
     is_repeated = len(set(names)) != len(names)
     message = f"each {what} needs a name of its own, and the names are {', '.join(names)}"
@@ -161,7 +163,7 @@ def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
 
 
 def unknown_name_fault(name: str, known: Sequence[str], key: str, what: str) -> Fault:
-    """Return the fault that a name is not among the known ones.
+    """Return the possible fault that a name is not among the known ones.
 
     Parameters
     ----------
@@ -172,7 +174,7 @@ def unknown_name_fault(name: str, known: Sequence[str], key: str, what: str) -> 
     key : str
         The key that holds the name, for the message.
     what : str
-        What the name is of, in the singular, for the message: "control".
+        What is named, in the singular, for the message: "control".
     """
     message = f"`{key}` must name a {what} ({', '.join(known)}), and `{name}` came"
     return name not in known, message
@@ -181,18 +183,18 @@ def unknown_name_fault(name: str, known: Sequence[str], key: str, what: str) -> 
 def incomplete_table_fault(
     table: Mapping[str, object], names: Sequence[str], key: str, what: str
 ) -> Fault:
-    """Return the fault that the keys of a table are not exactly the names of some things.
+    """Return the possible fault that a table lacks an entry for a name, or has one too many.
 
     Parameters
     ----------
     table : mapping
         The table.
     names : sequence of str
-        The names that the table must have, each once.
+        The names that must be the keys of the table.
     key : str
-        The location of the table, for the message.
+        The location of the table in the file, for the message: "rewards.control".
     what : str
-        What the names are of, in the singular, for the message: "control".
+        What is named, in the singular, for the message: "control".
     """
     present = ", ".join(table) or "none"
     message = f"`{key}` must have one entry for each {what} ({', '.join(names)}), and has {present}"

@@ -29,14 +29,14 @@ ROW_SUM_TOLERANCE = 1e-12
 
 
 class FigureGroup(NamedTuple):
-    """A group of figures of the summary, as `figures.toml` has it.
+    """A group of figures of the summary, whose names and titles are in `figures.toml`.
 
     Attributes
     ----------
     name : str
-        The table of `figures.toml`.
+        The name of the group's table in `figures.toml`.
     fields : dict of str to str
-        What stands in the braces in the names of its figures.
+        The texts that replace the fields in braces in the names of the figures.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Transition(Section):
     def faults_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names and tables.
+        """Yield (is present, message) of each possible fault: names and tables.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class Transition(Section):
     def _probability_faults(
         self, controls: tuple[str, ...], states: tuple[str, ...]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names of probabilities."""
+        """Yield (is present, message) of each possible fault: names of probabilities."""
         key = "transition.probability"
         yield incomplete_table_fault(self.probability, controls, key, "control")
         for control, probability in self.probability.items():
@@ -111,7 +111,7 @@ class Transition(Section):
     def _table_faults(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: names and rows of tables."""
+        """Yield (is present, message) of each possible fault: names and rows of tables."""
         yield incomplete_table_fault(self.tables, controls, "transition.tables", "control")
         for control, tables in self.tables.items():
             key = f"transition.tables.{control}"
@@ -123,6 +123,7 @@ class Transition(Section):
                     has_other_size,
                     f"`{key}.{state}` must be {size} rows of {size} probabilities",
                 )
+                # how far the worst row is from a sum of 1
                 departure = max(abs(sum(row) - 1.0) for row in rows)
                 yield (
                     departure > ROW_SUM_TOLERANCE,
@@ -153,7 +154,7 @@ class Span(Section):
     last_step: Step | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: an early end."""
+        """Yield (is present, message) of each possible fault: an early end."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
             ends_early,
@@ -186,7 +187,7 @@ class SensorFault(Span):
     rate: Number | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: span and rate."""
+        """Yield (is present, message) of each possible fault: span and rate."""
         yield from super().faults()
         needs_rate = self.kind == "drift"
         has_rate = self.rate is not None
@@ -226,7 +227,7 @@ class TruthSection(Section):
     """How the record of each step is made, if modes are observed."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: keys of another kind."""
+        """Yield (is present, message) of each possible fault: keys of another kind."""
         is_inside_asset = self.kind == "asset"
         has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
         if self.record is not None:
@@ -290,7 +291,7 @@ class Action(Section):
     """Whether the mission ends with that step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: readings and effect."""
+        """Yield (is present, message) of each possible fault: readings and effect."""
         inspects = bool(self.inspects)
         has_deviation = self.standard_deviation is not None
         yield (
@@ -340,7 +341,7 @@ class Planner(Section):
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: keys of another policy."""
+        """Yield (is present, message) of each possible fault: keys of another policy."""
         yield (
             self.limit_probability is not None and self.policy != "belief",
             "`planner.limit_probability` needs `planner.policy` `belief`",
@@ -352,15 +353,16 @@ class Planner(Section):
 
 
 def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the table of a scenario in which each action is a control as well.
+    """Return the table of a scenario with a further control for each action.
 
-    The action has the values, the probabilities and, less its cost, the reward of its control. A
-    malformed table is returned as it is: the schema refuses it with a sentence.
+    This control has the input values and probabilities of the action's base control. Its reward is
+    lower by the cost of the action. A malformed table is returned unchanged, and the schema refuses
+    it later.
 
     Parameters
     ----------
     table : mapping
-        The table of a scenario with actions, as the file has it.
+        The table of a scenario with actions, as in the file; it is not changed.
     """
     extended = deepcopy(dict(table))
     try:
@@ -372,7 +374,10 @@ def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
-    """Add a control, its reward and its probabilities for an action; those that exist stay."""
+    """Add a control, its reward and probabilities for an action to a scenario's table, in place.
+
+    Entries of that name are kept: the user gave them, or the table was extended before.
+    """
     name = action["name"]
     base_name = action["control"]
     controls = {control["name"]: control for control in table["control"]}
@@ -381,12 +386,14 @@ def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
         table["control"].append(controls[base_name] | {"name": name, "title": title})
 
     rewards = table["rewards"]
-    # With a weight of 0 costs have no meaning; the schema refuses them.
+    # The planner multiplies the reward by the weight, so that the cost is divided by it. With a
+    # weight of 0 a cost has no effect; the schema refuses it.
     weight = rewards.get("control_weight", 1.0) or 1.0
     rewards["control"].setdefault(name, rewards["control"][base_name] - action["cost"] / weight)
 
     transition = table["transition"]
     truth = table.get("truth", {})
+    # the probabilities of the control on which the action is based
     for values_by_control in (
         transition.get("probability"),
         transition.get("tables"),
@@ -419,7 +426,7 @@ class Learning(Section):
     not learnt."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults, each with whether it is there: transition factors."""
+        """Yield (is present, message) of each possible fault: transition factors."""
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)
@@ -430,7 +437,7 @@ class Learning(Section):
         )
 
     def figure_groups(self) -> list[FigureGroup]:
-        """Return the groups of figures on what is learnt beside the parameter."""
+        """Return the groups of figures on all learnt quantities except the parameter."""
         groups = []
         if self.transition_factors:
             groups.append(FigureGroup("learnt", {"quantity": "transition_factor"}))
