@@ -119,8 +119,8 @@ def leaving_probability(
     for twin, twin_belief in enumerate(belief):
         beliefs = np.tile(twin_belief, (LIVES, 1))
         has_left = policy.decide(beliefs) != control
-        # All lives begin with the same belief, and so with the same first decision. If it is another
-        # control, no further step is needed.
+        # All lives begin with the same belief, and so with the same first decision. If this is
+        # another control, no further step is needed.
         later_steps = uniform[:0] if has_left.all() else uniform
         for uniform_of_step in later_steps:
             probability = beliefs @ problem.likelihood[control].T
