@@ -195,7 +195,7 @@ class HypothesisWeights:
 
 @dataclass(frozen=True)
 class HypothesisBeliefs:
-    """The beliefs of the hypotheses under which a state is believed.
+    """The beliefs about the state under all hypotheses but free gains, which no state explains.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class HypothesisBeliefs:
 
 @dataclass(frozen=True)
 class MixedBelief:
-    """The belief about the state, averaged over all hypotheses under which one is believed.
+    """The belief about the state, averaged over all hypotheses but free gains.
 
     Attributes
     ----------

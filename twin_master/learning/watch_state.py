@@ -184,7 +184,7 @@ class WatchState:
 
     @classmethod
     def from_arrays(cls, arrays: CarriedArrays, gauge_shape: tuple[int, ...]) -> "WatchState":
-        """Return the state in arrays of `as_arrays`; the arrays are copied.
+        """Return the state from the arrays that `as_arrays` returned; they are copied.
 
         Parameters
         ----------

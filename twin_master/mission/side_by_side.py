@@ -257,7 +257,10 @@ class _Formation:
         self._inspecting_controls = sorted(inspecting_controls)
 
     def fly_step(self, step: int) -> None:
-        """Fly one step of all twins, filter its observations, and decide on the next control."""
+        """Fly one step of all twins, filter its observations, and decide on the next control.
+
+        What was flown is stored in `flights`.
+        """
         if step > 0:
             self._end_missions(step)
         observed, state = self._assets.fly_step(

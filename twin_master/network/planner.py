@@ -101,20 +101,20 @@ class BeliefPolicy:
 
 @dataclass(frozen=True)
 class PlannedPolicy:
-    """A planned policy.
+    """A policy of S states and U controls with its value.
 
     Attributes
     ----------
     value : (S,) array
         The expected discounted reward from each state.
     action_value : (S, U) array
-        The same, if the given control is taken first.
+        The expected discounted reward from each state if the control is taken first.
     policy : (S, U) array
         p(U | D), row-stochastic.
     iterations : int
         The number of sweeps of value iteration; zero if the policy was given.
     on_belief : BeliefPolicy or None
-        A policy that decides by the belief in the place of `policy`, which then only predicts.
+        A policy that decides by the belief. If it is given, `policy` serves only to predict.
     """
 
     value: Float

@@ -185,12 +185,13 @@ class Twin:
     first_control : int or str
         The control of the first step, if none is given with it.
     estimator : Estimator, optional
-        Holds the belief in the place of the exact filter of model and sensor model.
+        The estimator of the belief; the exact filter of model and sensor model if left out.
     safest : int or str, optional
-        The control if no state is believed. If left out, the policy under the hypotheses that
-        believe in a state decides alone.
+        The control to take if no state explains the sensors. If left out, that case is ignored: the
+        policy decides by the belief alone.
     on_belief : BeliefPolicy, optional
-        Decides by p(D_{t+1} | o_0..o_t) in the place of `policy`, which then only predicts.
+        A policy that decides by p(D_{t+1} | o_0..o_t). If it is given, `policy` serves only to
+        predict.
 
     Raises
     ------
