@@ -1,4 +1,4 @@
-"""The sentences by which the watch over the gauges tells an operator what it notices."""
+"""The notices of the watch over the gauges, as sentences for an operator."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

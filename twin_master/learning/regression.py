@@ -35,7 +35,7 @@ SUM_COUNT = 6
 
 
 class GaugeReadings(NamedTuple):
-    """One observation beside its predictions by each draw in each state.
+    """One observation of G gauges, with the predictions of E draws in S states.
 
     Attributes
     ----------

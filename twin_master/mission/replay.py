@@ -63,7 +63,7 @@ def replay(
     end: int | None = None,
     question: BelievedModel | None = None,
 ) -> tuple[History, JsonObject]:
-    """Filter the steps of a journal again; late observations stand at the step that they belong to.
+    """Filter the steps of a journal again, with late observations at the steps they belong to.
 
     The journal is read backwards to the last settled state of the twin before the first step that
     is asked for. The steps after that state are filtered again.
@@ -77,11 +77,13 @@ def replay(
     lag : int or None
         The lag of the twin, in steps.
     first_step : int, optional
-        The first step whose belief is asked for; if left out, only the twin after the last step is.
+        The first step whose belief is needed. If left out, only the twin after the last step is
+        needed.
     end : int, optional
         The end of the last line to read, in bytes; the end of the journal if left out.
     question : BelievedModel, optional
-        A further model: what would the twin believe with it? The decisions are not checked then.
+        A further model, to find what the twin would believe with it. If it is given, the decisions
+        are not compared with those of the journal.
 
     Returns
     -------
@@ -174,7 +176,8 @@ class _BackwardScan:
             return
         step = int(record["settled"]["step"])
         state = record["settled"]["state"]
-        # It must lie before each step that is asked for, and before models adopted after it.
+        # It must lie before each required step, and before the first step of each model that was
+        # adopted later.
         if all(step < required_step for required_step in self._required_steps):
             self.settled = SettledState(step, decode_state(state))
 

@@ -225,7 +225,7 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """Holds the belief of a twin: the exact filter, or one that learns or watches beside it."""
+    """The estimator of a twin's belief: an exact filter, a learning one, or one with a watch."""
 
     @property
     def model(self) -> GraphicalModel:

@@ -26,7 +26,7 @@ EXPONENT_BIAS = 1023
 FRACTION_BITS = 52
 """Number of bits of the fraction of a double."""
 LEAST_EXPONENT = -708.0
-"""The exponential function of a smaller number is negligible beside one, and has fewer digits."""
+"""Exponents are cut to this: exp of a smaller number is negligible compared with one."""
 ROUNDING = 1e-13
 """Entries that remain of a separated matrix, relative to the largest value, are rounding errors."""
 

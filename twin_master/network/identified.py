@@ -25,7 +25,7 @@ def packed_row(values: Float, covariance: Float) -> Float:
 
 
 class IdentifiedSensorModel(GaussianSensorModel):
-    """Gaussian sensors, each observation of which has a covariance beside the assumed noise.
+    """Gaussian sensors whose observations have a covariance, which is added to the assumed noise.
 
     Parameters are those of `GaussianSensorModel`. The average over the draws is that of eq. (30),
     "outside".

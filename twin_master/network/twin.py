@@ -48,7 +48,7 @@ DecisionBasis = Literal["filtered", "predicted"]
 DEFAULT_LAG = 50
 """Steps back over which a twin smooths and which may be revised."""
 _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
-"""Former name of the arrays `steps` in saved states, also behind a prefix."""
+"""Pattern of the former name `turns` of arrays in saved states, with or without a prefix."""
 
 
 def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
