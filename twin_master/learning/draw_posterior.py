@@ -9,8 +9,9 @@ from twin_master.network.estimator import Learnt
 INTERVAL = (0.05, 0.95)
 """Levels of the bounds of the interval in which a learnt quantity is reported."""
 _GRID_POINTS = 801
+"""Points of the grid on which the interpolated posterior is summed."""
 _LARGEST_LOG_RATIO = 60.0
-"""Draws whose log evidence lies this far below the best do not shape the spline."""
+"""Draws whose log evidence is lower than the largest by more than this do not shape the spline."""
 _FEWEST_FOR_SPLINE = 4
 """Distinct draws from which the evidence is interpolated: those of a cubic polynomial."""
 
@@ -18,10 +19,10 @@ _FEWEST_FOR_SPLINE = 4
 def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -> Learnt:
     """Return the posterior of a parameter, given the weights of its draws.
 
-    The evidence of a draw is a smooth function of the parameter, and its logarithm is nearly a
-    parabola. If it is narrower than the distance of the draws, their weights alone would give a
-    point. So the log evidence is interpolated between them by a cubic spline, and the prior by the
-    straight lines of its distribution function.
+    The evidence is a smooth function of the parameter, and its logarithm is nearly a parabola. If
+    the posterior is narrower than the distance between two draws, the weights alone would put it on
+    a single draw. So the log evidence is interpolated between draws by a cubic spline, and the
+    prior by a piecewise linear distribution function.
 
     Parameters
     ----------
@@ -31,24 +32,26 @@ def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -
         Their probabilities before and after the observations.
     """
     distinct, position = np.unique(np.asarray(values, dtype=np.float64), return_inverse=True)
-    before: Float = np.zeros(len(distinct))
-    after: Float = np.zeros(len(distinct))
-    before += np.bincount(position, np.asarray(prior, dtype=np.float64))
-    after += np.bincount(position, np.asarray(weight, dtype=np.float64))
+    prior_weight: Float = np.zeros(len(distinct))
+    posterior_weight: Float = np.zeros(len(distinct))
+    prior_weight += np.bincount(position, np.asarray(prior, dtype=np.float64))
+    posterior_weight += np.bincount(position, np.asarray(weight, dtype=np.float64))
+    # The evidence of a value is the ratio of its posterior to its prior probability.
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_evidence = np.log(after) - np.log(before)
-    best = np.max(log_evidence[np.isfinite(log_evidence)])
-    considered = np.flatnonzero(log_evidence >= best - _LARGEST_LOG_RATIO)
+        log_evidence = np.log(posterior_weight) - np.log(prior_weight)
+    largest = np.max(log_evidence[np.isfinite(log_evidence)])
+    considered = np.flatnonzero(log_evidence >= largest - _LARGEST_LOG_RATIO)
     if len(distinct) < _FEWEST_FOR_SPLINE or len(considered) < 2:
-        return _posterior_of_points(distinct, after)
-    return _interpolated_posterior(distinct, before, log_evidence, considered)
+        return _posterior_of_points(distinct, posterior_weight)
+    return _interpolated_posterior(distinct, prior_weight, log_evidence, considered)
 
 
 def _posterior_of_points(values: Float, weight: Float) -> Learnt:
     """Return mean, standard deviation and quantiles of increasing values (E,) with weights (E,)."""
     mean = float(weight @ values)
     cumulative = np.cumsum(weight)
-    # The levels are lowered by a rounding error, or a sum that rounds below one would miss its end.
+    # The levels are lowered by a rounding error: otherwise a cumulative sum that rounds below a
+    # level could miss the value at which it reaches the level.
     lower, upper = (
         float(values[np.searchsorted(cumulative, level * (1 - 1e-12))]) for level in INTERVAL
     )
@@ -78,7 +81,8 @@ def _interpolated_posterior(
     first = max(int(considered[0]) - 1, 0)
     end = min(int(considered[-1]) + 2, len(values))
 
-    # Each draw stands for the interval half way to its neighbours; the outer ones are symmetric.
+    # Each draw stands for the interval that ends half way to its neighbours. The interval of an
+    # outermost draw is symmetric about it.
     edges = np.concatenate([[values[0]], 0.5 * (values[1:] + values[:-1]), [values[-1]]])
     edges[0] -= edges[1] - values[0]
     edges[-1] += values[-1] - edges[-2]
@@ -89,7 +93,8 @@ def _interpolated_posterior(
     prior_distribution = np.concatenate([[0.0], np.cumsum(prior)])
     prior_mass = np.diff(np.interp(grid, edges, prior_distribution))
 
-    # Posterior mass of the cells. The spline through fewer than four draws is one polynomial.
+    # Posterior mass of the cells. The log evidence of negligible neighbours may be minus infinity;
+    # it is raised to a finite floor for the spline.
     floor = np.min(log_evidence[considered]) - _LARGEST_LOG_RATIO
     spline = CubicSpline(values[first:end], np.maximum(log_evidence[first:end], floor))
     log_evidence_on_grid = spline(middle)

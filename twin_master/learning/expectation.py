@@ -19,6 +19,7 @@ from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEVELS = np.array([0.025, 0.975])
+"""Levels of the reported quantiles: the bounds of a central 95 % interval."""
 _NEGLIGIBLE_PROBABILITY = 1e-9
 """A state of smaller probability does not change the quantiles."""
 
@@ -114,50 +115,61 @@ class LearntExpectation:
         carried : sequence of Carried
             What the filter carried on from each step.
         beliefs : (T, S) array
-            The beliefs about the state. They may differ from those of the filter, if other
-            hypotheses than the model are believed, too.
+            The beliefs about the state. They differ from those of the filter if competing
+            hypotheses, such as a gauge fault, are mixed into them.
         observations : (T, G) array
             The observed sensor values, SI.
         """
-        parts = []
+        expectations = []
         for step, belief, observation in zip(carried, beliefs, observations, strict=True):
             hypotheses = self.learning.hypotheses(step)
-            parts.append(self._expect_step(hypotheses, step.control_index, belief, observation))
-        return stack_expectations(parts)
+            expectations.append(
+                self._expect_step(hypotheses, step.control_index, belief, observation)
+            )
+        return stack_expectations(expectations)
 
     def smoothed(
         self, carried: Sequence[Carried], beliefs: Float, observations: Float
     ) -> Expectation:
-        """Return the expectation in T steps given all observations; parameters as of `filtered`."""
+        """Return the expectation in T steps given all observations; see `filtered`."""
         joint_beliefs = self.learning.smoothed_hypotheses(carried)
         steps = zip(carried, joint_beliefs, beliefs, observations, strict=True)
-        parts = []
+        expectations = []
         for step, joint_belief, belief, observation in steps:
             hypotheses = self.learning.hypotheses(carried[-1], joint_belief)
-            parts.append(self._expect_step(hypotheses, step.control_index, belief, observation))
-        return stack_expectations(parts)
+            expectations.append(
+                self._expect_step(hypotheses, step.control_index, belief, observation)
+            )
+        return stack_expectations(expectations)
 
     def predicted(
         self, carried: Sequence[Carried], beliefs: Float, policies: Float, horizon: int
     ) -> Expectation:
-        """Return the expectation in the H steps after each of T steps.
+        """Return the predicted sensor values and rewards in the H steps after each of T steps.
+
+        S is the number of states, U that of controls.
 
         Parameters
         ----------
         carried : sequence of Carried
-            What the filter carried on from each of the T steps.
+            The arrays that the filter carried on from each of the T steps.
         beliefs : (T, S) array
-            The filtered beliefs about the state.
+            The filtered belief about the state in each of the T steps.
         policies : (T, S, U) array
-            For each of the T steps the probabilities p(U | D) of the later controls.
+            For each of the T steps the policy p(control | state) in all H steps after it.
         horizon : int
-            The number H of steps.
+            The number H of predicted steps.
+
+        Returns
+        -------
+        Expectation
+            The predicted values; their leading axes are (T, H).
         """
         steps = zip(carried, beliefs, policies, strict=True)
-        parts = [
+        predictions = [
             self._expect_ahead(step, belief, policy, horizon) for step, belief, policy in steps
         ]
-        return stack_expectations(parts)
+        return stack_expectations(predictions)
 
     def from_marginals(
         self,
@@ -210,11 +222,12 @@ class LearntExpectation:
         posterior = learnt[parameter.name]
         draws = np.asarray(parameter.values, dtype=np.float64)
         order = np.argsort(draws)
-        deviations = np.array([-1.0, 1.0]) * posterior.standard_deviation
-        values = posterior.mean + deviations
-        # The weight of a draw in a linear interpolation is that of its hat function.
+        offsets_from_mean = np.array([-1.0, 1.0]) * posterior.standard_deviation
+        two_values = posterior.mean + offsets_from_mean
+        # In a linear interpolation between draws the weight of a draw is its hat function: one at
+        # the draw, zero at all others. Each of the two values has the probability one half.
         hat_functions = np.eye(len(draws))[:, order]
-        return np.array([np.interp(values, draws[order], hat).mean() for hat in hat_functions])
+        return np.array([np.interp(two_values, draws[order], hat).mean() for hat in hat_functions])
 
     def _gauge_moments(
         self, learnt: Mapping[str, Learnt], name: str, default: float
@@ -239,7 +252,19 @@ class LearntExpectation:
     def _expect_step(
         self, hypotheses: StaticHypotheses, control_index: int, belief: Float, observation: Float
     ) -> Expectation:
-        """Return the expectation in one step under a known control, without a leading axis."""
+        """Return the expectation in one step under a known control, without a leading axis.
+
+        Parameters
+        ----------
+        hypotheses : StaticHypotheses
+            The joint belief of the filter.
+        control_index : int
+            The control in force.
+        belief : (S,) array
+            The belief about the state, which takes the place of that of the filter.
+        observation : (G,) array
+            The observed sensor values, SI.
+        """
         controls = slice(control_index, control_index + 1)
         weight = _joint_with_marginal(hypotheses.weight, belief)[None, :, :, None]
         expectation = self._expect(hypotheses, weight, controls, observation)
@@ -249,15 +274,28 @@ class LearntExpectation:
     def _expect_ahead(
         self, step: Carried, belief: Float, policy: Float, horizon: int
     ) -> Expectation:
-        """Return the expectation in the H steps after a step, under a policy (S, U)."""
+        """Return the expectation in the H steps after one step.
+
+        Parameters
+        ----------
+        step : Carried
+            The arrays that the filter carried on from the step.
+        belief : (S,) array
+            The filtered belief about the state in the step.
+        policy : (S, U) array
+            The policy p(control | state) in the H steps.
+        horizon : int
+            The number H of steps.
+        """
         hypotheses = self.learning.hypotheses(step)
         joint = _joint_with_marginal(hypotheses.weight, belief)
         predicted = np.empty((horizon, *hypotheses.weight.shape))  # (H, K, S)
+        # The first transition is under the control in force, later ones are under the policy.
         transition = self.learning.model.transition.matrix[step.control_index]
         for h in range(horizon):
             joint = joint @ transition
             predicted[h] = joint
-            transition = self._closed_loop  # after the first step the policy decides
+            transition = self._closed_loop
         return self._expect(hypotheses, predicted[..., None] * policy, slice(None), None)
 
     def _expect(
@@ -283,22 +321,23 @@ class LearntExpectation:
         weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
         value, value_variance = self._sensor_moments(hypotheses, controls)
         sensors = value.shape[-1]
-        beliefs = len(weight)
+        belief_count = len(weight)
 
-        # Moments about a point near the mean, so that squares do not cancel.
+        # Moments about a point near the mean: the variance is a small difference of large squares
+        # if they are taken about zero.
         center = value[0].mean(axis=(0, 1))
         first_moment = value - center
         second_moment = value_variance + first_moment**2
-        by_state = weight.sum(axis=1).reshape(beliefs, -1)
-        first_by_state = np.einsum("bksu,ksug->bsug", weight, first_moment).reshape(
-            beliefs, -1, sensors
+        state_weight = weight.sum(axis=1).reshape(belief_count, -1)
+        first_moment_by_state = np.einsum("bksu,ksug->bsug", weight, first_moment).reshape(
+            belief_count, -1, sensors
         )
-        second_by_state = np.einsum("bksu,ksug->bsug", weight, second_moment).reshape(
-            beliefs, -1, sensors
+        second_moment_by_state = np.einsum("bksu,ksug->bsug", weight, second_moment).reshape(
+            belief_count, -1, sensors
         )
-        mean = first_by_state.sum(axis=1)
-        variance = np.maximum(second_by_state.sum(axis=1) - mean**2, 0.0)
-        quantiles = _quantiles_by_state(by_state, first_by_state, second_by_state)
+        mean = first_moment_by_state.sum(axis=1)
+        variance = np.maximum(second_moment_by_state.sum(axis=1) - mean**2, 0.0)
+        quantiles = _quantiles_by_state(state_weight, first_moment_by_state, second_moment_by_state)
 
         reward_mean, reward_standard_deviation = self.rewards.expectation_of(
             weight, hypotheses.draw, controls, value, value_variance, observation
@@ -330,18 +369,18 @@ class LearntExpectation:
         self, hypotheses: StaticHypotheses, weight: Float, controls: slice
     ) -> Float:
         """Return the standard deviation (B, G) of noise and model error, SI."""
-        scale2 = _insert_state_and_control(hypotheses.squared_noise_scale)
+        squared_noise_scale = _insert_state_and_control(hypotheses.squared_noise_scale)
         deviation = self.learning.sensor_model.total_standard_deviation[:, controls]
-        beliefs, hypothesis_count, states, control_count = weight.shape
+        belief_count, hypothesis_count, states, control_count = weight.shape
         sensors = deviation.shape[-1]
         variance = np.broadcast_to(
-            scale2 * deviation**2, (hypothesis_count, states, control_count, sensors)
+            squared_noise_scale * deviation**2, (hypothesis_count, states, control_count, sensors)
         )
-        return np.asarray(np.sqrt(weight.reshape(beliefs, -1) @ variance.reshape(-1, sensors)))
+        return np.asarray(np.sqrt(weight.reshape(belief_count, -1) @ variance.reshape(-1, sensors)))
 
 
 def _insert_state_and_control(values: Float) -> Float:
-    """Return values (K, G) as (K, 1, 1, G), beside states and controls."""
+    """Return values (K, G) as (K, 1, 1, G), with axes for states and controls."""
     return values[:, None, None]
 
 
@@ -368,7 +407,7 @@ def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: 
 def _joint_with_marginal(joint: Float, belief: Float) -> Float:
     """Return p(k | D) of a joint belief (K, S) times another belief about the state (S,): (K, S).
 
-    In a state that the joint belief rules out the hypotheses have their total weights.
+    In a state that the joint belief rules out, p(k | D) is not defined; p(k) is taken there.
     """
     marginal = joint.sum(axis=0)
     hypothesis_given_state = np.tile(joint.sum(axis=1, keepdims=True), len(belief))

@@ -1,4 +1,4 @@
-"""The filters of the model and of the faults of gauges, which explain the same observations."""
+"""The filters of the model and of each gauge fault, all corrected by the same observations."""
 
 from hashlib import sha256
 from typing import Any
@@ -106,19 +106,31 @@ class FaultFilter:
     def _log_gauge_prior(self) -> Float:
         """Return the log prior probability (G,) of each gauge to be the one that is off.
 
-        It grows with the number of steps until a fault of the gauge is found. Otherwise weak gauges
-        would be lost among those whose faults show at once.
+        The probability is proportional to the expected number of steps until a fault of the gauge
+        is found. Otherwise a gauge with a weak signal would have no chance beside gauges whose
+        faults are found in one step.
         """
         sensor_model = self._sensor_model
         gain_signal = self._settings.gauge_gain * sensor_model.mean
         information_per_step = np.mean(
             (gain_signal / sensor_model.total_standard_deviation) ** 2, axis=(0, 1)
         )
-        steps = 1.0 + 1.0 / np.maximum(information_per_step, _LEAST_INFORMATION)
-        return np.asarray(np.log(steps / steps.sum()))
+        # The information about a gain is its squared signal-to-noise ratio, and steps add up. So
+        # about one over the information per step is needed until the ratio is one.
+        steps_to_detection = 1.0 + 1.0 / np.maximum(information_per_step, _LEAST_INFORMATION)
+        return np.asarray(np.log(steps_to_detection / steps_to_detection.sum()))
 
     def start(self, forecast: Float, control_index: int) -> WatchState:
-        """Return the state of the watch before the first observation of this model."""
+        """Return the state of the watch before the first observation of this model.
+
+        Parameters
+        ----------
+        forecast : (S,) array
+            The belief about the state before the observation.
+        control_index : int
+            The control in force.
+        """
+        # `prior` is the probability of each of the two kinds of fault: free gains and one gauge.
         weights = HypothesisWeights.initial(
             fault_probability=2.0 * self._settings.prior * FROM_THE_START,
             log_begin=self._log_begin,
@@ -131,8 +143,19 @@ class FaultFilter:
         )
 
     def advance(self, before: Carried, control_index: int) -> WatchState:
-        """Return the state of the watch one transition after a step, under the next control."""
+        """Return the state of the watch in the next step, before its observation.
+
+        The beliefs pass one transition. In the weights, faults may begin, end or become hidden.
+
+        Parameters
+        ----------
+        before : Carried
+            The arrays that were carried on from the previous step; they are copied, not changed.
+        control_index : int
+            The control in force in the next step.
+        """
         state = WatchState.from_arrays(before.arrays, self._gauge_belief_shape)
+        # The state follows that of the previous step through the control of the previous step.
         for belief in (
             state.model_belief,
             state.gauge_belief,
@@ -140,8 +163,10 @@ class FaultFilter:
             state.recovered_belief,
         ):
             self._advance_belief(belief, before.control_index)
-        still_to_begin = self.probability_to_begin_after(state.step_count)
-        begins_now = self.probability_to_begin_after(state.step_count - 1.0) - still_to_begin
+        # The prior probability to begin in exactly this step. It is positive: the probability to
+        # begin after a step decreases strictly with the step.
+        begins_later = self.probability_to_begin_after(state.step_count)
+        begins_now = self.probability_to_begin_after(state.step_count - 1.0) - begins_later
         log_begins_now = np.log(begins_now)
         self._begin_gauge_faults(state, log_begins_now)
         self._begin_free_gains(state, log_begins_now)
@@ -149,16 +174,16 @@ class FaultFilter:
         return state
 
     def _advance_belief(self, belief: NDArray[Any], control_index: int) -> None:
-        """Advance a belief (..., S) by one transition, in place.
+        """Advance beliefs (..., S) by one transition under a control, in place.
 
-        Rows of zeros stay zero. They are skipped, because most beliefs of gauge faults are zero.
+        A row of zeros stays zero. Such rows are skipped: most of those of gauge faults are zero.
         """
         rows = belief.reshape(-1, belief.shape[-1])
-        is_believed = rows.any(axis=1)
-        rows[is_believed] = self._model.transition.forward(control_index, rows[is_believed])
+        is_nonzero = rows.any(axis=1)
+        rows[is_nonzero] = self._model.transition.forward(control_index, rows[is_nonzero])
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: float) -> None:
-        """Let faults of single gauges begin in this step, and let their gains fade.
+        """Let faults of single gauges begin in this step, and fade what is learnt of their gains.
 
         A fault that begins now has the belief and the sums of squares of the model so far.
 
@@ -178,6 +203,7 @@ class FaultFilter:
             log_begins_now - np.log(gains),  # each gain with equal probability
             state.step_count,
         ).reshape(sensors, gains)
+        # A fault that begins now has learnt no gain yet: its sums are zero.
         fading = self._fading_per_step()
         state.gauge_sum_cc *= fading * earlier_weight
         state.gauge_sum_cx *= fading * earlier_weight
@@ -187,7 +213,9 @@ class FaultFilter:
         )
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: float) -> None:
-        """Let the fault that several gauges have unknown gains begin in this step; let gains fade.
+        """Let free gains begin in this step, and fade what is learnt of them.
+
+        Free gains are the fault that several gauges have unknown gains.
 
         A fault that begins now has the belief and the sums of squares of the model so far.
 
@@ -218,17 +246,20 @@ class FaultFilter:
         statistics.sum_cx *= fading * earlier_weight
 
     def _fading_per_step(self) -> float:
-        """Return the factor by which the sums of gains fade in a step, as gains may change."""
+        """Return the factor of exponential forgetting of the sums of gains, as gains may change."""
         return float(np.exp(-1.0 / self._settings.memory_steps))
 
     def probability_to_begin_after(self, step: float) -> float:
-        """Return the prior probability that a fault begins after a step."""
+        """Return the prior probability that a fault begins after a step, counted from 0.
+
+        It decreases slowly, as 1 / step, so that a fault may still begin after years.
+        """
         return (1.0 - FROM_THE_START) / (1.0 + step / self._settings.onset_steps)
 
     def _switch_hypotheses(
         self, state: WatchState, log_begins_now: float, previous_control: int, control: int
     ) -> None:
-        """Let faults begin, end and be hidden among the weights of the hypotheses.
+        """Update the weights of the hypotheses for faults that begin, end or become hidden.
 
         Parameters
         ----------
@@ -239,23 +270,23 @@ class FaultFilter:
         previous_control, control : int
             The controls of the step before and of this one.
         """
-        # Hazard: probability to begin now, given that none of the two kinds has begun before.
-        probability = 2.0 * self._settings.prior
-        to_begin = self.probability_to_begin_after(state.step_count - 1.0)
-        log_none_begun = np.log1p(probability * (to_begin - 1.0))
-        log_hazard = np.log(probability) + log_begins_now - log_none_begun
+        # Hazard: probability to begin now, given that no fault of either kind has begun before.
+        fault_probability = 2.0 * self._settings.prior
+        begins_now_or_later = self.probability_to_begin_after(state.step_count - 1.0)
+        log_no_fault_so_far = np.log1p(fault_probability * (begins_now_or_later - 1.0))
+        log_hazard = np.log(fault_probability) + log_begins_now - log_no_fault_so_far
 
-        right_again = np.zeros_like(state.weights.hidden)
+        ended_or_hidden = np.zeros_like(state.weights.hidden)
         if previous_control != control:
-            right_again += state.weights.change_control(previous_control, control)
-        right_again += state.weights.advance(log_hazard, self._log_begin)
-        if right_again.sum() > 0.0:
-            self._move_to_recovered(state, right_again)
+            ended_or_hidden += state.weights.change_control(previous_control, control)
+        ended_or_hidden += state.weights.advance(log_hazard, self._log_begin)
+        if ended_or_hidden.sum() > 0.0:
+            self._move_to_recovered(state, ended_or_hidden)
 
     def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix beliefs and sums of squares of ended faults into those of "recovered".
+        """Mix beliefs and sums of squares of ended and hidden faults into those of "recovered".
 
-        "Recovered" is the hypothesis that gauges are right again after a fault.
+        "Recovered" is the hypothesis that the gauges are right again after a fault.
 
         Parameters
         ----------
@@ -264,35 +295,36 @@ class FaultFilter:
         right_again : (1 + G K,) array
             The probability of each fault that it ended or was hidden in this step.
         """
-        total = right_again.sum()
-        # Of the probability that gauges are right after a fault, the part that is new.
-        fraction_new = min(total * np.exp(-state.weights.log_right_after_fault), 1.0)
-        weight = right_again / total
-        free_gains_weight = weight[hypothesis_weights.FREE_GAINS_OF_FAULTS]
-        gauge_weight = weight[hypothesis_weights.GAUGES_OF_FAULTS]
+        probability_of_all = right_again.sum()
+        # The fraction of the probability of "recovered" that was added in this step.
+        fraction_new = min(probability_of_all * np.exp(-state.weights.log_right_after_fault), 1.0)
+        fault_weight = right_again / probability_of_all
+        free_gains_weight = fault_weight[hypothesis_weights.FREE_GAINS_OF_FAULTS]
+        gauge_weight = fault_weight[hypothesis_weights.GAUGES_OF_FAULTS]
 
         gauge_rows = state.gauge_belief.reshape(len(gauge_weight), -1)
         gauge_belief = gauge_weight.astype(np.float32) @ gauge_rows
-        incoming = (
+        new_belief = (
             gauge_belief.reshape(state.recovered_belief.shape)
             + free_gains_weight * state.free_gains_belief[0]
         )
         state.recovered_belief += fraction_new * (
-            incoming / incoming.sum() - state.recovered_belief
+            new_belief / new_belief.sum() - state.recovered_belief
         )
 
-        # A gauge has the squares of the model, but for the one that was off, or if gains were free.
-        squares = state.model_squares.copy()
+        # Sums of squares: those of the model for a sound gauge and those of the fault for a faulty
+        # one, averaged over the faults by their weights.
+        new_squares = state.model_squares.copy()
         gauge_weight = gauge_weight.reshape(state.gauge_squares.shape)
-        squares += np.sum(gauge_weight * (state.gauge_squares - squares[:, None]), axis=1)
+        new_squares += np.sum(gauge_weight * (state.gauge_squares - new_squares[:, None]), axis=1)
         statistics = state.free_gain_statistics
         free_probability = statistics.free_probability
         free_gains_squares = (
             free_probability * statistics.free_squares
             + (1.0 - free_probability) * statistics.fixed_squares
         )
-        squares += free_gains_weight * (free_gains_squares - state.model_squares)
-        state.recovered_squares += fraction_new * (squares - state.recovered_squares)
+        new_squares += free_gains_weight * (free_gains_squares - state.model_squares)
+        state.recovered_squares += fraction_new * (new_squares - state.recovered_squares)
 
     def assimilate(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
@@ -306,7 +338,7 @@ class FaultFilter:
         readings : (G,) array
             The sensor values, SI; NaN where a sensor is lost or left out.
         log_density_beside : (S,) array
-            The log density of what does not pass through the sensors.
+            The log density of the rest of the observation, such as readings of inspections.
         control_index : int
             The control in force.
         """
@@ -340,14 +372,15 @@ class FaultFilter:
                 state.free_gain_statistics,
             )
 
-        # Evidence over that of the model: for alarms, and for the weights of the mixture.
+        # Log evidence of each hypothesis minus that of the model: for alarms, which sum it over all
+        # steps, and for the weights of the mixture.
         state.log_gauge_evidence += log_gauges - log_model
         state.log_free_gains_evidence += log_free_gains - log_model
-        log_ratio = np.zeros_like(state.weights.current)
-        log_ratio[hypothesis_weights.RECOVERED] = log_recovered - log_model
-        log_ratio[hypothesis_weights.FREE_GAINS] = log_free_gains - log_model
-        log_ratio[hypothesis_weights.GAUGE_FAULTS] = (log_gauges - log_model).ravel()
-        state.weights.update(log_ratio)
+        log_evidence_ratio = np.zeros_like(state.weights.current)
+        log_evidence_ratio[hypothesis_weights.RECOVERED] = log_recovered - log_model
+        log_evidence_ratio[hypothesis_weights.FREE_GAINS] = log_free_gains - log_model
+        log_evidence_ratio[hypothesis_weights.GAUGE_FAULTS] = (log_gauges - log_model).ravel()
+        state.weights.update(log_evidence_ratio)
         state.observation_count += observation.present
         state.step_count += 1.0
 
@@ -357,10 +390,19 @@ class FaultFilter:
         observation: StandardizedObservation,
         log_density_without_residuals: Float,
     ) -> float:
-        """Correct the belief that gauges are right again after a fault; return its log evidence.
+        """Correct the belief of "recovered" by an observation, and return its log evidence.
 
-        The state of the watch, with the squares of the model before the observation, is updated in
-        place. The log density is (N,), for each pair of a draw and a state.
+        "Recovered" is the hypothesis that the gauges are right again after a fault.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch; belief and squares of "recovered" are updated in place. The
+            squares of the model are still those before the observation.
+        observation : StandardizedObservation
+            The observation, for N pairs of a draw and a state.
+        log_density_without_residuals : (N,) array
+            The log density of the observation but for its standardised residuals.
         """
         recovered_squares_before = state.recovered_squares.copy()
         log_evidence, _ = faults.update_model(
@@ -369,7 +411,8 @@ class FaultFilter:
             state.recovered_belief.reshape(-1),
             log_density_without_residuals.copy(),
         )
-        # The constant of the density differs from that of the model by the noise scales.
+        # Each hypothesis has learnt noise scales of its own. They enter the constant of Student's
+        # density: 1 / sqrt(degrees + squares) for each gauge.
         log_scale_ratio = np.log(
             (observation.degrees + state.model_squares)
             / (observation.degrees + recovered_squares_before)
@@ -379,15 +422,16 @@ class FaultFilter:
     def _standardize(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
     ) -> tuple[StandardizedObservation, Float]:
-        """Return an observation in units of noise, and the part of its density without residuals.
+        """Return an observation in units of noise, and its log density without the residuals.
 
-        That part is the log density (N,) for each pair of a draw and a state, but for the
-        densities of the standardised residuals. Parameters are those of `assimilate`.
+        The log density (N,), for each pair of a draw and a state, lacks the densities of the
+        standardised residuals, which depend on the hypothesis. The parameters are those of
+        `assimilate`.
         """
         degrees = self._settings.noise_degrees
         count = state.observation_count
-        # Gauges count by the noise that is learnt. Otherwise a gauge that is off would shift the
-        # best fit within the interval of a state, and with it the residuals of all other gauges.
+        # A gauge is weighted by the noise that is learnt. Otherwise a gauge that is off would shift
+        # the best fit within the interval of a state, and so the residuals of all other gauges.
         precision = np.minimum((degrees + count) / (degrees + state.model_squares), 1.0)
         best_fit = self._sensor_model.fit_within_interval(
             readings, control_index, self._value[control_index], precision
@@ -409,10 +453,10 @@ class FaultFilter:
 
 
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
-    """Return some draws that lie evenly over the range of all, and the probability nearest to each.
+    """Choose draws evenly over the range of all, and give each the probability of its neighbours.
 
-    They lie evenly because a true value between two of them must not look like a fault, least of
-    all in the tails.
+    The chosen draws are evenly spaced: a true value in a wide gap between two of them would look
+    like a fault.
 
     Parameters
     ----------
@@ -424,7 +468,7 @@ def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], 
     chosen : (E',) array
         The indices of the chosen draws.
     chosen_weight : (E',) array
-        The probability of all draws that are nearest to each.
+        For each chosen draw, the total probability of the draws that are nearest to it.
     """
     order = np.argsort(draws, kind="stable")
     grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)

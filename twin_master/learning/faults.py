@@ -1,9 +1,9 @@
-"""Faults of gauges as competing hypotheses: how each explains an observation, beside the model.
+"""Faults of gauges as hypotheses that compete with the model to explain an observation.
 
 Each hypothesis has a belief over pairs of a draw and a state, of which there are N. There are two
-kinds of fault: a single gauge shows 1 + gain times what the model says, and several gauges have
-unknown gains of their own ("free gains"; users read "none of these"). A pair whose probability is
-negligible is left out.
+kinds of fault: a single gauge shows 1 + gain times the value that the model predicts, or several
+gauges have unknown gains of their own ("free gains"; users read "none of these"). A pair whose
+probability is negligible is left out.
 
 Predictive densities are Student's, with the noise scale of each gauge learnt by the hypothesis. In
 units of the assumed noise of a gauge:
@@ -119,7 +119,9 @@ def mix_in_beginning_faults(
     log_begin_probability: float,
     step: float,
 ) -> Float:
-    """Let R faults begin in this step, and return the weight (R,) of those that began earlier.
+    """Let R faults begin in this step, and return the weights (R,) of those that began earlier.
+
+    The weight of a fault is the probability that it began before this step, if it has begun at all.
 
     A fault that begins now has the belief of the model. It is mixed with the belief of the fault
     that began earlier, so that one belief stands for all first steps.
@@ -139,12 +141,16 @@ def mix_in_beginning_faults(
     step : float
         The number of this step.
     """
-    total = np.logaddexp(log_evidence, log_begin_probability)
-    earlier_weight = np.exp(log_evidence - total)
-    log_evidence[:] = total
+    log_total = np.logaddexp(log_evidence, log_begin_probability)
+    earlier_weight = np.exp(log_evidence - log_total)
+    log_evidence[:] = log_total
     onset[:] = earlier_weight * onset + (1.0 - earlier_weight) * step
-    earlier = earlier_weight[:, None, None].astype(np.float32)  # as precise as the beliefs
-    fault_belief[:] = earlier * fault_belief + (1.0 - earlier) * model_belief.astype(np.float32)
+    single_weight = earlier_weight[:, None, None].astype(
+        np.float32
+    )  # single precision, as the beliefs
+    fault_belief[:] = single_weight * fault_belief + (1.0 - single_weight) * model_belief.astype(
+        np.float32
+    )
     return np.asarray(earlier_weight)
 
 
@@ -162,7 +168,7 @@ def update_model(
     belief : (N,) array
         The belief; updated in place.
     log_likelihood : (N,) array
-        What does not depend on the noise scales; the densities of the gauges are added in place.
+        The log density without the standardised residuals; their densities are added in place.
 
     Returns
     -------
@@ -174,12 +180,14 @@ def update_model(
     kernel = 1.0 + observation.residual**2 / (observation.degrees + squares)
     log_likelihood -= np.log(kernel) @ observation.power
     considered = belief >= NEGLIGIBLE_UNDER_MODEL
-    best = log_likelihood[considered].max()
-    belief *= np.where(considered, np.exp(np.minimum(log_likelihood - best, 0.0)), 0.0)
+    # The exponents are taken relative to the largest one of the pairs that count. Those of other
+    # pairs may be larger: they are cut to zero, so that they do not overflow, and not used.
+    largest = log_likelihood[considered].max()
+    belief *= np.where(considered, np.exp(np.minimum(log_likelihood - largest, 0.0)), 0.0)
     total = belief.sum()
     belief /= total
     squares += belief @ observation.residual**2
-    return float(best + np.log(total)), kernel
+    return float(largest + np.log(total)), kernel
 
 
 @compiled
@@ -193,9 +201,9 @@ def update_gauge_faults(
     sum_cc: Float,
     sum_cx: Float,
 ) -> Float:
-    """Correct the beliefs of the faults "gauge g shows 1 + gain times what the model says".
+    """Correct the beliefs of the faults "gauge g shows 1 + gain times the predicted value".
 
-    The gain is learnt by a regression, within its prior standard deviation of gains[k].
+    The gain is learnt by a regression, and kept within one prior standard deviation of `gains[k]`.
 
     Parameters
     ----------
@@ -231,19 +239,21 @@ def update_gauge_faults(
         log_constant = 0.5 * np.log((degrees + model_squares[g]) / scale_squares)
 
         # Log densities: those of the model, with that of gauge g exchanged.
-        best = -np.inf
+        largest = -np.inf
         for n in range(len(fault_belief)):
             if fault_belief[n] < NEGLIGIBLE_UNDER_FAULT:
                 fault_belief[n] = 0.0
                 continue
             weight[n] = log_likelihood[n]
+            # Replace the kernel of gauge g by that of the fault. The factor 1 / sqrt(variance) of
+            # its density follows below.
             if present[g]:
                 c = gain_deviations[k] * prediction[n, g]
                 x = residual[n, g] - gains[k] * prediction[n, g] - c * fitted_gain
                 variance = 1.0 + c * c * gain_variance
                 fault_kernel = 1.0 + x * x / (scale_squares * variance)
                 weight[n] += log_constant + power[g] * np.log(kernel[n, g] / fault_kernel)
-            best = max(best, weight[n])
+            largest = max(largest, weight[n])
 
         # Weights of the pairs, and what they add to the sums.
         total = 0.0
@@ -256,12 +266,12 @@ def update_gauge_faults(
                 x = residual[n, g] - gains[k] * prediction[n, g]
                 variance = 1.0 + c * c * gain_variance
                 deviation = np.sqrt(variance) if present[g] else 1.0
-                weight[n] = fault_belief[n] * np.exp(weight[n] - best) / deviation
+                weight[n] = fault_belief[n] * np.exp(weight[n] - largest) / deviation
                 total += weight[n]
                 added_cc += weight[n] * c * c
                 added_cx += weight[n] * c * x
                 added_squares += weight[n] * (x - c * fitted_gain) ** 2 / variance
-        log_evidence[g, k] = best + np.log(total) if total > 0.0 else -np.inf
+        log_evidence[g, k] = largest + np.log(total) if total > 0.0 else -np.inf
 
         # Normalised belief, and the sums.
         for n in range(len(fault_belief)):
@@ -283,8 +293,8 @@ def update_free_gains(
 ) -> float:
     """Correct the belief of the fault that some gauges have unknown gains.
 
-    It is not known which gauges those are: the predictive density of each gauge is a mixture of
-    that without a gain and that with a free one.
+    It is not known which gauges these are. So the predictive density of each gauge is a mixture of
+    two: that of a sound gauge, and that of a gauge with a gain of its own.
 
     Parameters
     ----------
@@ -295,9 +305,9 @@ def update_free_gains(
     gain_deviation : float
         The prior standard deviation of a free gain.
     belief : (N,) array
-        The belief; updated in place.
+        The belief over pairs of a draw and a state; updated in place.
     statistics : FreeGainStatistics
-        What is learnt of the gauges; updated in place.
+        What is learnt of the gain of each gauge; updated in place.
 
     Returns
     -------
@@ -317,7 +327,7 @@ def update_free_gains(
     variance = 1.0 + c**2 * gain_variance
 
     def log_ratio_to_model(squared_residual: Float, squares: Float) -> Float:
-        """Return the log of a gauge's density over that of the model: (n, G)."""
+        """Return the log ratio of a gauge's density to that of the model, for n pairs: (n, G)."""
         scale_squares = observation.degrees + squares
         log_constant = 0.5 * np.log((observation.degrees + model.squares) / scale_squares)
         log_kernel_ratio = np.log(kernel / (1.0 + squared_residual / scale_squares))
@@ -332,8 +342,8 @@ def update_free_gains(
 
     # Belief over the pairs.
     log_density = model.log_likelihood[considered] + log_mixture.sum(axis=1)
-    best = log_density.max()
-    weight = belief[considered] * np.exp(log_density - best)
+    largest = log_density.max()
+    weight = belief[considered] * np.exp(log_density - largest)
     total = weight.sum()
     weight /= total
     belief[considered] = weight
@@ -346,4 +356,4 @@ def update_free_gains(
     statistics.sum_cc = statistics.sum_cc + weight @ c**2
     statistics.sum_cx = statistics.sum_cx + weight @ (c * x)
     statistics.free_squares = statistics.free_squares + weight @ (innovation**2 / variance)
-    return float(best + np.log(total))
+    return float(largest + np.log(total))

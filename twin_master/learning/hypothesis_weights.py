@@ -1,4 +1,4 @@
-"""Which hypothesis about the gauges holds now: a mixture whose faults begin, show, hide and end.
+"""The weights of the hypotheses about the gauges, whose faults begin, show, hide and end.
 
     the model is right --> a gauge is off, or free gains --> recovered --> the model is right
 
@@ -94,24 +94,30 @@ class HypothesisWeights:
         return cls(current, np.full(fault_count, -np.inf), showing)
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Divide each fault into a showing and a hidden part under the control that comes in force.
+        """Divide each fault into a showing and a hidden part under the next control, in place.
+
+        Parameters
+        ----------
+        previous_control, control : int
+            The controls of the previous step and of the next one.
 
         Returns
         -------
         (1 + G K,) array
             The probability of each fault that it showed before and is hidden now.
         """
+        # Keep what was learnt under the previous control: p(showing | fault).
         log_showing_before = self.current[FAULTS]
         hidden_before = np.exp(self.hidden)
         log_fault = np.logaddexp(log_showing_before, self.hidden)
-        learnt_showing = np.exp(log_showing_before - log_fault)
-        self.showing[:, previous_control] = np.clip(learnt_showing, LEAST_SHOWING, 1.0)
+        showing_probability = np.exp(log_showing_before - log_fault)
+        self.showing[:, previous_control] = np.clip(showing_probability, LEAST_SHOWING, 1.0)
         self.current[FAULTS] = log_fault + np.log(self.showing[:, control])
         self.hidden = log_fault + np.log1p(-self.showing[:, control])
         return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
 
     def advance(self, log_hazard: float, log_begin: Float) -> Float:
-        """Let faults begin and end in a step.
+        """Let faults begin and end in a step: one transition of the weights, in place.
 
         Parameters
         ----------
@@ -128,7 +134,7 @@ class HypothesisWeights:
         before = self.current
         log_ended = np.log(END_PROBABILITY) + before
 
-        # A new fault begins from the model. If gauges are right after another fault, only free
+        # A new fault begins from the model. If the gauges are right again after a fault, only free
         # gains may begin: the beliefs of single gauges have not followed what happened since.
         log_free_gains_begin = log_hazard + log_begin[FREE_GAINS]
         log_right_after_fault = np.logaddexp(before[RECOVERED], np.logaddexp.reduce(self.hidden))
@@ -137,6 +143,7 @@ class HypothesisWeights:
             log_begun[FREE_GAINS_OF_FAULTS], log_right_after_fault + log_free_gains_begin
         )
 
+        # Each hypothesis keeps the probability that it does not pass on to others.
         log_stay = np.full_like(before, np.log1p(-END_PROBABILITY))
         log_stay[MODEL] = np.log1p(-np.exp(log_hazard))
         log_stay[RECOVERED] = np.log1p(-END_PROBABILITY - np.exp(log_free_gains_begin))
@@ -146,19 +153,20 @@ class HypothesisWeights:
         self.current = np.logaddexp(before + log_stay, log_incoming)
         self.hidden = self.hidden + np.log1p(-np.exp(log_free_gains_begin))
 
-        # A fault that began in this step is not known under the other controls.
+        # For a fault that began in this step nothing is known about the other controls: it has the
+        # prior probability to show there.
         log_fault = np.logaddexp(self.current[FAULTS], self.hidden)
         begun_fraction = np.exp(log_begun - log_fault)
         self.showing += begun_fraction[:, None] * (SHOWS_ELSEWHERE - self.showing)
         return np.asarray(np.exp(log_ended[FAULTS]))
 
     def update(self, log_ratio: Float) -> None:
-        """Correct the weights by an observation.
+        """Correct the weights by an observation, in place, and normalise them.
 
         Parameters
         ----------
         log_ratio : (3 + G K,) array
-            The log evidence of each hypothesis over that of the model. A hidden fault predicts the
+            The log evidence of each hypothesis minus that of the model. A hidden fault predicts the
             same as "recovered".
         """
         self.current = self.current + log_ratio
@@ -187,7 +195,7 @@ class HypothesisWeights:
 
 @dataclass(frozen=True)
 class HypothesisBeliefs:
-    """The beliefs of the hypotheses under which a state is believed.
+    """The beliefs about the state under all hypotheses but free gains, which no state explains.
 
     Attributes
     ----------
@@ -206,7 +214,7 @@ class HypothesisBeliefs:
 
 @dataclass(frozen=True)
 class MixedBelief:
-    """The belief about the state, averaged over all hypotheses under which one is believed.
+    """The belief about the state, averaged over all hypotheses but free gains.
 
     Attributes
     ----------
@@ -224,23 +232,26 @@ class MixedBelief:
 
 
 def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> MixedBelief:
-    """Return the belief about the state, averaged over all hypotheses but free gains."""
+    """Return the belief about the state, averaged over all hypotheses but free gains.
+
+    Under free gains no state explains the sensors, so that they add nothing to the belief.
+    """
     # Normalise the weights without free gains, under which no state is believed.
     log_believing = np.append(
         np.delete(weights.current, FREE_GAINS), weights.hidden[GAUGES_OF_FAULTS]
     )
     log_total = np.logaddexp.reduce(log_believing)
-    weight = np.exp(weights.current - log_total)
+    current_weight = np.exp(weights.current - log_total)
     hidden_weight = np.exp(weights.hidden[GAUGES_OF_FAULTS] - log_total)
 
-    model_weight = float(weight[MODEL])
-    right_after_fault = weight[RECOVERED] + hidden_weight.sum()
-    gauge_weight = weight[GAUGE_FAULTS].astype(np.float32)
-    of_gauges = gauge_weight @ beliefs.gauge.reshape(len(gauge_weight), -1)
-    competing = of_gauges.reshape(beliefs.recovered.shape).sum(axis=0)
+    model_weight = float(current_weight[MODEL])
+    right_after_fault = current_weight[RECOVERED] + hidden_weight.sum()
+    gauge_weight = current_weight[GAUGE_FAULTS].astype(np.float32)
+    gauge_competitors = gauge_weight @ beliefs.gauge.reshape(len(gauge_weight), -1)
+    competing = gauge_competitors.reshape(beliefs.recovered.shape).sum(axis=0)
     competing = competing + right_after_fault * beliefs.recovered.sum(axis=0)
-    total = competing.sum()
-    competing = beliefs.model if total == 0.0 else competing / total
+    competing_sum = competing.sum()
+    competing = beliefs.model if competing_sum == 0.0 else competing / competing_sum
     belief = model_weight * beliefs.model + (1.0 - model_weight) * competing
     return MixedBelief(belief, competing, model_weight)
 
@@ -248,36 +259,41 @@ def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> Mixed
 def list_hypotheses(
     weights: HypothesisWeights, beliefs: HypothesisBeliefs, gauge_names: tuple[str, ...]
 ) -> tuple[Hypothesis, ...]:
-    """Return the model, each gauge fault that is not improbable, and "none of these".
+    """Return the hypotheses with probability and belief, as they are shown to users.
+
+    These are the model, each gauge whose fault has a probability of at least 1 %, and "none of
+    these" (free gains).
 
     Parameters
     ----------
     weights : HypothesisWeights
         The log weights.
     beliefs : HypothesisBeliefs
-        What each hypothesis believes.
+        The belief of each hypothesis about the state.
     gauge_names : tuple of str
         The names of the faults of the gauges, such as "gauge 5 off".
     """
     probability = np.exp(weights.current)
     gauges_and_gains = beliefs.gauge.shape[:2]
-    showing = probability[GAUGE_FAULTS].reshape(gauges_and_gains)
-    hidden = np.exp(weights.hidden[GAUGES_OF_FAULTS]).reshape(gauges_and_gains)
-    gauge_probability = (showing + hidden).sum(axis=1)
+    showing_probability = probability[GAUGE_FAULTS].reshape(gauges_and_gains)
+    hidden_probability = np.exp(weights.hidden[GAUGES_OF_FAULTS]).reshape(gauges_and_gains)
+    gauge_probability = (showing_probability + hidden_probability).sum(axis=1)
 
     # The gauges are right: under the model, or after a fault has ended.
-    right = probability[: RECOVERED + 1].sum()
+    sound_probability = probability[: RECOVERED + 1].sum()
     belief = beliefs.model
     if probability[RECOVERED] > 0.0:
         recovered_belief = beliefs.recovered.sum(axis=0)
         belief = (
             probability[MODEL] * beliefs.model + probability[RECOVERED] * recovered_belief
-        ) / right
-    hypotheses = [Hypothesis("model", float(right), belief)]
+        ) / sound_probability
+    hypotheses = [Hypothesis("model", float(sound_probability), belief)]
 
     for g in np.flatnonzero(gauge_probability >= _LEAST_REPORTED).tolist():
-        showing_belief = np.einsum("k,kes->s", showing[g], beliefs.gauge[g])  # over gains, draws
-        hidden_belief = hidden[g].sum() * beliefs.recovered.sum(axis=0)
+        showing_belief = np.einsum(
+            "k,kes->s", showing_probability[g], beliefs.gauge[g]
+        )  # over gains, draws
+        hidden_belief = hidden_probability[g].sum() * beliefs.recovered.sum(axis=0)
         belief = showing_belief + hidden_belief
         hypotheses.append(
             Hypothesis(gauge_names[g], float(gauge_probability[g]), belief / belief.sum())

@@ -45,7 +45,7 @@ class ParameterDraws(NamedTuple):
 
 @dataclass(frozen=True)
 class StaticHypotheses:
-    """Joint belief over states and static hypotheses, and what each hypothesis says of the gauges.
+    """Joint belief over S states and K static hypotheses, and the gauge coefficients given each.
 
     Attributes
     ----------
@@ -157,10 +157,10 @@ class LearningFilter:
         the parameter, `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]` and
         `gauge_offset[g]` for the sensors g from 1.
         """
-        sensor_values, log_density_beside = self.sensor_model.split_observation(observation)
+        sensor_values, other_log_density = self.sensor_model.split_observation(observation)
         forecast, statistics, count = self._forecast(before)
 
-        # Correct the belief.
+        # Correct the belief by the sensors, and by the rest of the observation.
         inverse_deviation = self._inverse_deviation[:, control_index]
         best_fit = self.sensor_model.fit_within_interval(
             sensor_values,
@@ -168,21 +168,21 @@ class LearningFilter:
             self.sensor_model.value_per_draw[:, :, control_index],
         )
         readings = GaugeReadings(sensor_values, self._draw, best_fit.value, inverse_deviation)
-        log_belief = forecast + log_density_beside + best_fit.log_density[self._draw]
+        log_belief = forecast + other_log_density + best_fit.log_density[self._draw]
         log_belief += self._gauges.log_density(readings, statistics, count)
 
         # Normalise it.
-        best = float(log_belief.max())
-        if best == -np.inf:
-            worst = self.sensor_model.worst_residuals(sensor_values, control_index)
-            raise ImpossibleObservation(self._name, step, worst)
-        filtered = np.exp(log_belief - best)
-        log_evidence = best + float(np.log(filtered.sum()))
+        largest = float(log_belief.max())
+        if largest == -np.inf:
+            worst_residuals = self.sensor_model.worst_residuals(sensor_values, control_index)
+            raise ImpossibleObservation(self._name, step, worst_residuals)
+        filtered = np.exp(log_belief - largest)
+        log_evidence = largest + float(np.log(filtered.sum()))
         filtered /= filtered.sum()
         log_belief -= log_evidence
 
-        # Update the regressions. Each gauge is compared with the fit by all other gauges, so that
-        # its own noise does not seem smaller than it is.
+        # Update the regressions. Each gauge is compared with the fit by all other gauges: a fit
+        # that contains the gauge follows its noise, which would seem smaller than it is.
         if self._gauges.learns:
             predictive_scale = inverse_deviation * np.sqrt(best_fit.one_minus_leverage)
             readings = GaugeReadings(
@@ -200,7 +200,7 @@ class LearningFilter:
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
-        """Return what is known before the observation of a step.
+        """Return belief, regression sums and counts before the observation of a step.
 
         Returns
         -------
@@ -222,14 +222,17 @@ class LearningFilter:
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
     def hypotheses(self, carried: Carried, weight: Float | None = None) -> StaticHypotheses:
-        """Return the hypotheses after a step, without those of negligible weight.
+        """Return the joint belief after a step and the gauge coefficients given each hypothesis.
+
+        Hypotheses of negligible weight are left out.
 
         Parameters
         ----------
         carried : Carried
-            What the filter carried on from the step.
+            The arrays that the filter carried on from the step.
         weight : (K, S) array, optional
-            Another joint belief, such as a smoothed one, in the place of the filtered one.
+            Another joint belief over hypotheses and states, such as a smoothed one, that takes the
+            place of the filtered one.
         """
         if weight is None:
             weight = np.exp(carried.arrays["log_belief"])
@@ -237,11 +240,13 @@ class LearningFilter:
         is_considered = hypothesis_weight > _NEGLIGIBLE_WEIGHT * hypothesis_weight.sum()
         considered = np.flatnonzero(is_considered)
 
+        # Regression of offset and gain error, in units of their prior standard deviations.
         fit = self._gauges.fit(carried.arrays["statistics"][considered])
         offset_deviation = self._gauges.offset_deviation
         gain_deviation = self._gauges.gain_deviation
-        scale2 = self._gauges.squared_noise_scale(fit, carried.arrays["count"])
-        # From prior standard deviations to SI.
+        squared_noise_scale = self._gauges.squared_noise_scale(fit, carried.arrays["count"])
+        # Convert the posterior covariance to SI: a coefficient is in units of its prior standard
+        # deviation. It holds for a noise scale of one, and is proportional to the squared scale.
         offset_variance = offset_deviation**2 * fit.offset_variance
         covariance = offset_deviation * gain_deviation * fit.covariance
         gain_variance = gain_deviation**2 * fit.gain_variance
@@ -250,10 +255,10 @@ class LearningFilter:
             draw=self._draw[considered],
             offset=offset_deviation * fit.offset,
             gain=gain_deviation * fit.gain,
-            offset_variance=scale2 * offset_variance,
-            covariance=scale2 * covariance,
-            gain_variance=scale2 * gain_variance,
-            squared_noise_scale=scale2,
+            offset_variance=squared_noise_scale * offset_variance,
+            covariance=squared_noise_scale * covariance,
+            gain_variance=squared_noise_scale * gain_variance,
+            squared_noise_scale=squared_noise_scale,
         )
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
@@ -269,19 +274,20 @@ class LearningFilter:
         if self.parameter is None and len(self._draw) > 1:
             log_belief = np.stack([self._restore_draw_weights(row) for row in log_belief])
 
-        # Given its hypothesis each filter is smoothed by itself; the weights are those of the end.
+        # The belief of each hypothesis is smoothed by itself. Hypotheses do not change in time, so
+        # that their smoothed weights are those after the last step.
         weight = np.exp(log_belief[-1]).sum(axis=1)
-        possible = np.flatnonzero(weight > 0.0)
-        log_given_hypothesis = log_belief[:, possible] - logsumexp(
-            log_belief[:, possible], axis=2, keepdims=True
+        possible_hypotheses = np.flatnonzero(weight > 0.0)
+        log_given_hypothesis = log_belief[:, possible_hypotheses] - logsumexp(
+            log_belief[:, possible_hypotheses], axis=2, keepdims=True
         )
         step_controls = np.array([step.control_index for step in carried])
-        control = self._first_control[possible, None] + step_controls
+        control = self._first_control[possible_hypotheses, None] + step_controls
         log_given_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
         smoothed = smooth_many(
             self._transition, control, np.exp(log_given_hypothesis), log_given_hypothesis
         )
-        result[:, possible] = weight[possible, None] * smoothed.swapaxes(0, 1)
+        result[:, possible_hypotheses] = weight[possible_hypotheses, None] * smoothed.swapaxes(0, 1)
         return result
 
     def _restore_draw_weights(self, log_belief: Float) -> Float:
@@ -293,7 +299,7 @@ class LearningFilter:
         by_factor = log_belief.reshape(factor_count, -1, log_belief.shape[1])  # (factors, E, S)
         draw_count = by_factor.shape[1]
         log_factor_belief = np.repeat(np.logaddexp.reduce(by_factor, axis=1), draw_count, axis=0)
-        # The prior weights are those of draw and factor; times the factors they are of the draw.
+        # `_log_weight` holds p(draw) / (number of factors); times that number it is p(draw).
         return np.asarray(log_factor_belief + self._log_weight[:, None] + np.log(factor_count))
 
     def _learnt_quantities(
@@ -332,16 +338,20 @@ class LearningFilter:
     def _learnt_noise_scales(self, weight: Float, fit: GaugeFit, count: Float) -> dict[str, Learnt]:
         """Return the posterior of each noise scale, given the weights (K,) of the hypotheses.
 
-        The square of a scale is inverse gamma (shape, rate) given a hypothesis. The moments of the
-        scale are those over all hypotheses; its quantiles are those of the mean rate.
+        Given a hypothesis, the square of a scale has an inverse gamma distribution with a shape and
+        a rate. Mean and variance are averaged over the hypotheses. The quantiles are approximate:
+        those of the inverse gamma distribution with the mean rate.
         """
         degrees = self._gauges.degrees
         shape = 0.5 * (degrees + count)
         rate = 0.5 * (degrees + fit.residual_squares)
         low_level, high_level = INTERVAL
-        # A large gamma variate belongs to a small scale: the levels change places.
+        # The squared scale is the rate over a gamma variate, so that the lower quantile of the
+        # scale belongs to the upper one of the variate.
         lower = np.sqrt(weight @ rate / gammaincinv(shape, high_level))
         upper = np.sqrt(weight @ rate / gammaincinv(shape, low_level))
+        # For a gamma variate x: E(1 / sqrt(x)) = Gamma(shape - 1/2) / Gamma(shape), and
+        # E(1 / x) = 1 / (shape - 1).
         mean = weight @ np.sqrt(rate) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
         variance = np.maximum(weight @ rate / (shape - 1.0) - mean**2, 0.0)
         deviation = np.sqrt(variance)
@@ -355,21 +365,31 @@ class LearningFilter:
     def _learnt_offsets_and_gains(
         self, weight: Float, fit: GaugeFit, count: Float
     ) -> dict[str, Learnt]:
-        """Return the posterior of each offset and gain error, given the weights (K,)."""
-        scale2 = self._gauges.squared_noise_scale(fit, count)
+        """Return the posterior of each offset and gain error by name.
+
+        Parameters
+        ----------
+        weight : (K,) array
+            The probability of each hypothesis.
+        fit : GaugeFit
+            The posterior of the coefficients given each hypothesis.
+        count : (G,) array
+            The number of observations of each sensor.
+        """
+        squared_noise_scale = self._gauges.squared_noise_scale(fit, count)
         offsets = _learnt_coefficients(
             "gauge_offset",
             self._units,
             self._gauges.offset_deviation,
             mean=weight @ fit.offset,
-            mean_square=weight @ (fit.offset**2 + scale2 * fit.offset_variance),
+            mean_square=weight @ (fit.offset**2 + squared_noise_scale * fit.offset_variance),
         )
         gains = _learnt_coefficients(
             "gauge_gain",
             ("1",) * len(self._units),
             self._gauges.gain_deviation,
             mean=weight @ fit.gain,
-            mean_square=weight @ (fit.gain**2 + scale2 * fit.gain_variance),
+            mean_square=weight @ (fit.gain**2 + squared_noise_scale * fit.gain_variance),
         )
         return offsets | gains
 

@@ -1,15 +1,16 @@
-"""The watch over the gauges: a gauge that is off, states that explain no gauges, absurd readings.
+"""The watch over the gauges: it notices faulty gauges, unexplained readings and absurd readings.
 
-The model as it is says that every gauge shows the value that belongs to the state and to a draw of
-the parameter, plus noise of unknown scale. Beside it compete two kinds of fault, each with a filter
-of its own, so that state and parameter are marginalised under each: a gauge shows a stated fraction
-too much or too little; or several gauges have gains of their own, which no state of the model
-explains. Each fault may begin in any step. The mixture over the first step is exact, because until
-then the belief of the fault is that of the model.
+By the model, every gauge shows the value that belongs to the state and to a draw of the parameter,
+plus noise of unknown scale. Two kinds of fault compete with the model: a gauge shows a stated
+fraction too much or too little; or several gauges have unknown gains of their own, which no state
+of the model explains. Each has a filter of its own, so that state and parameter are marginalised
+under each. A fault may begin in any step. The mixture over the first step of the fault is exact,
+because the belief of a fault that has not begun is that of the model.
 
 The ratio of the evidence of a fault to that of the model is an e-process: its mean under the
 predictions of the model is one at every step. So it ever exceeds a threshold c with a probability
-of at most 1 / c, however often one looks (Ville 1939; Ramdas, Grünwald, Vovk and Shafer 2023).
+of at most 1 / c, in however many steps they are compared (Ville 1939; Ramdas, Grünwald, Vovk and
+Shafer 2023).
 """
 
 from collections.abc import Sequence
@@ -88,7 +89,10 @@ class WatchfulEstimator:
         self._notices = self._notice_writer(words or NoticeWording(), settings)
 
     def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
-        """Return the writer of notices, with the range of readings that are not absurd."""
+        """Return the writer of notices.
+
+        A reading is plausible if it is within a margin of the prediction of some draw and state.
+        """
         value = self._sensor_model.value_per_draw
         deviation = self._sensor_model.total_standard_deviation
         margin = settings.absurd_deviations * deviation  # (S, U, G)
@@ -106,30 +110,33 @@ class WatchfulEstimator:
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S).
 
-        Under the model it is that of the inner estimator. Otherwise the mixed beliefs of the steps
-        are smoothed, from the belief of the competing hypotheses in the last step.
+        Under the model, the inner estimator smooths. Under the competing hypotheses, the mixed
+        beliefs of the steps are smoothed, which is approximate: the last step has the belief of the
+        competing hypotheses alone. The result is the average, with the last weight of the model.
         """
         under_model = self._inner.smoothed(carried)
         if not carried:
             return under_model
-        beliefs = [StoredBelief.from_arrays(step.arrays) for step in carried]
-        last = beliefs[-1]
+        stored_beliefs = [StoredBelief.from_arrays(step.arrays) for step in carried]
+        last_step = stored_beliefs[-1]
         with np.errstate(divide="ignore"):
-            log_beliefs = np.log([stored.belief for stored in beliefs])
-            log_beliefs[-1] = np.log(last.competing_belief)
+            log_beliefs = np.log([stored.belief for stored in stored_beliefs])
+            log_beliefs[-1] = np.log(last_step.competing_belief)
         controls = [step.control_index for step in carried]
         competing = smooth(self.model, controls, log_beliefs)
-        return np.asarray(last.model_weight * under_model + (1.0 - last.model_weight) * competing)
+        return np.asarray(
+            last_step.model_weight * under_model + (1.0 - last_step.model_weight) * competing
+        )
 
     def step(
         self, before: Carried | None, observation: Float, control_index: int, step: int
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         # Leave out absurd readings.
-        readings, log_density_beside = self._sensor_model.split_observation(observation)
+        readings, other_log_density = self._sensor_model.split_observation(observation)
         is_absurd = self._notices.is_absurd(readings, control_index)
         used_readings = np.where(is_absurd, np.nan, readings)
-        # What follows the sensors in an observation, such as readings of inspections, is kept.
+        # The rest of the observation, such as readings of inspections, is kept.
         used_observation = np.append(used_readings, observation[len(used_readings) :])
         estimate = self._inner.step(before, used_observation, control_index, step)
 
@@ -138,13 +145,13 @@ class WatchfulEstimator:
             state = self._faults.advance(before, control_index)
         else:
             state = self._faults.start(estimate.forecast, control_index)
-        self._faults.assimilate(state, used_readings, log_density_beside, control_index)
+        self._faults.assimilate(state, used_readings, other_log_density, control_index)
 
-        # Report what is noticed.
+        # Write the notices of this step.
         notices = self._notices.report_absurd_readings(
             state.left_out, is_absurd, readings, control_index, step
         )
-        # A gauge that is left out stays so while it is silent.
+        # A gauge that was left out and sends no reading now counts as left out still.
         state.left_out = is_absurd | (state.left_out & np.isnan(readings))
         suspicion = self._suspicion(state)
         notices += self._notices.raise_alarms(state, suspicion, step)
@@ -155,15 +162,15 @@ class WatchfulEstimator:
         notices += self._notices.report_followed_hypothesis(state, hypotheses, step)
 
         # Mix the beliefs of the hypotheses by their weights.
-        mixed = hypothesis_weights.mix_beliefs(state.weights, beliefs)
-        state.belief = mixed.belief
-        state.competing_belief = mixed.competing
-        state.model_weight = mixed.model_weight
+        mixed_belief = hypothesis_weights.mix_beliefs(state.weights, beliefs)
+        state.belief = mixed_belief.belief
+        state.competing_belief = mixed_belief.competing
+        state.model_weight = mixed_belief.model_weight
         arrays = {**estimate.carried.arrays, **state.as_arrays(self._faults.model_key)}
         probabilities = {hypothesis.name: hypothesis.probability for hypothesis in hypotheses}
         return replace(
             estimate,
-            filtered=mixed.belief,
+            filtered=mixed_belief.belief,
             carried=Carried(control_index, arrays),
             notices=(*estimate.notices, *notices),
             suspicion=replace(suspicion, hypotheses=probabilities),
@@ -171,25 +178,26 @@ class WatchfulEstimator:
         )
 
     def _continues(self, before: Carried) -> bool:
-        """Return whether a step before was watched with the same predictions."""
+        """Return whether the state of the previous step belongs to the same predictions."""
         return bool(before.arrays.get(MODEL_KEY) == self._faults.model_key)
 
     def _suspicion(self, state: WatchState) -> Suspicion:
         """Return how well the model explains the sensors so far.
 
-        A fault that has not begun yet predicts what the model predicts. So its evidence over the
-        model contains, with the ratio one, the prior probability that it begins later.
+        The evidence for a fault, relative to that for the model, is a sum over the steps in which
+        it may begin. If it begins later, it predicts so far what the model predicts: this term is
+        the prior probability that it begins later, times one.
         """
-        log_to_begin = np.log(self._faults.probability_to_begin_after(state.step_count - 1.0))
-        log_begun = np.logaddexp.reduce(state.log_gauge_evidence, axis=1)
-        log_gauge = np.logaddexp(log_begun, log_to_begin)
+        log_begins_later = np.log(self._faults.probability_to_begin_after(state.step_count - 1.0))
+        log_fault_has_begun = np.logaddexp.reduce(state.log_gauge_evidence, axis=1)
+        log_each_gauge = np.logaddexp(log_fault_has_begun, log_begins_later)
         log_free_gains = float(state.log_free_gains_evidence[0])
-        log_any_gauge = np.logaddexp.reduce(log_gauge + self._faults.log_gauge_prior)
+        log_any_gauge = np.logaddexp.reduce(log_each_gauge + self._faults.log_gauge_prior)
         return Suspicion(
             none_of_these=state.weights.free_gains_probability,
             gauge_off=float(state.weights.gauge_fault_probability.sum()),
-            log_evidence_none=float(np.logaddexp(log_free_gains, log_to_begin)),
+            log_evidence_none=float(np.logaddexp(log_free_gains, log_begins_later)),
             log_evidence_any_gauge=float(log_any_gauge),
-            log_evidence_gauge=log_gauge,
+            log_evidence_gauge=log_each_gauge,
             left_out=state.left_out,
         )

@@ -1,4 +1,4 @@
-"""The sentences by which the watch over the gauges tells an operator what it notices."""
+"""The notices of the watch over the gauges, as sentences for an operator."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,7 +53,10 @@ class NoticeWriter:
     hypothesis_names: tuple[str, ...]
 
     def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
-        """Return which readings (G,) no state can plausibly cause under a control; NaN is not."""
+        """Return whether each reading (G,) is implausible in every state under a control.
+
+        A missing reading (NaN) is not absurd.
+        """
         is_too_low = readings < self.lowest_plausible[control_index]
         is_too_high = readings > self.highest_plausible[control_index]
         return np.asarray(is_too_low | is_too_high)
@@ -66,7 +69,21 @@ class NoticeWriter:
         control_index: int,
         step: int,
     ) -> list[Notice]:
-        """Return a notice for each gauge (G,) whose readings begin or cease to be absurd."""
+        """Return a notice for each gauge whose readings begin or cease to be absurd.
+
+        Parameters
+        ----------
+        was_left_out : (G,) array of bool
+            Whether the gauge was left out before this step.
+        is_absurd : (G,) array of bool
+            Whether its reading is absurd now.
+        readings : (G,) array
+            The readings, SI; NaN where nothing was received.
+        control_index : int
+            The control in force.
+        step : int
+            The number of this step.
+        """
         notices = []
         for g in np.flatnonzero(is_absurd & ~was_left_out).tolist():
             reading, low, high = self.wording.format_values(
@@ -127,28 +144,29 @@ class NoticeWriter:
         return [Notice("hypothesis", sentence, numbers, best.probability)]
 
     def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
-        """Return the alarms that are raised in this step; the state remembers them.
+        """Return the alarms that are raised in this step, and mark them as raised in `state`.
 
-        A gauge that is off also raises the evidence of free gains, and a region that softens raises
-        that of its gauges. So the kind of fault that explains less waits. This makes false alarms
-        rarer still.
+        Each kind of fault raises its alarm once: a single gauge, or free gains of several. A gauge
+        that is off also raises the evidence for free gains, and a region that softens raises that
+        for its gauges. So the kind with less evidence raises no alarm in the meantime; free gains
+        must be clearly better than a single gauge, the simpler explanation.
         """
         log_gauge = suspicion.log_evidence_any_gauge
         log_free_gains = suspicion.log_evidence_none
         log_threshold = np.log(self.threshold)
         notices = []
-        is_gauge = log_gauge >= max(log_threshold, log_free_gains - CLEARLY_BETTER)
-        if is_gauge and not state.gauge_alarm_raised:
+        is_gauge_alarm = log_gauge >= max(log_threshold, log_free_gains - CLEARLY_BETTER)
+        if is_gauge_alarm and not state.gauge_alarm_raised:
             state.gauge_alarm_raised = True
             notices.append(self._gauge_alarm(state, log_gauge, step))
-        is_free_gains = log_free_gains >= max(log_threshold, log_gauge + CLEARLY_BETTER)
-        if is_free_gains and not state.free_gains_alarm_raised:
+        is_free_gains_alarm = log_free_gains >= max(log_threshold, log_gauge + CLEARLY_BETTER)
+        if is_free_gains_alarm and not state.free_gains_alarm_raised:
             state.free_gains_alarm_raised = True
             notices.append(self._free_gains_alarm(state, log_free_gains, step))
         return notices
 
     def _gauge_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
-        """Return the alarm that a single gauge is off, naming those that it may be."""
+        """Return the alarm that a single gauge is off, with the gauges that may be the one."""
         log_weight = state.log_gauge_evidence + self.log_gauge_prior[:, None]
         weight = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))  # (G, K)
         probability = weight.sum(axis=1)
@@ -165,7 +183,7 @@ class NoticeWriter:
         return self._alarm(state, step, finding, named, log_evidence, onset)
 
     def _free_gains_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
-        """Return the alarm that no state explains all gauges, naming those explained least."""
+        """Return the alarm that no state explains all gauges, with the gauges of largest gain."""
         statistics = state.free_gain_statistics
         gain_deviations = np.abs(statistics.sum_cx) / np.sqrt(1.0 + statistics.sum_cc)
         named = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
@@ -224,7 +242,10 @@ class NoticeWriter:
 
 
 def _largest(values: Float, least: float) -> list[int]:
-    """Return the indices of the largest of values (G,): those of `least` or more, one at least."""
+    """Return the indices of the values (G,) of at least `least`, the largest first.
+
+    There are at most `_MOST_NAMED`, and at least that of the largest value.
+    """
     order = np.argsort(-values, kind="stable").tolist()
-    large = [g for g in order if values[g] >= least]
-    return large[:_MOST_NAMED] or order[:1]
+    large_enough = [g for g in order if values[g] >= least]
+    return large_enough[:_MOST_NAMED] or order[:1]

@@ -35,7 +35,7 @@ SUM_COUNT = 6
 
 
 class GaugeReadings(NamedTuple):
-    """One observation beside its predictions by each draw in each state.
+    """One observation of G gauges, with the predictions of E draws in S states.
 
     Attributes
     ----------
@@ -58,8 +58,8 @@ class GaugeReadings(NamedTuple):
 class RegressionSums(NamedTuple):
     """Sums of products over all observations, each (K, G).
 
-    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
-    value by one prior standard deviation of offset and gain: `cx` is the sum of c x.
+    For a gauge, x is the standardised residual, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain. The field `cx` is the sum of c x.
 
     An array (K, G, 6) holds them in this order along its last axis.
     """
@@ -90,7 +90,8 @@ class GaugeFit(NamedTuple):
     offset_variance, covariance, gain_variance : (K, G) array
         Posterior covariance of the two.
     residual_squares : (K, G) array
-        Sum of the squares that the fitted coefficients leave unexplained.
+        The squared residuals of the fit plus the squared coefficients, which the prior adds as in
+        a ridge regression.
     """
 
     offset: Float
@@ -146,8 +147,8 @@ class GaugeRegression:
             offset_precision / determinant,
             residual_squares,
         ]
-        # Views of one array, as the sums are. A mean over hypotheses of such a view does not depend
-        # on a library of linear algebra.
+        # The fields are views of one array, as the sums are. A mean over hypotheses of such a view
+        # is summed by NumPy, not by a library of linear algebra whose last bits may differ.
         return GaugeFit._make(np.moveaxis(np.stack(fields, axis=-1), -1, 0))
 
     def squared_noise_scale(self, fit: GaugeFit, count: Float) -> Float:
@@ -162,7 +163,8 @@ class GaugeRegression:
         """
         if not self.degrees > 0.0:
             return np.ones_like(fit.residual_squares)
-        # The mean of an inverse gamma distribution exists above two degrees of freedom.
+        # The mean of an inverse gamma distribution exists above two degrees of freedom; with fewer
+        # the divisor is kept at one.
         degrees_above_two = np.maximum(self.degrees + count - 2.0, 1.0)
         return np.asarray((self.degrees + fit.residual_squares) / degrees_above_two)
 
@@ -180,7 +182,8 @@ class GaugeRegression:
         """
         present = ~np.isnan(readings.observation)
         fit = self.fit(statistics)
-        # The factors of the density that do not depend on the state.
+        # The factors of the density that do not depend on the state. The density is Student's, or
+        # normal if the noise scale is not learnt.
         log_constant: Float = np.full(len(present), -0.5 * np.log(2.0 * np.pi))
         if self.degrees > 0.0:
             power = 0.5 * (self.degrees + count + 1.0)
@@ -205,7 +208,9 @@ class GaugeRegression:
         return result
 
     def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
-        """Return what an observation adds to the sums (K, G, 6), expected over the state.
+        """Return the expected products that an observation adds to the sums: (K, G, 6).
+
+        The expectation is over the state, given the hypothesis.
 
         Parameters
         ----------
@@ -236,13 +241,14 @@ def _add_log_densities(
     count: Float,
     result: Float,
 ) -> None:
-    """Add the factors of the predictive density that depend on the state to result (K, S).
+    """Add to `result` (K, S) the log factors of the predictive density that depend on the state.
 
-    Of a gauge, x is the standardised residual that the fitted offset and gain leave, and a and c
-    are the changes of its standardised value by one prior standard deviation of offset and gain.
+    K is the number of hypotheses, S that of states. For a gauge, x is the standardised residual
+    after the fitted offset and gain are subtracted, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain.
 
-    A logarithm is what costs time here. So the factors of gauges whose densities have the same
-    power are multiplied, and the logarithm is taken of the product.
+    Most of the time is spent on logarithms. So the factors of gauges whose densities have the same
+    power are multiplied first, and one logarithm is taken of the product.
     """
     observation, draw, prediction, inverse_deviation = readings
     for k in range(result.shape[0]):
@@ -290,24 +296,25 @@ def _add_expected_products(
     log_weight: Float,
     sums: RegressionSums,
 ) -> None:
-    """Add the products of a, c and x of each gauge, expected over the state, to sums (K, G).
+    """Add the expected products of a, c and x of each gauge to `sums` (K, G), in place.
 
-    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
-    value by one prior standard deviation of offset and gain.
+    The expectation is over the state, given each of K hypotheses. For a gauge, x is the
+    standardised residual, and a and c are the changes of its standardised value by one prior
+    standard deviation of offset and gain.
     """
     observation, draw, prediction, inverse_deviation = readings
     weight = np.empty(log_weight.shape[1])
     for k in range(len(draw)):
-        best = np.max(log_weight[k])
-        if best == -np.inf:
+        largest = np.max(log_weight[k])
+        if largest == -np.inf:  # the hypothesis is ruled out
             continue
         # Probability of each state given the hypothesis.
         for s in range(len(weight)):
-            weight[s] = np.exp(max(log_weight[k, s] - best, NEGLIGIBLE_LOG_WEIGHT))
+            weight[s] = np.exp(max(log_weight[k, s] - largest, NEGLIGIBLE_LOG_WEIGHT))
         weight /= weight.sum()
         # Sum of the products over states.
         for s in range(len(weight)):
-            if log_weight[k, s] - best <= NEGLIGIBLE_LOG_WEIGHT:
+            if log_weight[k, s] - largest <= NEGLIGIBLE_LOG_WEIGHT:
                 continue
             for g in range(len(observation)):
                 if np.isnan(observation[g]):

@@ -1,4 +1,4 @@
-"""What the watch over the gauges carries from one step to the next, and how it is stored."""
+"""The state of the watch over the gauges, which is carried from step to step, and its storage."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,13 +12,13 @@ from twin_master.learning.hypothesis_weights import HypothesisWeights
 from twin_master.network.estimator import CarriedArrays
 
 PREFIX = "notice/"
-"""Beginning of the names of the arrays that are stored beside those of the inner estimator."""
+"""Prefix of the names of its arrays; those of the inner estimator are stored without it."""
 MODEL_KEY = f"{PREFIX}model_key"
 """Name of the array that identifies the predictions for which the state holds."""
 FROM_THE_START = 0.5
-"""Prior probability that a fault is there from the first step; others begin in a later one."""
+"""Prior probability that a fault, if there is one, begins in the first step, not a later one."""
 FREE_GAIN_PROBABILITY = 0.5
-"""Prior probability that a gauge has a gain of its own, if several gauges have one."""
+"""Prior probability that a certain gauge has a gain of its own, under the fault free gains."""
 
 
 @dataclass
@@ -98,12 +98,14 @@ class WatchState:
         Parameters
         ----------
         model_belief : (E, S) array
-            The prior over draws and states, which all hypotheses share.
+            The prior over draws and states, the same under all hypotheses.
         sensors, gains : int
             The numbers G of gauges and K of gain errors.
         weights : HypothesisWeights
             The prior weights of the hypotheses.
         """
+        # The evidence for a fault starts as the prior probability that it is there from the first
+        # step; each gain of a gauge is equally probable.
         log_prior = np.log(FROM_THE_START)
         gauge_shape = (sensors, gains)
         gauge_belief = np.broadcast_to(model_belief, (*gauge_shape, *model_belief.shape))
@@ -138,17 +140,22 @@ class WatchState:
         )
 
     def as_arrays(self, model_key: Unsigned) -> CarriedArrays:
-        """Return the state as arrays by name, with only the entries of `gauge_belief` not zero.
+        """Return the state as arrays by name; zeros of `gauge_belief` are left out.
 
-        Names and layout are those of saved states of earlier versions, too.
+        Names and layout are those of earlier versions, so that their saved states can be read.
+
+        Parameters
+        ----------
+        model_key : (1,) array
+            The number that identifies the predictions for which the state holds.
         """
-        # Comparing first is ten times as fast as to look for numbers that are not zero.
-        nonzero = np.flatnonzero(self.gauge_belief != 0.0)
+        # The comparison first makes `flatnonzero` ten times as fast.
+        nonzero_indices = np.flatnonzero(self.gauge_belief != 0.0)
         arrays: CarriedArrays = {
             "model": self.model_belief,
             "mended": self.recovered_belief,
-            "gauge": self.gauge_belief.ravel()[nonzero],
-            "gauge_place": nonzero.astype(np.int32),
+            "gauge": self.gauge_belief.ravel()[nonzero_indices],
+            "gauge_place": nonzero_indices.astype(np.int32),
             "none": self.free_gains_belief,
             "share": self.weights.current,
             "hidden": self.weights.hidden,
@@ -177,12 +184,12 @@ class WatchState:
 
     @classmethod
     def from_arrays(cls, arrays: CarriedArrays, gauge_shape: tuple[int, ...]) -> "WatchState":
-        """Return a copy of the state that arrays hold, for further steps.
+        """Return the state from the arrays that `as_arrays` returned; they are copied.
 
         Parameters
         ----------
         arrays : dict of str to array
-            The arrays that an estimator carried on, with those of `as_arrays` among them.
+            All arrays that an estimator carried on; those of the state begin with `PREFIX`.
         gauge_shape : tuple of int
             The shape (G, K, E, S) of `gauge_belief`.
         """
@@ -224,7 +231,7 @@ class WatchState:
 
 @dataclass(frozen=True)
 class StoredBelief:
-    """The beliefs about the state that a step left, to smooth over.
+    """The mixed beliefs about the state that were stored in a step, for smoothing.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The decision that a line of a journal tells the operator, as a record and in words."""
+"""The decision in a line of a journal, as a record and in words for the operator."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,39 +11,39 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 
 _KEYS_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
-"""The entries of a suspicion that the decision repeats."""
+"""The entries of a suspicion that are copied into the decision."""
 
 
 def decision_from_line(
     line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel
 ) -> JsonObject:
-    """Return the decision in a line of a journal; empty if the line tells none.
+    """Return the decision in a line of a journal; empty if the line contains none.
 
-    A decision always states the probability of its control. If no state explains the sensors, no
-    state is believed, and the decision has no mean and no standard deviation of it.
+    A decision always states the probability of its control. If no state is believed, because most
+    probably none explains the sensors, mean and standard deviation of the state are None.
 
     Parameters
     ----------
     line : mapping of str to object
         The record of the line.
     scenario : Scenario
-        What is flown or watched.
+        The scenario of the run or watch.
     model : GraphicalModel
-        The states of the belief.
+        The states to which the belief in the line refers.
     """
-    for reason in ("quiet", "refused"):  # such a line repeats the last decision
+    for reason in ("quiet", "refused"):  # such a line contains a copy of the last decision
         if reason in line:
             return dict(line[reason])
     if "filtered" not in line:
         return {}
     controls = scenario.control_names
     next_control = line["next_control"]
-    is_believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
+    is_a_state_believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
     decision: JsonObject = {
         "step": line["step"],
         "control": controls[line.get("control_in_force", line["control_index"])],
-        "state_believed": is_believed,
-        "health": _health_record(line, scenario, model, is_believed=is_believed),
+        "state_believed": is_a_state_believed,
+        "health": _health_record(line, scenario, model, is_believed=is_a_state_believed),
         "next_control": controls[next_control],
         "probability": min(float(line["decision_probability"][next_control]), 1.0),
         "lost_sensors": line["observed"][: scenario.observation.count].count(None),
@@ -95,13 +95,13 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
 
 
 def decision_line(scenario: Scenario, decision: Mapping[str, Any]) -> str:
-    """Return a decision as a line of text for people."""
-    health = "no state is believed"
+    """Return a decision as a line of text for the operator."""
+    health_text = "no state is believed"
     if decision.get("state_believed", True):
         texts = health_in_words(decision)
-        health = ", ".join(f"{name} {text}" for name, text in texts.items())
+        health_text = ", ".join(f"{name} {text}" for name, text in texts.items())
     line = (
-        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
+        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health_text}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"
     )
     hypothesis = decision.get("decided_by", "model")

@@ -1,8 +1,9 @@
-"""The journal of a run or a watch, `journal.jsonl`: one line for each step, after its SHA-256 hash.
+"""The journal of a run or a watch, `journal.jsonl`: one line for each step.
 
-The file only grows. A line that was cut off when the process was killed ends without a line feed
-and is dropped. Any other line without its hash was changed. The file is read line by line, however
-long it is.
+A line is the SHA-256 hash of a JSON text, a blank, and the text. The file only grows. If the
+process was killed while it wrote, the last line has no line feed and is dropped. Any other line
+that does not match its hash was changed or is damaged. The file is read line by line, so that its
+length does not matter.
 """
 
 import base64
@@ -48,7 +49,7 @@ PRESENT_NAMES = {
     "standing.teaching.trial.to_turn": "to_step",
     "standing.teaching.adopted.from_turn": "from_step",
 }
-"""The present name of each key of a journal, by the location of its former name."""
+"""The present name of each renamed key, by the path of its former name in a record."""
 _HASH_LENGTH = 64
 """Characters of a SHA-256 hash in hexadecimal digits."""
 _BLOCK_SIZE = 1_000_000
@@ -58,14 +59,14 @@ _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", "
 
 
 class JournalLine(NamedTuple):
-    """A line of a journal that has its hash.
+    """A line of a journal that matches its hash.
 
     Attributes
     ----------
     record : dict
         The content of the line.
     begin, end : int
-        Where the line begins and ends in the file, in bytes.
+        The positions of the first byte of the line and of the byte after its last one.
     """
 
     record: JsonObject
@@ -95,9 +96,9 @@ def array_from_json(values: Iterable[float | None]) -> Float:
 
 
 def step_record(step: MissionStep) -> JsonObject:
-    """Return the content of the journal's line of a step.
+    """Return the record of a step for the journal.
 
-    The line also holds the belief, so that a viewer need not filter the observations again.
+    The record also contains the belief, so that a viewer need not filter the observations again.
     """
     twin_step = step.twin_step
     record: JsonObject = {
@@ -121,7 +122,7 @@ def step_record(step: MissionStep) -> JsonObject:
 
 
 def reading_from_line(record: JsonObject) -> Reading:
-    """Return the reading in a line of the journal; that of a simulated asset has its ground truth.
+    """Return the reading in a record of the journal, with the ground truth of a simulated asset.
 
     Raises
     ------
@@ -159,7 +160,7 @@ class JournalFile:
     path : Path
         The file.
     size : int
-        The bytes of its whole lines.
+        The size of all complete lines, in bytes.
 
     Raises
     ------
@@ -206,13 +207,15 @@ class JournalFile:
             If the disk is full or the folder cannot be written; the earlier lines are still there.
         """
         line = encode_line(record)
-        written = 0
+        written_bytes = 0
         try:
-            while written < len(line):
-                written += os.write(self._descriptor, line[written:])
+            # The operating system may write less than it is given.
+            while written_bytes < len(line):
+                written_bytes += os.write(self._descriptor, line[written_bytes:])
             if time.monotonic() - self._flushed_at >= self._flush_seconds:
                 self.flush()
         except OSError as error:
+            # Remove what was written of the line.
             with suppress(OSError):
                 os.truncate(self._descriptor, self.size)
             raise write_error(error, self.path) from error
@@ -292,10 +295,9 @@ def records_in_file(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[Jour
 
 
 def record_of_line(line: bytes, path: Path) -> dict[str, Any] | None:
-    """Return the record of a line, or None if the line does not have its hash.
+    """Return the record of a line, or None if the line does not match the hash that it begins with.
 
-    Each line has a hash of its own. A line of an earlier version is returned with the present
-    names.
+    If the line was written by an earlier version, its keys are replaced by their present names.
     """
     text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
     if sha256(text).hexdigest().encode("ascii") != line[:_HASH_LENGTH]:
@@ -303,6 +305,7 @@ def record_of_line(line: bytes, path: Path) -> dict[str, Any] | None:
     record = json.loads(text)
     if not isinstance(record, dict):
         return None
+    # Only earlier versions wrote the key "turn".
     if "turn" in record:
         return with_present_names(record, PRESENT_NAMES, str(path), NotResumableError)
     return record
@@ -346,19 +349,21 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLin
 def _lines_backwards(file: BinaryIO, end: int) -> Iterator[bytes]:
     """Yield the lines of a file that end at or before `end`, the last one first."""
     block_begin = end
-    end_of_split_line = b""  # of the line that begins in an earlier block
+    end_of_split_line = b""  # end of a line that begins in the block before this one
     while block_begin > 0:
         block_size = min(block_begin, _BLOCK_SIZE)
         block_begin -= block_size
         file.seek(block_begin)
         lines = io.BytesIO(file.read(block_size) + end_of_split_line).readlines()
+        # The first line of a block may begin in an earlier block; only the first block of the file
+        # begins with a complete line.
         if block_begin > 0:
             end_of_split_line = lines.pop(0)
         yield from reversed(lines)
 
 
 def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
-    """Return the last step of a journal that is not above a limit, and the end of its last line.
+    """Return the last step of a journal that is at most a limit, and the end of its last line.
 
     Parameters
     ----------
@@ -380,40 +385,41 @@ def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
         If one of the lines that are read was changed or is damaged.
     """
     for line in records_backwards(path):
-        step = int(line.record.get("step", -1))
+        step = int(line.record.get("step", -1))  # the header has no step
         if step <= limit:
             return step, line.end
     return -1, 0
 
 
 def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError:
-    """Return the error that says which line of a journal is damaged.
+    """Return the error that names a damaged line and counts the undamaged lines around it.
 
     Parameters
     ----------
     path : Path
         The journal.
     begin : int
-        Where the damaged line begins, in bytes.
+        The position of the first byte of the damaged line in the file.
     reason : str
-        How the damage shows.
+        What is wrong with the line, as a clause that the error message quotes.
     """
     line_number = 1
-    whole_lines_before = 0
-    whole_lines_after = 0
+    undamaged_lines_before = 0
+    undamaged_lines_after = 0
     line_begin = 0
     with path.open("rb") as file:
         for line in file:
             if line_begin < begin:
                 line_number += 1
+            # A line that matches its hash is undamaged; the damaged line itself is not counted.
             if line_begin != begin and record_of_line(line, path) is not None:
                 if line_begin < begin:
-                    whole_lines_before += 1
+                    undamaged_lines_before += 1
                 else:
-                    whole_lines_after += 1
+                    undamaged_lines_after += 1
             line_begin += len(line)
     return NotResumableError(
         f"line {line_number} of the journal {path} was changed or is damaged ({reason}); "
-        f"{whole_lines_before} before it are whole, and {whole_lines_after} behind it: "
+        f"{undamaged_lines_before} before it are whole, and {undamaged_lines_after} behind it: "
         "begin again with --replace."
     )

@@ -1,4 +1,7 @@
-"""The one loop: a source gives observations, the twin decides; a mission can be resumed."""
+"""The loop of a mission or a watch: a source gives observations, the twin assimilates and decides.
+
+A mission that was interrupted can be resumed.
+"""
 
 import time
 import zlib
@@ -50,9 +53,9 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
     twin : Twin
         The twin.
     source : Source
-        The source; it is asked for an observation when the step before was stored.
+        The source. It is asked for an observation after the previous step was stored.
     *sinks : callable
-        What stores each step, called one after the other.
+        Functions that store each step, called one after the other.
     """
     while True:
         begin = time.perf_counter()
@@ -142,7 +145,7 @@ def early_end_sentence(scenario: Scenario, steps_flown: int, reason: str) -> str
 STATE_ALLOWANCE = 64_000_000
 """Size of the journal up to which every step keeps the state of the asset, in bytes."""
 STATE_SHARE = 4_000
-"""Beyond it, a state is kept once it takes at most so many bytes for each step since the last one.
+"""Largest size of a state beyond it, in bytes for each step since the last state that was kept.
 
 An asset that is replayed keeps the inputs of all its steps in its state. If every step kept it, the
 journal would grow with the square of the number of steps. Steps after the last kept state are flown
@@ -151,9 +154,10 @@ again when a mission is resumed.
 
 
 def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
-    """Return the steps that an earlier process flew, and put plant and journal where it stopped.
+    """Return the steps of an earlier process, and set plant and journal to the end of these steps.
 
-    Lines after the last saved state of the asset are dropped; these steps are flown again.
+    Lines after the last saved state of the asset are removed from the journal; their steps must be
+    flown again.
 
     Parameters
     ----------
@@ -187,7 +191,8 @@ def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> 
 def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
     """Return a sink that appends steps to a journal, sometimes with the state of the asset.
 
-    After a kill, steps without a state of the asset after them are flown again, to the same bits.
+    If the process is killed, the steps after the last state are flown again, with the same results
+    to the last bit. A state is left out if it would make the journal too large.
     """
     steps_since_state = 0
 

@@ -28,7 +28,7 @@ INSPECTION_PERIODS = (2, 3, 5, 8, 12, 20)
 _GAP = 0.005
 """Relative gap between the bounds of a plan at which its search ends."""
 _GAP_OF_PRICED_PLANS = 0.06
-"""The same for the plans that are tried to keep a limit."""
+"""The same if several prices are tried to keep a health limit, which is coarser to save time."""
 _LARGEST_PRICE = 2.0**12
 """Largest price of a step beyond the health limit, in rewards."""
 _BISECTIONS = 4
@@ -36,7 +36,7 @@ _BISECTIONS = 4
 
 
 def discounts(scenario: Scenario) -> Float:
-    """Return the discount after a step under each control (U,); zero if it ends the mission."""
+    """Return the discount factor of each control (U,); zero if the control ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
 
@@ -59,11 +59,12 @@ class PricedPlan(NamedTuple):
 def plan_within_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
 ) -> PricedPlan:
-    """Return the plan on the belief that keeps the health limit as often as the scenario asks.
+    """Return the plan on the belief that exceeds the health limit as rarely as the scenario asks.
 
-    The scenario may bound the share of steps beyond the limit (`planner.limit_probability`). Such a
-    constraint on the mean is met by a multiplier (Altman 1999): each step beyond the limit costs a
-    price. The plan has the least of the tried prices for which the bound holds.
+    The scenario may bound the fraction of steps beyond the limit (`planner.limit_probability`).
+    Such a constraint on a mean is met by a Lagrange multiplier (Altman 1999): a price that each
+    step beyond the limit costs. Of the prices that are tried, the plan has the lowest for which the
+    bound holds.
 
     Parameters
     ----------
@@ -81,18 +82,18 @@ def plan_within_limit(
     """
     first_control = scenario.control_names.index(scenario.mission.first_control)
     allowed = scenario.planner.limit_probability
-    risk = _probability_beyond_limit(rewards)
+    probability_beyond = _probability_beyond_limit(rewards)
 
     def plan_with_price(price: float) -> PricedPlan:
-        priced_problem = replace(problem, reward=problem.reward - price * risk)
+        priced_problem = replace(problem, reward=problem.reward - price * probability_beyond)
         gap = _GAP if allowed is None else _GAP_OF_PRICED_PLANS
         return PricedPlan(plan_on_belief(priced_problem, first=first_control, gap=gap), price)
 
     def keeps_limit(candidate: PricedPlan) -> bool:
         if allowed is None:
             return True
-        share = share_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
-        return share <= allowed
+        fraction = share_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
+        return fraction <= allowed
 
     without_price = plan_with_price(0.0)
     if keeps_limit(without_price):
@@ -122,7 +123,7 @@ def plan_within_limit(
 
 
 def _probability_beyond_limit(rewards: RewardModel) -> Float:
-    """Return the probability that the health limit is exceeded in each state and control (S, U)."""
+    """Return the probability, over the draws, that the health limit is exceeded: (S, U)."""
     is_beyond = (rewards.health_per_draw < 0.0).astype(np.float64)
     return np.asarray(np.tensordot(rewards.quantity.draw_weight, is_beyond, axes=1))
 
@@ -130,11 +131,10 @@ def _probability_beyond_limit(rewards: RewardModel) -> Float:
 def share_beyond_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
 ) -> float:
-    """Return the discounted share of steps beyond the health limit under a policy.
+    """Return the discounted fraction of steps beyond the health limit under a policy.
 
-    The share is estimated in simulated missions. It is the expected return of a reward of one for
-    each step beyond the limit, relative to that of
-    a reward of one for each step.
+    It is estimated in simulated missions: the return of a reward of one for each step beyond the
+    limit, divided by the return of a reward of one for every step.
     """
     beyond_limit = replace(problem, reward=_probability_beyond_limit(rewards))
     all_steps = replace(problem, reward=np.ones_like(problem.reward))
@@ -173,8 +173,8 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         reason: object = error
         if "pickle" in str(error):
-            # NumPy takes a file that it does not know for Python objects, and advises to load it
-            # unsafely.
+            # NumPy takes an unknown file for pickled Python objects, and its message advises to
+            # allow these, which would be unsafe.
             reason = "it is neither NPY nor NPZ"
         raise PlanningError(
             f"{path} is no policy, as of `uav-twin plan --out` ({reason}): give such a file, or "
@@ -216,7 +216,7 @@ class ComparedPolicy:
         return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
 
     def beyond(self, other: "ComparedPolicy") -> "ComparedPolicy":
-        """Return by how much the returns exceed those of another rule, mission by mission."""
+        """Return the difference of the returns to those of another rule, mission by mission."""
         return ComparedPolicy(f"{self.name} beyond {other.name}", self.returns - other.returns)
 
 
@@ -233,9 +233,8 @@ def compare_simple_rules(
 ) -> tuple[ComparedPolicy, ...]:
     """Return the returns of rules that are simpler than a plan on the belief.
 
-    The mode of the policy by states is taken for the belief that the scenario decides on. A rule
-    that inspects at fixed intervals takes the first action that inspects, and decides as QMDP
-    between.
+    The rules are the most probable control of the policy by states, QMDP, and inspections at fixed
+    intervals. The latter take the first control that inspects, and decide by QMDP in between.
     """
     plan = value_iteration(problem.transition, problem.reward, problem.discount)
     decides_on_predicted = scenario.planner.decide_on == "predicted"
@@ -269,7 +268,10 @@ def compare_simple_rules(
 
 
 def _simulate(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
-    """Return the returns (B,) of missions under a rule that decides from the second step on."""
+    """Return the returns (B,) of simulated missions under a rule.
+
+    The control of the first step is that of the scenario; the rule decides on the later ones.
+    """
     first_control = scenario.control_names.index(scenario.mission.first_control)
 
     def decide(belief: Float, filtered: Float, step: int) -> Index:

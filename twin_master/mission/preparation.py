@@ -93,34 +93,43 @@ class Knowledge:
 
     @cached_property
     def sensor_model(self) -> GaussianSensorModel:
-        """The predicted observations and the assumed noise."""
+        """The sensors: their predicted values in each state, and the assumed noise.
+
+        The class is that for identified modes, whose observations contain a covariance; that for
+        inspections, if an action of the twin reads the state; or plain Gaussian sensors.
+        """
         section = self.scenario.observation
-        make_sensor_model: Callable[..., GaussianSensorModel] = GaussianSensorModel
+        sensor_model_class: Callable[..., GaussianSensorModel] = GaussianSensorModel
         if section.modes is not None:
-            make_sensor_model = IdentifiedSensorModel
+            sensor_model_class = IdentifiedSensorModel
         elif self.scenario.readings:
-            make_sensor_model = _inspected_sensor_model(self.scenario, self.model)
-        interval = None
+            sensor_model_class = _inspected_sensor_model(self.scenario, self.model)
+        # The change of each sensor within the interval of values that a state stands for.
+        change_within_interval = None
         if section.between_levels:
-            interval = self.model.states.change_within_interval(self.predicted.mean(axis=0))
-        return make_sensor_model(
+            change_within_interval = self.model.states.change_within_interval(
+                self.predicted.mean(axis=0)
+            )
+        return sensor_model_class(
             self.predicted,
             section.standard_deviation,
             average=section.average_over_draws,
             model_error=section.model_error,
-            interval=interval,
+            interval=change_within_interval,
         )
 
     @cached_property
     def rewards(self) -> RewardModel:
-        """The rewards by state and control."""
+        """The rewards for health, control and error, as the scenario states them."""
         section = self.scenario.rewards
+        # The error is divided by one input of each control, such as the load factor.
         control_normaliser = None
         if section.normalise_error_by is not None:
             normalising_input = section.normalise_error_by
             control_normaliser = tuple(
                 control.values[normalising_input] for control in self.scenario.control
             )
+        # The scenario counts sensors from 1; None stands for all sensors.
         health_sensors = None
         if section.health_sensors != "all":
             health_sensors = tuple(number - 1 for number in section.health_sensors)
@@ -131,14 +140,15 @@ class Knowledge:
             error_scale=section.error_scale,
             control_normaliser=control_normaliser,
             health_sensors=health_sensors,
-            true_per_draw=self.true_values,
+            true_per_draw=self.true_values,  # limits refer to the structure, not to its sensors
         )
 
     @cached_property
     def plan(self) -> PlannedPolicy:
-        """The plan of value iteration, with a policy on the belief if the scenario asks for one.
+        """The plan by value iteration, with a policy on the belief if the scenario asks for one.
 
-        A policy that was given takes its place.
+        If `policy` is given, it is not planned: a policy by states is only evaluated, and a policy
+        on the belief takes the place of the scenario's.
         """
         transition = self.model.transition
         discount = discounts(self.scenario)
@@ -149,10 +159,12 @@ class Knowledge:
         return replace(plan, on_belief=self._belief_policy(plan))
 
     def _belief_policy(self, plan: PlannedPolicy) -> BeliefPolicy | None:
-        """Return the policy on the belief; None if the plan by states decides."""
+        """Return the policy on the belief; None if the policy by states decides."""
         if isinstance(self.policy, BeliefPolicy):
             return self.policy
         if self.scenario.planner.policy == "qmdp":
+            # QMDP averages the returns of the fully observed problem over the belief: one vector of
+            # returns for each control (Littman, Cassandra and Kaelbling 1995).
             return BeliefPolicy(plan.action_value.T, np.arange(len(self.scenario.control)))
         if self.scenario.planner.policy == "belief":
             priced_plan = plan_within_limit(self.scenario, self.problem, self.rewards)
@@ -161,9 +173,9 @@ class Knowledge:
 
     @cached_property
     def problem(self) -> DecisionProblem:
-        """The decision problem of the mission.
+        """The partially observed decision problem of the mission.
 
-        It needs finitely many observations: those that are sampled here are joined to classes.
+        It has finitely many observations: observations are drawn, and joined to classes.
         """
         random_numbers = generator(self.scenario.mission.seed, "planning")
         return DecisionProblem(
@@ -182,7 +194,7 @@ class Knowledge:
 
     @cached_property
     def learning(self) -> LearningFilter | None:
-        """The filter that learns, without notices; None if nothing is learnt.
+        """The learning filter, without the watch for gauge faults; None if nothing is learnt.
 
         Raises
         ------
@@ -211,10 +223,9 @@ class Knowledge:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The estimator of the belief.
+        """The estimator of the belief: the exact filter, or the learning filter.
 
-        It is the exact filter, or one that learns; either may also give notices, as the scenario
-        says.
+        If the scenario asks for notices, the estimator also watches for gauge faults.
 
         Raises
         ------
@@ -237,7 +248,7 @@ class Knowledge:
 
     @cached_property
     def expectation(self) -> LearntExpectation | None:
-        """What is expected of sensors and rewards given what is learnt; None without learning."""
+        """Expected sensor values and rewards of the learning filter; None if nothing is learnt."""
         if self.learning is None:
             return None
         return LearntExpectation(self.learning, self.rewards, self.plan.policy)
@@ -295,25 +306,29 @@ class Knowledge:
         return int(np.argmax(health_reward.mean(axis=0)))
 
     def policy_with_doubt(self, unexplained: ArrayLike) -> Float:
-        """Return the policy p(U | D) of future steps, if perhaps no state is believed then.
+        """Return the policy p(control | state) of future steps, mixed with the safest control.
+
+        The safest control is flown with the probability that no state explains the sensors.
 
         Parameters
         ----------
         unexplained : (...) array
-            The probability that no state explains the sensors; then the safest control is flown.
+            The probability that no state of the model explains the sensors.
 
         Returns
         -------
         (..., S, U) array
             The policy.
         """
-        doubt = np.asarray(unexplained, dtype=np.float64)[..., None, None]
-        safest_control = np.eye(len(self.model.controls))[self.safest_control]
-        return np.asarray((1.0 - doubt) * self.plan.policy + doubt * safest_control)
+        safest_weight = np.asarray(unexplained, dtype=np.float64)[..., None, None]
+        certainly_safest = np.eye(len(self.model.controls))[self.safest_control]
+        return np.asarray(
+            (1.0 - safest_weight) * self.plan.policy + safest_weight * certainly_safest
+        )
 
     @cached_property
     def true_model(self) -> GraphicalModel:
-        """The states and transitions that random growth of the true damage follows."""
+        """The model by which true damage grows: that of the twin, or with other probabilities."""
         probability = self.scenario.truth.probability
         if not probability:
             return self.model
@@ -322,26 +337,30 @@ class Knowledge:
         )
 
     def truth(self, seed: int) -> Truth:
-        """Return what really happens in a mission of a seed."""
+        """Return the true damage, noise and faults of the mission with a seed."""
         return Truth(self.scenario, self.true_model, seed)
 
     def plant(self, truth: Truth, asset: Asset) -> Plant:
-        """Return an asset that is driven by a truth."""
+        """Return the simulated asset, with the true damage, noise and faults."""
         return Plant(self.scenario, truth, asset)
 
 
 def _inspected_sensor_model(
     scenario: Scenario, model: GraphicalModel
 ) -> "partial[InspectedSensorModel]":
-    """Return the constructor of the sensor model, with its arguments of inspections filled in."""
+    """Return the constructor of the sensor model, with its arguments of inspections filled in.
+
+    An inspection reads one factor of the state, with noise of a stated standard deviation.
+    """
     controls = np.array([control for control, _state, _name, _deviation in scenario.readings])
     factors = np.array([state for _control, state, _name, _deviation in scenario.readings])
     deviations = np.array([deviation for _control, _state, _name, deviation in scenario.readings])
     coordinates = model.states.coordinates  # (S, F)
     within_level = np.zeros_like(coordinates)
     if scenario.observation.between_levels:
-        # The standard deviation of each factor inside the interval that its level stands for: the
-        # last two axes of the changes are the factor that changes and the factor that is moved.
+        # The standard deviation of each factor inside the interval that its level stands for. The
+        # last axes of the changes are the factor that changes and the factor that is moved, and a
+        # factor changes only with itself: the diagonal.
         within_level = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
     return partial(
         InspectedSensorModel,
@@ -357,9 +376,9 @@ def prepare_knowledge(
     seed: int,
     policy: Float | BeliefPolicy | None = None,
 ) -> Knowledge:
-    """Calibrate, predict the observations of every state and control, and plan.
+    """Return what a twin knows: calibrated draws, and predictions for every state and control.
 
-    Kapteyn et al. 2021, eqs. (30) and (36).
+    Kapteyn et al. 2021, eq. (30). The plan, eq. (36), is made when it is first used.
 
     Parameters
     ----------
@@ -425,7 +444,7 @@ def prepare_twin(
 def prepare_without_folder(
     scenario: Scenario, source: AssetSource, progress: Progress | None = None
 ) -> Knowledge:
-    """Return what a twin knows that needs no run folder; the source works in a temporary one."""
+    """Return what a twin knows, without a run folder; the source works in a temporary folder."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
@@ -441,7 +460,9 @@ CALIBRATION_NAME = "calibration.json"
 
 
 def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
-    """Write what a twin knows before its flight; the bytes depend on nothing else.
+    """Write what a twin knows before its flight to a file; equal knowledge gives equal bytes.
+
+    If the calibration has a record, it is written to a second file.
 
     The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); with a policy on
     the belief also `belief_vectors` (N, S) and `belief_control` (N,); and `true` (E, S, U, G), SI,
@@ -481,7 +502,10 @@ def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
 
 
 def link_knowledge(folder: Path, other_folder: Path) -> None:
-    """Put the knowledge of one folder into another one, as a hard link if that is possible."""
+    """Put the knowledge file of `folder` into `other_folder`, if it has none.
+
+    The file is a hard link if the file system allows it, and a copy otherwise.
+    """
     if (other_folder / KNOWLEDGE_NAME).exists():
         return
     try:

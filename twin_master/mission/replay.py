@@ -22,14 +22,14 @@ from twin_master.run_folder import JsonObject
 
 @dataclass(frozen=True)
 class BelievedModel:
-    """A model that the twin believes from a step on.
+    """A model, and the step from which on the twin filters with it.
 
     Attributes
     ----------
     from_step : int
         The first step that is filtered with the model.
     knowledge : Knowledge
-        The observations that the model predicts.
+        The knowledge of a twin with this model, such as the predicted observations.
     patch : Path or None
         The file of its patch, if the model is patched.
     """
@@ -63,7 +63,7 @@ def replay(
     end: int | None = None,
     question: BelievedModel | None = None,
 ) -> tuple[History, JsonObject]:
-    """Filter the steps of a journal again; late observations stand at the step that they belong to.
+    """Filter the steps of a journal again, with late observations at the steps they belong to.
 
     The journal is read backwards to the last settled state of the twin before the first step that
     is asked for. The steps after that state are filtered again.
@@ -77,11 +77,13 @@ def replay(
     lag : int or None
         The lag of the twin, in steps.
     first_step : int, optional
-        The first step whose belief is asked for; if left out, only the twin after the last step is.
+        The first step whose belief is needed. If left out, only the twin after the last step is
+        needed.
     end : int, optional
         The end of the last line to read, in bytes; the end of the journal if left out.
     question : BelievedModel, optional
-        A further model: what would the twin believe with it? The decisions are not checked then.
+        A further model, to find what the twin would believe with it. If it is given, the decisions
+        are not compared with those of the journal.
 
     Returns
     -------
@@ -118,7 +120,7 @@ def replay(
 
 
 class _BackwardScan:
-    """What the lines of a journal tell, which are taken in from the last one back.
+    """The readings, decisions and settled state in a journal, which is read from its end backwards.
 
     Attributes
     ----------
@@ -143,7 +145,7 @@ class _BackwardScan:
         self._later_begin = 0
 
     def take_in(self, line: JournalLine) -> bool:
-        """Take in the line before the last one taken in; return whether to read on."""
+        """Evaluate the next line backwards, and return whether earlier lines are needed."""
         is_header = line.begin == 0
         step = -1 if is_header else int(line.record["step"])
         self._check_order(line, step)
@@ -161,7 +163,7 @@ class _BackwardScan:
         return True
 
     def _check_order(self, line: JournalLine, step: int) -> None:
-        """Refuse a line whose step is not that of the line after it, or the step before."""
+        """Refuse a line whose step is neither that of the following line nor one less."""
         later_step = self._later_step
         if later_step is None or later_step - step in (0, 1):
             return
@@ -169,16 +171,21 @@ class _BackwardScan:
         raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
 
     def _take_in_settled_state(self, record: JsonObject) -> None:
+        """Keep the settled state in a record, if it is the first one that is early enough."""
         if self.settled is not None or "settled" not in record:
             return
         step = int(record["settled"]["step"])
         state = record["settled"]["state"]
-        # It must lie before each step that is asked for, and before models adopted after it.
+        # It must lie before each required step, and before the first step of each model that was
+        # adopted later.
         if all(step < required_step for required_step in self._required_steps):
             self.settled = SettledState(step, decode_state(state))
 
     def _take_in_change(self, record: JsonObject, step: int) -> None:
-        """Take in an adopted model or an observation, which revise the decisions from a step on."""
+        """Keep the reading in a record, and the step from which on the record revises decisions.
+
+        An adopted model and a late observation revise all decisions from their step on.
+        """
         if "model" in record:
             from_step = int(record["model"]["from_step"])
             self._first_revised_step = min(self._first_revised_step, from_step)
@@ -189,7 +196,7 @@ class _BackwardScan:
             self.readings.setdefault(observed_step, reading_from_line(record))
 
     def check_decisions(self, history: History) -> None:
-        """Refuse a history whose twin decides otherwise than the journal."""
+        """Refuse a history if a decision differs from that in the journal."""
         for step in history.steps:
             number = step.twin_step.step
             control = step.twin_step.next_control
@@ -207,10 +214,10 @@ class _BackwardScan:
 
 
 def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
-    """Return the models that are believed one after the other, given all in the order of adoption.
+    """Return the models with which the steps are filtered, in the order of the steps.
 
-    A model that was adopted later, but from an earlier or the same step on, replaces the one before
-    it.
+    `models` are in the order of their adoption. A model is replaced by a model that was adopted
+    later, if that holds from an earlier step or the same step on.
     """
     in_force = []
     for index, model in enumerate(models):
@@ -264,7 +271,7 @@ def refilter(
 def spans_of_models(
     history: History, models: Sequence[BelievedModel]
 ) -> list[tuple[Knowledge, slice]]:
-    """Return the knowledge of each model in force, and the steps of a history that are its own.
+    """Return the knowledge of each model in force, and the slice of steps filtered with it.
 
     Parameters
     ----------

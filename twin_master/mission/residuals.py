@@ -20,7 +20,7 @@ from twin_master.network.inference import known_control
 def expected_in_steps(
     history: History, knowledge: Knowledge, belief: Float, *, smoothed: bool
 ) -> Expectation:
-    """Return the observations and rewards that are expected in the steps of a history.
+    """Return the expected observations and rewards in the steps of a history.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def expected_in_steps(
 def expected_ahead(
     history: History, knowledge: Knowledge, predicted: Float
 ) -> tuple[Expectation, Float]:
-    """Return what is expected after each step of a history, in the H steps to come.
+    """Return the predicted observations and rewards in the H steps after each step of a history.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def expected_ahead(
     knowledge : Knowledge
         The knowledge of the twin in these steps.
     predicted : (T, H, S) array
-        The belief predicted in each step.
+        The belief about the state in each of the H steps after each step.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def expected_ahead(
 def residual_summary(
     history: History, from_step: int, models: Sequence[BelievedModel]
 ) -> dict[str, float | None]:
-    """Return the root mean square residual and the log evidence of the steps from one on.
+    """Return root mean square residual and log evidence of the steps from `from_step` on.
 
     The residuals are in standard deviations of the noise that the twin assumes or has learnt. Both
     values are None if nothing was observed in these steps.
@@ -92,20 +92,22 @@ def residual_summary(
     history : History
         The steps.
     from_step : int
-        The number of the first step that counts.
+        The number of the first step that is evaluated.
     models : sequence of BelievedModel
         What the twin believed in the steps, in the order of adoption.
     """
     history = history.without_first(from_step - history.first_step)
     if not history.steps or np.isnan(history.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    expected_parts = []
+    expectations = []
     for knowledge, span in spans_of_models(history, models):
-        part = replace(history, steps=history.steps[span])
-        if part.steps:
-            expected_parts.append(expected_in_steps(part, knowledge, part.filtered, smoothed=False))
-    expected = concatenate_expectations(expected_parts)
-    residual = (history.observed - expected.mean) / expected.noise
+        span_history = replace(history, steps=history.steps[span])
+        if span_history.steps:
+            expectations.append(
+                expected_in_steps(span_history, knowledge, span_history.filtered, smoothed=False)
+            )
+    expectation = concatenate_expectations(expectations)
+    residual = (history.observed - expectation.mean) / expectation.noise
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
         "log_evidence": float(np.sum(history.log_evidence)),

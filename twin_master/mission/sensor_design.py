@@ -1,4 +1,4 @@
-"""Which sensors to install: those whose readings are expected to tell most about the state.
+"""Which sensors to install: those with the most expected information about the state.
 
 The information of a set of sensors is the expected logarithm of the posterior probability of the
 true state over its prior probability. The expectation is over simulated readings, with all states
@@ -86,7 +86,7 @@ class DrawnReadings:
 
     @cached_property
     def _terms(self) -> _LikelihoodTerms:
-        """The terms of the likelihood, by sensor."""
+        """The terms of the likelihood of each sensor, which add up over a set of sensors."""
         residual = self.residual.transpose(2, 0, 1)  # (G, N, S)
         loadings = self.loadings.transpose(1, 0, 2)  # (G, S, F)
         return _LikelihoodTerms(
@@ -102,18 +102,18 @@ class DrawnReadings:
         (sensors, F) are the loadings. Its inverse and determinant follow from the small matrix
         C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma.
         """
-        chosen = list(sensors)
+        chosen_sensors = list(sensors)
         terms = self._terms
-        squared_distance = terms.squared_residual[chosen].sum(axis=0)  # (N, S)
-        projection = terms.loading_residual[chosen].sum(axis=0)  # (S, N, F)
-        small_matrix = terms.loading_product[chosen].sum(axis=0)  # (S, F, F)
+        squared_distance = terms.squared_residual[chosen_sensors].sum(axis=0)  # (N, S)
+        projection = terms.loading_residual[chosen_sensors].sum(axis=0)  # (S, N, F)
+        small_matrix = terms.loading_product[chosen_sensors].sum(axis=0)  # (S, F, F)
         small_matrix = small_matrix + np.eye(projection.shape[-1])
 
         # Log density of each reading in each state.
-        solution = np.matmul(projection, np.linalg.inv(small_matrix))
-        squared_distance -= np.sum(solution * projection, axis=-1).T
+        weighted_projection = np.matmul(projection, np.linalg.inv(small_matrix))
+        squared_distance -= np.sum(weighted_projection * projection, axis=-1).T
         log_density = -0.5 * (squared_distance + np.linalg.slogdet(small_matrix)[1])
-        log_density -= self.log_deviation[:, chosen].sum(axis=1)
+        log_density -= self.log_deviation[:, chosen_sensors].sum(axis=1)
 
         # Posterior over prior of the true state; the prior is uniform.
         states = log_density.shape[1]
@@ -182,11 +182,11 @@ class SensorDesign:
     Attributes
     ----------
     sensors : tuple of int
-        The indices of the sensors; each tells most beside those before it.
+        The indices of the chosen sensors. Each adds the most information to those before it.
     information : tuple of float
         The information of the first sensor, of the first two, and so on, in bits.
     of_all : float
-        The information of all candidates, in bits.
+        The information of all candidate sensors together, in bits.
     """
 
     sensors: tuple[int, ...]
@@ -197,7 +197,7 @@ class SensorDesign:
 def choose_sensors(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
 ) -> SensorDesign:
-    """Choose the sensors that tell most about the state.
+    """Choose the sensors with the most information about the state.
 
     They are added one after the other; then a chosen sensor is exchanged for another candidate as
     long as that gains information.
@@ -254,7 +254,7 @@ def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> _
 def _add_greedily(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
 ) -> list[int]:
-    """Return sensors, each chosen to tell most beside those before it."""
+    """Return `count` sensors, each of which adds the most information to those before it."""
     chosen: list[int] = []
     while len(chosen) < count:
         extended = [[*chosen, sensor] for sensor in candidates if sensor not in chosen]
@@ -265,7 +265,10 @@ def _add_greedily(
 def _exchange(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen: list[int]
 ) -> list[int]:
-    """Exchange chosen sensors, one at a time, for candidates that gain information."""
+    """Return the chosen sensors, improved by exchanging one at a time for another candidate.
+
+    It ends if no exchange gains information.
+    """
     information = _mean_information(readings, chosen)
     while len(candidates) > len(chosen):
         other_sensors = [sensor for sensor in candidates if sensor not in chosen]
@@ -273,18 +276,18 @@ def _exchange(
         for position in range(len(chosen)):
             for sensor in other_sensors:
                 exchanged_sets.append([*chosen[:position], sensor, *chosen[position + 1 :]])
-        best = _best_set(readings, exchanged_sets)
-        if best.information <= information + _LEAST_GAIN:
+        best_set = _best_set(readings, exchanged_sets)
+        if best_set.information <= information + _LEAST_GAIN:
             break
-        information = best.information
-        chosen = best.sensors
+        information = best_set.information
+        chosen = best_set.sensors
     return chosen
 
 
 def level_separations(
     knowledge: Knowledge, readings: Sequence[DrawnReadings], sensors: Sequence[int]
 ) -> dict[tuple[str, int], float]:
-    """Return how far a set of sensors separates each level of a state factor from the next level.
+    """Return how well a set of sensors separates each level of a state factor from the next one.
 
     The separation is in standard deviations of the readings, under the control that separates most,
     with the other factors at their lowest levels.
@@ -324,7 +327,10 @@ def level_separations(
 def _squared_distance(
     readings: DrawnReadings, state: int, difference: Float, sensors: list[int]
 ) -> float:
-    """Return the squared Mahalanobis distance of a difference of means (G,), in a state."""
+    """Return the squared Mahalanobis distance of a difference of means (G,), SI, in a state.
+
+    The covariance is that of the standardised readings, I + L Lᵀ with their loadings L.
+    """
     standardised = difference[sensors] * np.exp(-readings.log_deviation[state, sensors])
     loadings = readings.loadings[state, sensors]
     covariance = np.eye(len(sensors)) + loadings @ loadings.T

@@ -1,4 +1,4 @@
-"""Many twins of one scenario, flown side by side; each flies the same as with `fly`, to the bit.
+"""Many twins of one scenario, flown together; each gives the results of `fly`, to the last bit.
 
 The results of a twin do not depend on the number of twins: sums run over the states, sensors and
 draws of one twin, never over twins.
@@ -115,7 +115,7 @@ class _TrueStates(NamedTuple):
 
 
 class _StatelessAssets:
-    """Assets without memory; each is asked only once what it shows under a control in a state."""
+    """Assets without memory: each is evaluated once for each control and state, and then reused."""
 
     def __init__(
         self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
@@ -146,7 +146,7 @@ class _StatelessAssets:
         is_flying : (B,) array of bool
             Whether the twin is still flying.
         failure : list of str
-            The error of each twin; that of a failing asset is put here.
+            The error of each twin, empty if there is none; errors of assets are written into it.
 
         Returns
         -------
@@ -190,7 +190,7 @@ class _StatelessAssets:
         return _TrueStates(state_index, self._states.coordinates[state_index])
 
     def _observe(self, step: int, asset: int, control_index: int, state: Float) -> Float | str:
-        """Return what an asset shows without noise (G,), SI, or why it shows nothing."""
+        """Return the observation of an asset without noise (G,), SI, or the text of its error."""
         key = (asset, control_index, state.tobytes())
         if key not in self._observations:
             control = self._scenario.control[control_index]
@@ -234,7 +234,7 @@ class _Formation:
     Attributes
     ----------
     flights : Flights
-        What they have flown.
+        The histories of the twins so far.
     """
 
     def __init__(
@@ -257,7 +257,10 @@ class _Formation:
         self._inspecting_controls = sorted(inspecting_controls)
 
     def fly_step(self, step: int) -> None:
-        """Fly one step of all twins, filter its observations, and decide on the next control."""
+        """Fly one step of all twins, filter its observations, and decide on the next control.
+
+        What was flown is stored in `flights`.
+        """
         if step > 0:
             self._end_missions(step)
         observed, state = self._assets.fly_step(
@@ -281,7 +284,10 @@ class _Formation:
             self._is_flying[twin] = False
 
     def _filter(self, step: int, observed: Float) -> Filtered:
-        """Return the filtered beliefs; a twin whose observation is impossible fails."""
+        """Return the filtered beliefs of a step, and mark twins with an impossible observation.
+
+        Such a twin stops flying, and its error is stored in `flights.failure`.
+        """
         knowledge = self._knowledge
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, self._control)
         # The filter takes sequences of steps; each twin has a sequence of one.

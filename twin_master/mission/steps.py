@@ -1,4 +1,4 @@
-"""The steps of a mission, and what really happens in them: damage, noise, faults, the asset."""
+"""The steps of a mission, and its ground truth: damage, noise, sensor faults, the asset."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -178,7 +178,7 @@ class History:
 
     @property
     def simulated(self) -> bool:
-        """Whether it is known what really happened."""
+        """Whether the ground truth of the steps is known, as for a simulated asset."""
         return bool(self.steps) and self.steps[0].reading.ground_truth is not None
 
     @property
@@ -218,7 +218,7 @@ class History:
 
 
 class SensorStatus(IntEnum):
-    """What a sensor really does at a step."""
+    """The true condition of a sensor in a step, which the twin does not know."""
 
     HEALTHY = 0
     LOST = 1
@@ -282,7 +282,7 @@ class Truth:
         self.growth = DamageGrowth(model)
 
     def _apply_faults(self, scenario: Scenario) -> None:
-        """Put the scenario's sensor faults into `status` and `drift`."""
+        """Set `status` and `drift` in the steps and sensors of the scenario's sensor faults."""
         steps = np.arange(scenario.mission.steps)
         for fault in scenario.truth.sensor_faults:
             last_step = fault.last_step if fault.last_step is not None else scenario.mission.steps
@@ -293,6 +293,7 @@ class Truth:
                 self.status[cells] = SensorStatus.LOST
             else:
                 assert fault.rate is not None  # the schema asks for it
+                # The drift grows by the rate in each step, from the first step of the fault on.
                 steps_of_drift = steps[is_active] - fault.first_step + 1.0
                 self.drift[cells] += (fault.rate * steps_of_drift)[:, None]
                 is_lost = self.status[cells] == SensorStatus.LOST
@@ -332,7 +333,7 @@ class Truth:
         Its random numbers have the shape (T, B, ...). Script, drift and losses are those of the
         scenario, the same in all missions.
         """
-        stacked = copy(truths[0])  # its script, drift and losses are those of all
+        stacked = copy(truths[0])  # script, drift and losses are the same in all missions
         for name in ("noise", "uniform", "reading_noise"):
             setattr(stacked, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
         return stacked
@@ -399,15 +400,15 @@ class DamageGrowth:
         if control is None or state is None:
             return _draw(self._initial, uniform)
         next_states = np.empty_like(state)
-        # Missions with the same control in the same state are drawn at once.
+        # Missions with the same control in the same state are drawn together.
         code = control * self._model.states.size + state
-        for number in np.unique(code).tolist():
-            has_code = code == number
-            next_states[has_code] = _draw(self._states_after(number), uniform[has_code])
+        for pair_code in np.unique(code).tolist():
+            has_code = code == pair_code
+            next_states[has_code] = _draw(self._states_after(pair_code), uniform[has_code])
         return next_states
 
     def _states_after(self, code: int) -> _NextStates:
-        """Return what may follow a control and a state, given as control * S + state."""
+        """Return the possible next states of a pair, coded as control * S + state."""
         control, state = divmod(code, self._model.states.size)
         if (control, state) not in self._next_states:
             probability = self._model.transition.row(control, state)
@@ -456,7 +457,7 @@ def checked_observation(
 
 
 def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
-    """Return the sentence that an action of the twin has ended the mission."""
+    """Return the sentence that an action of the twin is the reason of an early end."""
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 

@@ -1,9 +1,9 @@
 """Planning on the belief: value iteration at points, between a lower and an upper bound.
 
-The lower bound of the return are vectors, each the return of a plan from each state. The upper one
-are values at beliefs. Beliefs are visited where the bounds differ most: Smith and Simmons 2005,
-heuristic search value iteration; Kurniawati et al. 2008, SARSOP. Now and then both bounds are
-improved at all visited beliefs: Pineau et al. 2003; Poupart et al. 2011.
+The lower bound of the return is a set of vectors, each with the return of one plan from each state.
+The upper bound is a set of values at beliefs. Beliefs are visited where the bounds differ most:
+Smith and Simmons 2005, heuristic search value iteration; Kurniawati et al. 2008, SARSOP. Now and
+then both bounds are improved at all visited beliefs: Pineau et al. 2003; Poupart et al. 2011.
 """
 
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ from twin_master.network.planner import BeliefPolicy, evaluate_policy
 from twin_master.network.upper_bound import UpperBound
 
 _LEAST_IMPROVEMENT = 1e-12
-"""A bound is improved by this at least."""
+"""Smallest improvement of a bound that counts, so that rounding does not add vectors."""
 _LONGEST_DESCENT = 1000
-"""Steps that a descent looks ahead at most."""
+"""Largest number of steps that a descent looks ahead."""
 MOST_BELIEFS = 180
-"""Beliefs at which the bounds are improved, if the gap between them stays wider than asked for."""
+"""Largest number of beliefs at which the bounds are improved before planning ends."""
 MOST_UNSETTLED = 1000
-"""The same if there is too much for the upper bound to settle."""
+"""The same if the upper bound cannot settle, because that takes too much time or memory."""
 _GAP_OF_DESCENT = 0.9
 """Fraction of the gap at the prior that a descent allows, so that it is short for a wide gap."""
 _FIRST_SETTLING = 32
 """Beliefs that are visited before the bounds settle for the first time."""
 _SETTLING_GROWTH = 1.6
-"""Growth of their number until the bounds settle again."""
+"""Factor by which the number of visited beliefs grows until the bounds settle again."""
 _RAISING_SWEEPS = 3
 """Sweeps of the lower bound over all visited beliefs when the bounds settle."""
 
@@ -61,43 +61,46 @@ class _Bounds:
         return np.asarray((rows @ self.vectors.T).max(axis=1))
 
     def backup(self, control: int, rows: Float) -> Float:
-        """Return the vector (S,) of a control, followed by the best known vectors.
+        """Return the vector (S,) of a plan: a control, then the best plan for each observation.
 
         Parameters
         ----------
         control : int
             The first control.
         rows : (K, S) array
-            The next beliefs at which the best vectors are chosen.
+            The next belief after each of K observations, at which the best known plan is chosen.
         """
-        chosen = np.argmax(rows @ self.vectors.T, axis=1)
-        later = self.problem.expected_vector(control, chosen, self.vectors)
+        best_plans = np.argmax(rows @ self.vectors.T, axis=1)
+        expected_return_later = self.problem.expected_vector(control, best_plans, self.vectors)
         discount = self.problem.discount[control]
-        return np.asarray(self.problem.reward[:, control] + discount * later)
+        return np.asarray(self.problem.reward[:, control] + discount * expected_return_later)
 
     def raise_lower_bound_at(self, belief: Float) -> None:
-        """Improve the lower bound at a belief (S,)."""
+        """Improve the lower bound at a belief (S,), by the vector of the best control there."""
         problem = self.problem
         next_rows = [problem.next_beliefs(belief, u) for u in range(len(problem.discount))]
-        later = np.array([self.lower_bound_at(rows).sum() for rows in next_rows])
-        action_value = belief @ problem.reward + problem.discount * later
-        best = int(np.argmax(action_value))
-        if action_value[best] > self.lower_bound_at(belief[None])[0] + _LEAST_IMPROVEMENT:
-            vector = self.backup(best, next_rows[best])
-            # Vectors that the new one exceeds in every state are not needed any more.
+        return_later = np.array([self.lower_bound_at(rows).sum() for rows in next_rows])
+        action_value = belief @ problem.reward + problem.discount * return_later
+        best_control = int(np.argmax(action_value))
+        if action_value[best_control] > self.lower_bound_at(belief[None])[0] + _LEAST_IMPROVEMENT:
+            vector = self.backup(best_control, next_rows[best_control])
+            # A vector is dropped if the new one is at least as large in every state.
             is_needed = ~np.all(self.vectors <= vector, axis=1)
             self.vectors = np.vstack((self.vectors[is_needed], vector))
-            self.control = np.append(self.control[is_needed], best)
+            self.control = np.append(self.control[is_needed], best_control)
 
     def descend(self, belief: Float, first: int | None, gap: float) -> list[Float]:
-        """Return beliefs one after the other at which the bounds differ by more than allowed.
+        """Return a path of beliefs along which the bounds differ by more than allowed.
+
+        Each step takes the control of the largest upper bound, and the observation after which the
+        difference exceeds the allowed one most.
 
         Parameters
         ----------
         belief : (S,) array
             The belief to begin with.
         first : int or None
-            The control of the first step; None for that of the largest upper bound.
+            The control of the first step, if it is prescribed.
         gap : float
             The allowed difference of the bounds at the first belief.
         """
@@ -109,17 +112,21 @@ class _Bounds:
             else:
                 control = int(np.argmax(self.upper.action_bound(belief)))
             rows = self.problem.next_beliefs(belief, control)
-            # What is allowed later counts less now.
+            # A difference one step later is discounted, so that a larger one is allowed there.
             gap /= max(float(self.problem.discount[control]), _LEAST_IMPROVEMENT)
+            # The rows are beliefs times the probability of the observation, and so is the gap.
             excess = self.upper.bound_at(rows) - self.lower_bound_at(rows) - gap * rows.sum(axis=1)
-            widest = int(np.argmax(excess))
-            if excess[widest] <= 0.0:
+            largest_excess = int(np.argmax(excess))
+            if excess[largest_excess] <= 0.0:
                 break
-            belief = rows[widest] / rows[widest].sum()
+            belief = rows[largest_excess] / rows[largest_excess].sum()
         return path
 
     def bounds_at(self, belief: Float, first: int | None) -> tuple[float, float]:
-        """Return lower and upper bound at a belief (S,), under a first control if it is given."""
+        """Return lower and upper bound of the return at a belief (S,).
+
+        If a first control is given, it is taken in the first step.
+        """
         if first is None:
             rows = belief[None]
             return float(self.lower_bound_at(rows)[0]), float(self.upper.bound_at(rows)[0])
@@ -156,19 +163,22 @@ def plan_on_belief(
     gap: float = 0.005,
     most_beliefs: int | None = None,
 ) -> BeliefPlan:
-    """Plan until the bounds of the return from the prior are close, or enough beliefs are visited.
+    """Return a plan on the belief, by heuristic search between a lower and an upper bound.
+
+    It ends if the bounds of the return from the prior are close, or if the largest number of
+    beliefs is visited.
 
     Parameters
     ----------
     problem : DecisionProblem
         The problem.
     first : int, optional
-        The control of the first step, if that is not decided on.
+        The control of the first step, if it is prescribed.
     gap : float
         The difference of the bounds at the end, as a fraction of the return.
     most_beliefs : int, optional
-        The number of beliefs at which the bounds are improved, counted each time. If left out, it
-        is 180, or 1000 if there is too much for the bounds to settle.
+        The largest number of visits to beliefs. If left out, it is 180, or 1000 if the upper bound
+        cannot settle.
     """
     bounds = _Bounds(problem)
     visited: list[Float] = []
@@ -194,7 +204,10 @@ def plan_on_belief(
 
 
 def _policy_at(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
-    """Return for each control the vectors that are largest at one of the beliefs (B, S)."""
+    """Return the policy at some beliefs (B, S).
+
+    For each control it has the vectors that are the largest of that control at one of the beliefs.
+    """
     vectors_by_control = []
     for control in range(len(bounds.problem.discount)):
         backups = []

@@ -12,8 +12,8 @@ from twin_master.network.transition import TransitionModel
 class DecisionProblem:
     """A partially observed Markov decision problem of finite size.
 
-    In a step the state is observed under the control and then moves; or, if `moves_first`, it moves
-    and is observed then.
+    In a step the state is first observed under the control and then moves. If `moves_first`, the
+    state first moves and is then observed.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class DecisionProblem:
     moves_first: bool = False
 
     def next_beliefs(self, belief: Float, control: int, observation: Index | None = None) -> Float:
-        """Return next beliefs, each times the probability of its observation.
+        """Return the next beliefs, each multiplied by the probability of its observation.
 
         Parameters
         ----------
@@ -64,23 +64,25 @@ class DecisionProblem:
         return self.transition.forward(control, likelihood * belief)
 
     def expected_vector(self, control: int, chosen: Index, vectors: Float) -> Float:
-        """Return the expected return after a step from each state: (S,).
+        """Return the expected return after a step, given the plan that follows: (S,).
 
         Parameters
         ----------
         control : int
             The control of the step.
         chosen : (K,) array
-            The vector that is followed after each observation.
+            The index of the plan that follows each observation.
         vectors : (N, S) array
-            Returns from each state.
+            The return of each of N plans from each state.
         """
         likelihood = self.likelihood[control]
         if self.moves_first:
             after_observation = np.einsum("ks,ks->s", likelihood, vectors[chosen])
             return self.transition.expected_value(control, after_observation)
+        # The observation depends on the state before the transition: sum over the plans of the
+        # probability that the plan is chosen times its expected return.
         result: Float = np.zeros(len(self.prior))
-        for number in np.unique(chosen).tolist():
-            probability = likelihood[chosen == number].sum(axis=0)
-            result += probability * self.transition.expected_value(control, vectors[number])
+        for plan in np.unique(chosen).tolist():
+            probability = likelihood[chosen == plan].sum(axis=0)
+            result += probability * self.transition.expected_value(control, vectors[plan])
         return result

@@ -1,8 +1,8 @@
-"""What holds the belief of a twin: the estimator's protocol, and the exact filter as one.
+"""Estimators of the belief of a twin: their protocol, and the exact filter.
 
-An estimator has no state of its own. What it needs of a step are arrays, which it returns with each
-estimate and receives for the next step. So a twin that keeps these arrays can smooth over them, go
-back and take in late observations, and be stored and continued to the last bit.
+An estimator has no state of its own. It returns the arrays that it needs of a step with each
+estimate, and receives them for the next step. So a twin that keeps these arrays can smooth over the
+steps, filter again with late observations, and be stored and continued to the last bit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,11 +22,19 @@ from twin_master.scenario.schema import Scenario
 CarriedArrays = Mapping[str, NDArray[Any]]
 """Arrays of several types by name, which an estimator carries from step to step."""
 BELIEVED = 0.5
-"""A state is believed up to this probability that no state explains the sensors."""
+"""Largest probability that no state explains the sensors, up to which a state is believed.
+
+Beyond one half that explanation is more probable than all others together."""
 
 
 def is_state_believed(none_of_these: float) -> bool:
-    """Return whether a state is believed, given the probability that none explains the sensors."""
+    """Return whether the twin believes in any state.
+
+    Parameters
+    ----------
+    none_of_these : float
+        The probability that no state of the model explains the sensors.
+    """
     return none_of_these <= BELIEVED
 
 
@@ -105,7 +113,7 @@ class Notice:
     sensors : tuple of int
         The numbers of the sensors that it concerns, from 1.
     value : float or None
-        The number that it rests on.
+        The number on which the notice is based, such as a probability or a reading in SI.
     since : int or None
         For an alarm, the step in which the fault is estimated to have begun.
     """
@@ -117,7 +125,7 @@ class Notice:
     since: int | None = None
 
     def as_record(self) -> dict[str, Any]:
-        """Return the notice as it stands in a journal, with lists in the place of tuples."""
+        """Return the notice as a record for the journal, with a list for the tuple of sensors."""
         return vars(self) | {"sensors": list(self.sensors)}
 
 
@@ -135,7 +143,7 @@ class Suspicion:
     gauge_off : float
         The posterior probability that a single sensor is off.
     log_evidence_none, log_evidence_any_gauge : float
-        The log e-values of the two.
+        The log e-values that no state explains the sensors, and that a single sensor is off.
     log_evidence_gauge : (G,) array
         The log e-value of each sensor.
     left_out : (G,) array of bool
@@ -217,7 +225,7 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """Holds the belief of a twin: the exact filter, or one that learns or watches beside it."""
+    """The estimator of a twin's belief: an exact filter, a learning one, or one with a watch."""
 
     @property
     def model(self) -> GraphicalModel:
@@ -285,8 +293,8 @@ class ExactFilter:
             filtered = filter_sequence(self.model, [control_index], log_likelihood[None], previous)
         except ImpossibleObservation:
             worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
-            worst = worst_residuals(observation, control_index) if worst_residuals else None
-            raise ImpossibleObservation(self._name, step, worst) from None
+            residuals = worst_residuals(observation, control_index) if worst_residuals else None
+            raise ImpossibleObservation(self._name, step, residuals) from None
         this_step = filtered[0]
         return Estimate(
             forecast=this_step.forecast,
@@ -299,13 +307,13 @@ class ExactFilter:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
         controls = [step.control_index for step in carried]
         log_filtered = np.array([step.arrays["log_filtered"] for step in carried])
-        # With no steps the array is still one of rows over the states.
+        # The shape is given because there may be no steps.
         return smooth(self.model, controls, log_filtered.reshape(-1, self.model.states.size))
 
 
 @dataclass(frozen=True)
 class NoticeWording:
-    """How the sentences of notices speak of steps and sensors.
+    """The words and units of a scenario for steps and sensors in the sentences of notices.
 
     Attributes
     ----------
@@ -343,13 +351,13 @@ class NoticeWording:
         )
 
     def format_values(self, sensor: int, *values: float) -> list[str]:
-        """Return values of a sensor, which is counted from 0, as they are printed."""
+        """Return SI values of a sensor, counted from 0, as text in its printed unit."""
         unit = self.units[sensor] if self.units else "1"
         unit_text = "" if unit == "1" else f" {unit}"
         return [f"{self.factor * value:.4g}{unit_text}" for value in values]
 
     def name_sensors(self, sensors: Sequence[int]) -> str:
-        """Return sensors, which are counted from 0, in words: "gauges 1 (root) and 3 (tip)"."""
+        """Return sensors, counted from 0, in words, such as "gauges 1 (root) and 3 (tip)"."""
         names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in sensors]
         noun = f"{self.sensor}s" if len(sensors) > 1 else self.sensor
         return f"{noun} {listing(names)}"

@@ -26,37 +26,38 @@ EXPONENT_BIAS = 1023
 FRACTION_BITS = 52
 """Number of bits of the fraction of a double."""
 LEAST_EXPONENT = -708.0
-"""The exponential function of a smaller number is negligible beside one, and has fewer digits."""
+"""Exponents are cut to this: exp of a smaller number is negligible compared with one."""
 ROUNDING = 1e-13
 """Entries that remain of a separated matrix, relative to the largest value, are rounding errors."""
 
 
 def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
-    """Return matrices (N, R) and (R, E) whose product is a matrix (N, E), to rounding.
+    """Factor a matrix (N, E) of low rank R into matrices (N, R) and (R, E), to rounding.
 
-    This is a cross approximation with full pivoting: the column and the row of the largest
-    remaining entry are taken out, until nothing remains. The caller forms sums of products, so that
-    the result does not depend on a library or its threads.
+    The method is a cross approximation with full pivoting (Bebendorf 2000): the product of the
+    column and the row of the largest remaining entry is subtracted until only rounding errors
+    remain. Unlike a singular value decomposition, it does not depend on a library or its threads.
 
     Parameters
     ----------
     values : (N, E) array
         The matrix.
     largest : float
-        The size of the numbers to whose rounding errors the product is exact.
+        The largest of the numbers from which the matrix was computed; remaining entries below 1e-13
+        of it are rounding errors.
     """
-    remaining = values.copy()
+    residual = values.copy()
     columns: list[Float] = []
     rows: list[Float] = []
-    while remaining.size and len(rows) < min(remaining.shape):
-        row, column = np.unravel_index(np.argmax(np.abs(remaining)), remaining.shape)
-        pivot = remaining[row, column]
+    while residual.size and len(rows) < min(residual.shape):
+        row, column = np.unravel_index(np.argmax(np.abs(residual)), residual.shape)
+        pivot = residual[row, column]
         if abs(pivot) <= ROUNDING * largest:
             break
-        columns.append(remaining[:, column].copy())
-        rows.append(remaining[row] / pivot)
-        remaining -= columns[-1][:, None] * rows[-1]
-    # Reshaped, because without any column an array has only one axis.
+        columns.append(residual[:, column].copy())
+        rows.append(residual[row] / pivot)
+        residual -= columns[-1][:, None] * rows[-1]
+    # The shape is given because an array of no columns would have only one axis.
     row_count, column_count = values.shape
     return (
         np.array(columns).reshape(-1, row_count).T,
@@ -68,10 +69,10 @@ def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
 def _log_sum_exp(
     exponent: Float, largest: Float, total: Float, mantissa: Float, power_bits: Index
 ) -> None:
-    """Fill `total` (B,) with log sum exp over the rows of `exponent` (E, B).
+    """Fill `total` (B,) with the log of the sum of exp(`exponent`) over its E rows (E, B).
 
-    The other arrays (B,) are for work. The exponential function is written out, as a number times a
-    power of two, because calls of a library function are not computed side by side.
+    The other arrays (B,) are work space. The exponential function is written out, as a number times
+    a power of two, because the compiler does not vectorise calls of a library function.
     """
     largest[:] = -np.inf
     total[:] = 0.0
@@ -115,8 +116,8 @@ def log_densities(
 
         (|I d|² - |d|²) / 2 + (d A) b_e - offset_e + log scale,
 
-    where I are the directions in which the interval of a state moves the sensors, and A b_e is the
-    difference of the draw from the mean.
+    where I (F, G) are the directions in which F factors move the G sensors within the interval of a
+    state, and A b_e is the difference of the draw from the mean, a matrix A (G, R) times a vector.
 
     Parameters
     ----------
@@ -132,9 +133,9 @@ def log_densities(
     draw_coefficients : (R, E) array
         The vectors b_e.
     draw_offset : (S, E) array
-        What the density of a draw has less, whatever is observed.
+        The term of each draw that is subtracted whatever is observed.
     log_scale : (S,) array
-        The log of the density's factor.
+        The log of the normalising factor of the density.
     result : (T, S, E) or (T, S, 1) array
         To be filled: the log density of each draw, or the log of the sum over the draws.
     """
@@ -171,7 +172,7 @@ def log_densities(
                 for b in range(size):
                     square[b] -= along_direction[b] * along_direction[b]
             for b in range(size):
-                if not square[b] < np.inf:  # an absurd observation
+                if not square[b] < np.inf:  # an absurd observation, whose square overflows
                     square[b] = np.inf
                     slope[:, b] = 0.0
             # The exponent of each draw.
@@ -181,7 +182,8 @@ def log_densities(
                 for r in range(directions):
                     for b in range(size):
                         exponent[e, b] += slope[r, b] * draw_coefficients[r, e]
-            # The sum over draws, if it is wanted.
+            # The log of the sum over draws, if the result has one entry for all draws. Work arrays
+            # that are not needed any more are used again.
             if result.shape[2] == 1:
                 _log_sum_exp(exponent, along_direction, square, mantissa, power_bits)
                 exponent[0] = square

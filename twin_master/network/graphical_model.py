@@ -54,7 +54,7 @@ class Factor:
         return 1e-9 * max(map(abs, self.levels))
 
     def index(self, value: float) -> int:
-        """Return the index of the level that a value is, but for rounding (`slack`).
+        """Return the index of the level that equals a value within rounding (`slack`).
 
         Raises
         ------
@@ -149,11 +149,11 @@ class StateSpace:
         return np.asarray(np.sqrt(variance))
 
     def change_within_interval(self, table: ArrayLike) -> Float:
-        """Return the change of a table within the interval that each state stands for.
+        """Return the typical change of a table within the interval that each state stands for.
 
-        A level stands for the values nearest to it: half way to its neighbours, and to one side
-        only at the ends. The true value lies anywhere in there. Between levels the table is taken
-        to be piecewise linear.
+        A level stands for the interval of values that are nearest to it: half way to its neighbours
+        on either side, and on one side only for the first and the last level. The true value is
+        uniformly distributed in the interval. Between levels the table is piecewise linear.
 
         Parameters
         ----------
@@ -163,8 +163,8 @@ class StateSpace:
         Returns
         -------
         (S, ..., F) array
-            The change of the table if each factor is one standard deviation off its level, by the
-            straight line that fits best; zero for a factor of one level.
+            The change of the table if each of F factors is one standard deviation off its level,
+            by the straight line that fits the table best; zero for a factor of one level.
         """
         table = np.asarray(table, dtype=np.float64)
         grid = table.reshape(*self.shape, *table.shape[1:])
@@ -197,7 +197,7 @@ class StateSpace:
 
 
 def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
-    """Return the change (..., L) of values (..., L) if a factor is one deviation off each level.
+    """Return the change (..., L) of values (..., L) at one standard deviation off each level.
 
     The true value x is uniform between half a step below the level and half a step above it. With
     the value v at the level and slopes on either side, the least-squares slope through the level is
@@ -208,15 +208,17 @@ def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
     no_padding = [(0, 0)] * (values.ndim - 1)
     difference = np.pad(np.diff(values), [*no_padding, (1, 1)])
     # Integral over a half step h/2 with slope d/h: d h² / 24; of x²: h³ / 24.
+    # With m the integral of x (v(x) - v), q that of x², and w the width of the interval, the change
+    # is m / q sqrt(q / w) = m / sqrt(q w), where 24 m = sum h² d, 24 q = sum h³, 2 w = sum h.
     moment = step**2 * difference
-    scale = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
-    safe_scale = np.where(scale > 0.0, scale, 1.0)
-    return np.asarray((moment[..., 1:] + moment[..., :-1]) / safe_scale)
+    divisor = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
+    safe_divisor = np.where(divisor > 0.0, divisor, 1.0)
+    return np.asarray((moment[..., 1:] + moment[..., :-1]) / safe_divisor)
 
 
 @dataclass(frozen=True)
 class GraphicalModel:
-    """States, controls, prior and transitions: what inference needs beside log-likelihoods.
+    """States, controls, prior and transitions of a dynamic decision network.
 
     Attributes
     ----------
@@ -225,7 +227,7 @@ class GraphicalModel:
     controls : tuple of str
         The names of the U controls.
     prior : (S,) array
-        p(D_0).
+        The distribution p(D_0) of the first state.
     transition : TransitionModel
         The transitions between the S states under the U controls.
     """
@@ -308,7 +310,7 @@ class GraphicalModel:
         Raises
         ------
         InvalidModelError
-            If a row is no distribution, or the shape is another one.
+            If a row is not a distribution, or the shape is not (S, U).
         """
         policy = stochastic_matrix(rows, name="policy[state]")
         check_shape("a policy", policy.shape, self.states.size, len(self.controls))
@@ -346,14 +348,29 @@ def worsening_table(level_count: int, probability: float) -> Float:
 
 
 def repaired_table(table: Float, success: float) -> Float:
-    """Return transitions (L, L) followed by a repair to the lowest level with a probability."""
+    """Return transitions (L, L) after which a repair to the lowest level follows.
+
+    Parameters
+    ----------
+    table : (L, L) array
+        The transitions without the repair, row-stochastic.
+    success : float
+        The probability that the repair succeeds.
+    """
     result = (1.0 - success) * table
     result[:, 0] += success
+    # Rows sum to one but for rounding, which the division removes.
     return np.asarray(result / result.sum(axis=1, keepdims=True), dtype=np.float64)
 
 
 def leaving_table(table: Float, factor: float) -> Float:
-    """Return transitions (L, L) with the probabilities to leave a level multiplied by a factor."""
+    """Return transitions (L, L) with the probabilities to leave a level multiplied by a factor.
+
+    Raises
+    ------
+    InvalidModelError
+        If the factor makes a probability to leave a level larger than one.
+    """
     is_staying = np.eye(len(table), dtype=bool)
     result = factor * np.where(is_staying, 0.0, table)
     staying = 1.0 - result.sum(axis=1)

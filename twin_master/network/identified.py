@@ -1,4 +1,4 @@
-"""Sensors whose observation is a row of G values and more: a covariance, or further readings.
+"""Sensors whose observation is a row of G values and a covariance, or G values and readings.
 
 Modes that are identified from a record come with their covariance: its lower triangle, row by row.
 An unknown entry is NaN or left out, and counts as zero. Inspections come with readings of the state
@@ -25,19 +25,22 @@ def packed_row(values: Float, covariance: Float) -> Float:
 
 
 class IdentifiedSensorModel(GaussianSensorModel):
-    """Gaussian sensors, each observation of which has a covariance beside the assumed noise.
+    """Gaussian sensors whose observations have a covariance, which is added to the assumed noise.
 
     Parameters are those of `GaussianSensorModel`. The average over the draws is that of eq. (30),
     "outside".
     """
 
     def split_observation(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return rows with or without their covariances, and zero log densities (..., S) beside."""
+        """Return the rows unchanged, with covariances if they have them, and zero log densities.
+
+        The log densities (..., S) are those of other parts of an observation, which there are not.
+        """
         rows = np.asarray(observation, dtype=np.float64)
         return rows, np.zeros((*rows.shape[:-1], self.state_count))
 
     def noise(self, joint: ArrayLike, rows: Float | None = None) -> Float:
-        """Return the standard deviation (..., G) of sensors, with the covariance of each row.
+        """Return the standard deviation (..., G) of each sensor, SI, with the variance in its row.
 
         Parameters
         ----------
@@ -100,13 +103,15 @@ class IdentifiedSensorModel(GaussianSensorModel):
             ) from None
 
         residual = values[present] - self.value_per_draw[:, :, control_index, present]  # (E, S, G)
-        white = np.linalg.solve(root, residual.transpose(1, 2, 0))  # (S, G, E)
+        # root @ root.T is the covariance, so that the whitened residuals are independent.
+        whitened_residual = np.linalg.solve(root, residual.transpose(1, 2, 0))  # (S, G, E)
+        # The determinant of the covariance is the squared product of the diagonal of its root.
         half_log_determinant = np.log(np.einsum("sgg->sg", root)).sum(axis=1)
         log_scale = half_log_determinant + present.size * LOG_ROOT_TWO_PI
-        return np.asarray(-0.5 * np.sum(white**2, axis=1) - log_scale[:, None])
+        return np.asarray(-0.5 * np.sum(whitened_residual**2, axis=1) - log_scale[:, None])
 
     def _covariance_of_row(self, row: Float) -> Float:
-        """Return the covariance (G, G) in a row; zero if the row has none."""
+        """Return the covariance (G, G) of the values in a row, SI; zeros if the row has none."""
         count = self.sensor_count
         if len(row) not in (count, row_width(count)) or np.isinf(row).any():
             raise InvalidObservationError(
@@ -164,7 +169,10 @@ class InspectedSensorModel(GaussianSensorModel):
     def draw_observations(
         self, state: Index, control_index: int, generator: np.random.Generator
     ) -> Float:
-        """Return one row drawn in each of N states (N,) under a control: (N, G + I), SI."""
+        """Draw one observation in each of N states (N,) under a control: (N, G + I), SI.
+
+        Readings that the control does not ask for are NaN.
+        """
         values = super().draw_observations(state, control_index, generator)
         shape = (len(state), len(self.asked_by))
         noise = self.reading_deviation[state] * generator.standard_normal(shape)

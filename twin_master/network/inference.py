@@ -1,7 +1,8 @@
 """Exact inference in the dynamic decision network: filter, smooth over the whole history, predict.
 
-Pure functions of arrays, with logarithms of beliefs: a belief whose probability underflows comes
-back if later data call for it. No floor is added anywhere, so what is impossible stays impossible.
+Pure functions of arrays, with logarithms of beliefs: a probability that underflows is kept as a
+logarithm, and can grow again by later data. No floor is added to probabilities, so that an
+impossible state stays impossible.
 
 The order of one step t: control u_t is in force, the state is D_t, the observation o_t is made
 under u_t. Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
@@ -74,17 +75,17 @@ class Predicted:
         return np.asarray(self.joint.sum(axis=1))
 
     def mix_control(self, weight: float, control: Float) -> "Predicted":
-        """Return the prediction if with a probability the controls do not depend on the state.
+        """Return the prediction with another distribution of the controls mixed in.
 
         Parameters
         ----------
         weight : float
-            That probability.
+            The probability that the controls follow the other distribution.
         control : (U,) array
-            The probabilities of the controls then.
+            That distribution, which does not depend on the state.
         """
-        joint_then = self.predicted[..., None] * control
-        return Predicted(self.predicted, (1.0 - weight) * self.joint + weight * joint_then)
+        joint_of_control = self.predicted[..., None] * control
+        return Predicted(self.predicted, (1.0 - weight) * self.joint + weight * joint_of_control)
 
 
 def _check_sequence(
@@ -124,7 +125,7 @@ def filter_many(
     log_before: Float,
     control_before: ArrayLike = _NO_CONTROL,
 ) -> tuple[Filtered, Index]:
-    """Filter B twins without any check.
+    """Filter the observations of B twins over T steps; the arguments are not checked.
 
     Parameters
     ----------
@@ -171,17 +172,21 @@ def filter_many(
 
 
 def log_forecast(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
-    """Return log beliefs (B, S) one transition later, each under its control (B,)."""
+    """Return log beliefs (B, S) one transition later, each under its control (B,).
+
+    A belief need not sum to one; its sum is kept.
+    """
     no_information = np.zeros_like(log_filtered)[:, None]
     beliefs, _ = filter_many(transition, control[:, None], no_information, log_filtered, control)
-    # The filter normalises each belief; its evidence is the sum that it had before.
+    # The filter normalises each belief. Without information, the evidence is the sum of the belief
+    # before that: adding its logarithm restores the sum.
     return np.asarray(beliefs.log_filtered[:, 0] + beliefs.log_evidence)
 
 
 def smooth_many(
     transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float
 ) -> Float:
-    """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
+    """Smooth the beliefs (B, T, S) of B twins under controls (B, T); arguments are not checked."""
     smoothed = np.empty_like(log_filtered)
     backward_pass(
         transition.forward_lists,
@@ -239,7 +244,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     control_index : (T,) array
         The control u_t in force in each step.
     log_filtered : (T, S) array
-        The log beliefs that `filter_sequence` returns, at once or one by one.
+        The filtered log beliefs, from one call of `filter_sequence` or from one call for each step.
 
     Raises
     ------
@@ -253,7 +258,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
 def predict(
     model: GraphicalModel, belief: ArrayLike, control_index: int, policy: ArrayLike, horizon: int
 ) -> Predicted:
-    """Predict through the policy: Kapteyn et al. 2021, eqs. (37)-(39).
+    """Predict beliefs and controls H steps ahead under a policy: Kapteyn et al. 2021, (37)-(39).
 
     D_{t+1} follows the belief at t through the known control u_t. From then on U_{t+h} follows
     policy(. | D_{t+h}), and D_{t+h+1} follows T[U_{t+h}](D_{t+h}, .). The control is marginalised
@@ -295,15 +300,28 @@ def predict(
 
 
 def _predict_by_blocks(transition: TransitionModel, policy: Float, predicted: Float) -> None:
-    """Fill the rows of `predicted` (H, S) after the first one, without the table of all states."""
+    """Fill the rows of `predicted` (H, S) after the first, without the joint table (U, S, S)."""
     for h in range(1, len(predicted)):
         joint = predicted[h - 1][:, None] * policy
-        next_by_control = [transition.forward(u, flow) for u, flow in enumerate(joint.T)]
+        next_by_control = [
+            transition.forward(u, belief_with_control)
+            for u, belief_with_control in enumerate(joint.T)
+        ]
         predicted[h] = np.sum(next_by_control, axis=0)
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:
-    """Return the joint (..., S, U) of beliefs (..., S) and known controls (...)."""
+    """Return the joint beliefs over states and controls (..., S, U), if the controls are known.
+
+    Parameters
+    ----------
+    belief : (..., S) array
+        The beliefs about the state.
+    control_index : (...) array
+        The index of the control for each belief.
+    control_count : int
+        The number U of controls.
+    """
     belief = np.asarray(belief, dtype=np.float64)
     is_control = np.eye(control_count)[np.asarray(control_index)]
     return np.asarray(belief[..., :, None] * is_control[..., None, :])

@@ -1,9 +1,9 @@
 """Compiled loops: transitions of a belief, the forward and the backward pass, and value iteration.
 
 A belief is kept both as probabilities and as their logarithms. A transition is a product of blocks,
-each applied along its own axis of the joint state. Sums over predecessors are formed of the
-probabilities if the sum is at least `SAFE`: what underflowed then weighs less than one part in 1e27
-of it, far below rounding. Otherwise logarithms are summed.
+each applied along its own axis of the joint state. A sum over predecessors is formed of the
+probabilities if the sum is at least `SAFE`: terms that underflowed are then less than one part in
+1e27 of it, far below rounding. Otherwise the sum is formed of the logarithms.
 
 Numbers are copied one by one, because numba takes two seconds to compile the copy of an array.
 """
@@ -66,10 +66,10 @@ def _exp(value: float) -> float:
 def apply_blocks(
     lists: PredecessorLists, control: int, before: Float, after: Float, work: Float
 ) -> None:
-    """Apply every block of a transition to numbers (S,), and fill `after`; `work` (S,) is lost.
+    """Fill `after` (S,) with the numbers `before` (S,) after every block of a transition.
 
     A block is applied along the first axis of the joint state, which becomes the last one. So after
-    all blocks the order of the axes is as before.
+    all blocks the order of the axes is as before. `work` (S,) is work space.
     """
     levels, first_row, start, predecessor, probability, _ = lists
     source = before
@@ -98,9 +98,9 @@ def _move_belief(
     log_after: Float,
     work: Float,
 ) -> None:
-    """Apply every block to one belief (S,) and its logarithm; `work` (2, S) is lost.
+    """Fill `after` and `log_after` (S,) with a belief and its logarithm after one transition.
 
-    The axes are treated as in `apply_blocks`.
+    The axes are treated as in `apply_blocks`. `work` (2, S) is work space.
     """
     levels, first_row, start, predecessor, probability, log_probability = lists
     source = before
@@ -122,7 +122,7 @@ def _move_belief(
                     work[0, target] = total
                     work[1, target] = np.log(total)
                     continue
-                # Log of the sum, from the logarithms of its terms.
+                # Log of the sum, from the logarithms of its terms, relative to the largest.
                 largest = -np.inf
                 for k in range(first_entry, end_entry):
                     log_term = log_source[predecessor[k] * inner_count + i] + log_probability[k]
@@ -189,33 +189,35 @@ def forward_pass(
         before = first
         log_before = log_first[twin]
         for t in range(steps):
-            now = forecast[twin, t]
+            forecast_now = forecast[twin, t]
             log_now = log_filtered[twin, t]
             # Forecast.
             control_in_force = control[twin, t - 1] if t > 0 else control_before[twin]
             if control_in_force < 0:
                 for state in range(size):
-                    now[state] = before[state]
+                    forecast_now[state] = before[state]
                     log_now[state] = log_before[state]
             else:
-                _move_belief(lists, control_in_force, before, log_before, now, log_now, work)
+                _move_belief(
+                    lists, control_in_force, before, log_before, forecast_now, log_now, work
+                )
             # Times the likelihood.
-            best = -np.inf
+            largest = -np.inf
             for state in range(size):
                 log_now[state] += log_likelihood[twin, t, state]
-                best = max(best, log_now[state])
-            if best == -np.inf:
+                largest = max(largest, log_now[state])
+            if largest == -np.inf:
                 failed[twin] = t
-                log_evidence[twin, t] = best
+                log_evidence[twin, t] = largest
                 break
             # Normalisation.
             before = filtered[twin, t]
             log_before = log_now
             total = 0.0
             for state in range(size):
-                before[state] = _exp(log_now[state] - best)
+                before[state] = _exp(log_now[state] - largest)
                 total += before[state]
-            evidence = best + np.log(total)
+            evidence = largest + np.log(total)
             log_evidence[twin, t] = evidence
             for state in range(size):
                 before[state] /= total
@@ -233,7 +235,8 @@ def backward_pass(
 ) -> None:
     """Smooth the beliefs of B twins over T steps, backward in time.
 
-    With the transition T from a step to the next one,
+    With the transition T from a step to the next one, the smoothed belief `later` of the next step,
+    and the forecast of the next step from the filtered belief of this one,
 
         smoothed(i) = filtered(i) sum_j T(i, j) later(j) / forecast(j).
 
@@ -275,7 +278,7 @@ def backward_pass(
                 underflows |= later[state] > 0.0 and forecast[state] < SAFE
                 ratio[state] = later[state] / max(forecast[state], SAFE)
             # The ratio, carried back through the transition.
-            best = -np.inf
+            largest = -np.inf
             if underflows:
                 _move_belief(
                     forward, control_in_force, before, log_now, forecast, log_forecast, work
@@ -284,9 +287,9 @@ def backward_pass(
                     log_ratio[state] = -np.inf
                     if later[state] > 0.0:
                         log_ratio[state] = np.log(later[state]) - log_forecast[state]
-                    best = max(best, log_ratio[state])
+                    largest = max(largest, log_ratio[state])
                 for state in range(size):
-                    log_ratio[state] -= best  # because the ratios themselves may overflow
+                    log_ratio[state] -= largest  # because the ratios themselves may overflow
                     ratio[state] = _exp(log_ratio[state])
                 _move_belief(backward, control_in_force, ratio, log_ratio, now, log_back, work)
             else:
@@ -295,7 +298,7 @@ def backward_pass(
             total = 0.0
             for state in range(size):
                 if underflows:
-                    now[state] = _exp(log_now[state] + (log_back[state] + best))
+                    now[state] = _exp(log_now[state] + (log_back[state] + largest))
                 elif before[state] >= SAFE:
                     now[state] *= before[state]
                 elif now[state] > 0.0:
@@ -327,7 +330,7 @@ def sweep_bellman(
     discount : (U,) array
         The discount factor of each control.
     policy : (S, U) or (0, U) array
-        The policy whose value is computed; without rows it is the value of the best control.
+        The policy whose value is computed. If it has no rows, the best control is taken instead.
     tolerance : float
         The largest change of the value at the end.
     most_sweeps : int
@@ -344,25 +347,25 @@ def sweep_bellman(
     change : float
         The last change of the value.
     """
-    later = np.empty(len(value))
+    expected_value = np.empty(len(value))
     work = np.empty(len(value))
     change = np.inf
     sweeps = 0
     while True:
         for control in range(len(discount)):
-            apply_blocks(backward, control, value, later, work)
+            apply_blocks(backward, control, value, expected_value, work)
             for state in range(len(value)):
                 action_value[state, control] = (
-                    reward[state, control] + discount[control] * later[state]
+                    reward[state, control] + discount[control] * expected_value[state]
                 )
         if change <= tolerance or sweeps == most_sweeps:
             return sweeps, change
         change = 0.0
         for state in range(len(value)):
             if len(policy):
-                improved = np.sum(policy[state] * action_value[state])
+                new_value = np.sum(policy[state] * action_value[state])
             else:
-                improved = np.max(action_value[state])
-            change = max(change, abs(improved - value[state]))
-            value[state] = improved
+                new_value = np.max(action_value[state])
+            change = max(change, abs(new_value - value[state]))
+            value[state] = new_value
         sweeps += 1

@@ -1,4 +1,4 @@
-"""Classes of observations: few outcomes that tell of the state what all observations do."""
+"""Classes of observations: few outcomes with nearly all the information about the state."""
 
 import numpy as np
 from scipy.special import rel_entr
@@ -9,7 +9,7 @@ from twin_master.network.sensor_model import GaussianSensorModel
 SAMPLES = 1500
 """Observations that are drawn for each control, the same number in each state."""
 MOST_CLASSES = 64
-"""Classes into which they are joined at most."""
+"""Largest number of classes into which the drawn observations are joined."""
 _LOSS = 0.005
 """Information about the state that fewer classes may lose [bit]."""
 
@@ -19,12 +19,12 @@ def observation_classes(
     generator: np.random.Generator,
     classes: int = MOST_CLASSES,
 ) -> tuple[Float, ...]:
-    """Return for each control the probability of each class of observations in each state: (K, S).
+    """Return for each control p(class of the observation | state), for K classes: (K, S).
 
-    Observations are drawn in each state. Those are joined to a class that tell the same of the
-    state: their posterior beliefs, from a uniform prior, are close in the distance of Hellinger.
-    The probability of a class is that of its members, weighted by their likelihood in each state.
-    The number of classes is doubled until they tell as much of the state as all observations.
+    Observations are drawn in each state. Those with similar posterior beliefs, from a uniform
+    prior, are joined to a class: their Hellinger distance is small. The probability of a class in a
+    state is the sum of the posteriors of its members, normalised over the classes. The number of
+    classes is doubled until they contain as much information about the state as all observations.
 
     Parameters
     ----------
@@ -46,25 +46,30 @@ def observation_classes(
         )
         posterior = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
         posterior /= posterior.sum(axis=1, keepdims=True)
-        joined = _join_similar(posterior, generator, classes)
-        class_probabilities.append(joined / joined.sum(axis=0))
+        class_sums = _join_similar(posterior, generator, classes)
+        class_probabilities.append(class_sums / class_sums.sum(axis=0))
     return tuple(class_probabilities)
 
 
 def _join_similar(posterior: Float, generator: np.random.Generator, classes: int) -> Float:
-    """Return sums (K, S) of posteriors (N, S) that are similar, in K classes at most."""
+    """Return the sum of the posteriors in each class of similar ones: (N, S) -> (K, S).
+
+    The classes are found by k-means; their number K is at most `classes`.
+    """
     from scipy.cluster.vq import kmeans2  # slow to import, and not needed in flight
 
     information = _information(posterior)
     count = 1
-    joined: Float = posterior.sum(axis=0, keepdims=True)
-    most = min(classes, len(posterior))
-    while count < most and _information(joined) < information - _LOSS:
+    class_sums: Float = posterior.sum(axis=0, keepdims=True)
+    largest_count = min(classes, len(posterior))
+    while count < largest_count and _information(class_sums) < information - _LOSS:
         count *= 2
-        # The Euclidean distance of square roots is that of Hellinger.
+        # The Euclidean distance of square roots of probabilities is the Hellinger distance.
         _, label = kmeans2(np.sqrt(posterior), min(count, classes), minit="++", rng=generator)
-        joined = np.array([posterior[label == one].sum(axis=0) for one in np.unique(label)])
-    return joined
+        class_sums = np.array(
+            [posterior[label == class_index].sum(axis=0) for class_index in np.unique(label)]
+        )
+    return class_sums
 
 
 def _information(joint: Float) -> float:
@@ -75,8 +80,8 @@ def _information(joint: Float) -> float:
     joint : (K, S) array
         Proportional to the joint probability of K observations and S states.
     """
-    observation = joint.sum(axis=1, keepdims=True)
-    state = joint.sum(axis=0)
+    observation_weight = joint.sum(axis=1, keepdims=True)
+    state_weight = joint.sum(axis=0)
     total = joint.sum()
-    independent = observation * state / total
+    independent = observation_weight * state_weight / total
     return float(rel_entr(joint, independent).sum() / total / np.log(2.0))

@@ -31,14 +31,17 @@ _RELATIVE_ROUNDING_OF_SWEEP = 4e-16
 
 @dataclass(frozen=True)
 class BeliefPolicy:
-    """A policy that depends on the belief before a step: the control of the largest vector there.
+    """A policy that decides by the belief before a step, given N plans (alpha vectors).
+
+    The vector of a plan has its expected return from each of S states. The policy takes the first
+    control of the plan whose expected return under the belief is the largest.
 
     Attributes
     ----------
     vectors : (N, S) array
-        The expected return of a plan that begins with a control, from each state.
+        The expected return of each plan from each state.
     control : (N,) array
-        The control with which each plan begins.
+        The index of the control with which each plan begins.
     """
 
     vectors: Float
@@ -46,19 +49,21 @@ class BeliefPolicy:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
-        """Return the policy in the arrays of a file.
+        """Return the policy whose two arrays were read from a file.
 
         Parameters
         ----------
         arrays : dict of str to array
-            Arrays by name, among them `vectors` and `control` behind the prefix.
+            All arrays of the file by name. Those of the policy are named `{prefix}vectors` (N, S)
+            and `{prefix}control` (N,).
         prefix : str
-            The beginning of the two names.
+            The text before `vectors` and `control` in the two names.
 
         Raises
         ------
         PlanningError
-            If one is missing, or they do not fit together.
+            If one of the two arrays is missing, or they have no common length N, or the controls
+            are not integers.
         """
         before = "a policy on the belief has `vectors` and `control`: "
         with PlanningError.instead_of(KeyError, before=before, after=" is missing"):
@@ -73,43 +78,43 @@ class BeliefPolicy:
         return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
 
     def value(self, belief: ArrayLike) -> Float:
-        """Return the expected return from beliefs (..., S): (...)."""
+        """Return the expected return of the best plan under each belief: (..., S) -> (...)."""
         return np.asarray((np.asarray(belief) @ self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
-        """Return the expected return by the control of the first step: (..., S) -> (..., U).
+        """Return the expected return of each first control: beliefs (..., S) -> (..., U).
 
-        It is minus infinity for a control without a vector.
+        It is minus infinity for a control with which no plan begins.
         """
-        vector_values = np.asarray(belief) @ self.vectors.T  # (..., N)
-        result: Float = np.full((*vector_values.shape[:-1], controls), -np.inf)
+        expected_returns = np.asarray(belief) @ self.vectors.T  # (..., N)
+        best_returns: Float = np.full((*expected_returns.shape[:-1], controls), -np.inf)
         for control in np.unique(self.control).tolist():
             has_control = self.control == control
-            result[..., control] = vector_values[..., has_control].max(axis=-1)
-        return result
+            best_returns[..., control] = expected_returns[..., has_control].max(axis=-1)
+        return best_returns
 
     def decide(self, belief: ArrayLike) -> Index:
-        """Return the control for beliefs (..., S): (...)."""
-        largest_vector = np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)
-        return np.asarray(self.control[largest_vector])
+        """Return the index of the control to take under each belief: (..., S) -> (...)."""
+        best_plan = np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)
+        return np.asarray(self.control[best_plan])
 
 
 @dataclass(frozen=True)
 class PlannedPolicy:
-    """A planned policy.
+    """A policy of S states and U controls with its value.
 
     Attributes
     ----------
     value : (S,) array
         The expected discounted reward from each state.
     action_value : (S, U) array
-        The same, if the given control is taken first.
+        The expected discounted reward from each state if the control is taken first.
     policy : (S, U) array
         p(U | D), row-stochastic.
     iterations : int
         The number of sweeps of value iteration; zero if the policy was given.
     on_belief : BeliefPolicy or None
-        A policy that decides by the belief in the place of `policy`, which then only predicts.
+        A policy that decides by the belief. If it is given, `policy` serves only to predict.
     """
 
     value: Float
@@ -135,7 +140,7 @@ def decision_probability(
 ) -> Float:
     """Return the probability of each next control of B twins: (B, U).
 
-    Each twin has what it would have alone, to the last bit.
+    The result of a twin does not depend on the other twins, not even in the last bit.
 
     Parameters
     ----------
@@ -148,17 +153,18 @@ def decision_probability(
     policy : (S, U) array
         p(U | D), which is averaged over the belief.
     on_belief : BeliefPolicy, optional
-        Decides by p(D_{t+1} | o_0..o_t) in the place of `policy`.
+        A policy that takes the place of `policy`; it decides by p(D_{t+1} | o_0..o_t).
     ahead : bool
-        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t), too.
+        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t) instead of `filtered`.
     """
     belief = filtered
     if ahead or on_belief is not None:
         pairs = zip(control.tolist(), filtered, strict=True)
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
     if on_belief is not None:
-        decided = [on_belief.decide(row) for row in belief]
-        return np.eye(policy.shape[1])[decided]
+        # The policy is deterministic: its control has the probability one.
+        controls = [on_belief.decide(row) for row in belief]
+        return np.eye(policy.shape[1])[controls]
     # One product for each twin, so that its last bit does not depend on the number of twins.
     return np.asarray(np.matmul(belief[:, None, :], policy)[:, 0])
 
@@ -172,10 +178,10 @@ def ration_controls(
     scarce: Sequence[int],
     budget: int,
 ) -> Index:
-    """Return the next controls (B,), with the scarce ones where they are worth most.
+    """Return the next controls (B,) if at most `budget` twins may have a scarce control.
 
-    A scarce control is worth the difference of its return to that of the best other control, which
-    is taken where the budget is spent.
+    The twins that gain most by a scarce control get it: the gain is its expected return minus that
+    of the best other control. A twin that wanted one and gets none takes its best other control.
 
     Parameters
     ----------
@@ -194,18 +200,20 @@ def ration_controls(
     budget : int
         The largest number of scarce controls.
     """
-    wanting = np.flatnonzero(np.isin(chosen, scarce))
-    if len(wanting) <= budget:
+    requesting_twins = np.flatnonzero(np.isin(chosen, scarce))
+    if len(requesting_twins) <= budget:
         return chosen
-    predicted = [transition.forward(int(before[twin]), filtered[twin]) for twin in wanting]
+    predicted = [transition.forward(int(before[twin]), filtered[twin]) for twin in requesting_twins]
     action_value = policy.action_value(np.array(predicted), transition.shape[0])
-    value_of_others = action_value.copy()
-    value_of_others[:, scarce] = -np.inf
-    gain = action_value[:, scarce].max(axis=1) - value_of_others.max(axis=1)
-    refused = np.argsort(-gain, kind="stable")[budget:]
-    result = chosen.copy()
-    result[wanting[refused]] = np.argmax(value_of_others[refused], axis=1)
-    return result
+    other_action_value = action_value.copy()
+    other_action_value[:, scarce] = -np.inf
+    gain = action_value[:, scarce].max(axis=1) - other_action_value.max(axis=1)
+    refused_positions = np.argsort(-gain, kind="stable")[budget:]
+    rationed = chosen.copy()
+    rationed[requesting_twins[refused_positions]] = np.argmax(
+        other_action_value[refused_positions], axis=1
+    )
+    return rationed
 
 
 @dataclass(frozen=True)
@@ -219,9 +227,9 @@ class _ValueIteration:
     sweeps : int
         The number of sweeps.
     change : float
-        The last change of the value.
+        The largest change of the value of a state in the last sweep.
     converged : bool
-        Whether it is as small as the tolerance asks.
+        Whether this change is as small as the tolerance requires.
     """
 
     value: Float
@@ -286,7 +294,7 @@ class _DecisionProcess:
 
     @property
     def is_solved(self) -> bool:
-        """Whether the value of a policy is the solution of a dense linear system."""
+        """Whether there are few enough states to solve a dense linear system for a value."""
         return len(self.reward) <= LARGEST_SOLVED
 
     def iterate_value(
@@ -310,22 +318,22 @@ class _DecisionProcess:
             The value to begin with; zero by default.
         """
         states, controls = self.reward.shape
-        scale = float(np.abs(self.reward).max()) or 1.0
+        largest_reward = float(np.abs(self.reward).max()) or 1.0  # 1 if all rewards are zero
         gamma = float(self.discount.max())
         # The error |V_k - V*| is at most gamma / (1 - gamma) times the change |V_k - V_{k-1}|.
         # Below rounding nothing changes any more.
-        allowed_change = tolerance * scale * (1.0 - gamma)
-        rounding = _RELATIVE_ROUNDING_OF_SWEEP * scale / (1.0 - gamma)
+        allowed_change = tolerance * largest_reward * (1.0 - gamma)
+        rounding = _RELATIVE_ROUNDING_OF_SWEEP * largest_reward / (1.0 - gamma)
         largest_change = max(allowed_change, rounding)
 
         value = np.zeros(states) if start is None else start.copy()
-        best_control = np.empty((0, controls))  # no rows: the kernel takes the best control
+        no_policy = np.empty((0, controls))  # no rows: the kernel takes the best control
         action_value = np.empty_like(self.reward)
         sweeps, change = sweep_bellman(
             self.transition.backward_lists,
             self.reward,
             self.discount,
-            best_control if policy is None else policy.copy(),
+            no_policy if policy is None else policy.copy(),
             largest_change,
             most_sweeps,
             value,
@@ -349,27 +357,39 @@ class _DecisionProcess:
             )
 
     def action_value(self, value: Float) -> Float:
-        """Return the return of each control in each state (S, U), if a value (S,) follows."""
+        """Return the expected return of each control in each state: (S, U).
+
+        Parameters
+        ----------
+        value : (S,) array
+            The expected return from each state after the step.
+        """
         expected = [
             self.transition.expected_value(control, value) for control in range(len(self.discount))
         ]
         return np.asarray(self.reward + self.discount * np.stack(expected, axis=1))
 
     def rounding_error(self, value: Float) -> Float:
-        """Return the rounding error of the returns of controls in each state: (S,)."""
-        absolute = replace(self, reward=np.abs(self.reward))
-        size_of_terms = absolute.action_value(np.abs(value))
+        """Return the largest rounding error of an action value in each state: (S,).
+
+        It is proportional to the sum of the absolute values of the terms.
+        """
+        absolute_process = replace(self, reward=np.abs(self.reward))
+        size_of_terms = absolute_process.action_value(np.abs(value))
         return np.asarray(_ROUNDING * size_of_terms.max(axis=1))
 
     def evaluate(self, policy: Float, start: Float | None = None) -> Float:
-        """Return the value (S,) of a policy: V = r + gamma P V with its rewards and transitions.
+        """Return the value (S,) of a policy: the solution V of V = r + gamma P V.
+
+        r (S,) are the expected rewards and P (S, S) the transitions under the policy.
 
         Parameters
         ----------
         policy : (S, U) array
             p(U | D), row-stochastic.
         start : (S,) array, optional
-            The value from which an iteration begins, if there are too many states to solve for.
+            The value from which the iteration begins, if there are too many states to solve the
+            linear system.
         """
         if not self.is_solved:
             result = self.iterate_value(0.0, _MOST_EVALUATION_SWEEPS, policy, start)
@@ -378,10 +398,12 @@ class _DecisionProcess:
         states = len(self.reward)
         discounted = np.zeros((states, states))  # gamma P
         for control, discount in enumerate(self.discount):
-            taking = np.flatnonzero(policy[:, control])  # states in which the control is taken
-            weight = discount * policy[taking, control]
-            next_state = self.transition.rows(np.full_like(taking, control), taking)
-            discounted[taking] += weight[:, None] * next_state
+            states_with_control = np.flatnonzero(policy[:, control])
+            weight = discount * policy[states_with_control, control]
+            next_state = self.transition.rows(
+                np.full_like(states_with_control, control), states_with_control
+            )
+            discounted[states_with_control] += weight[:, None] * next_state
         reward = np.sum(policy * self.reward, axis=1)
         return np.asarray(np.linalg.solve(np.eye(states) - discounted, reward))
 
@@ -396,7 +418,7 @@ class _DecisionProcess:
             An estimate of their value.
         """
         states = np.arange(len(control))
-        certain = np.eye(len(self.discount))
+        certain = np.eye(len(self.discount))  # rows are policies that take one control for certain
         value = self.evaluate(certain[control], start)
         while True:
             action_value = self.action_value(value)
@@ -420,11 +442,11 @@ def value_iteration(
     tolerance: float = 1e-12,
     max_iterations: int = 100_000,
 ) -> PlannedPolicy:
-    """Return the best policy and its value, by value iteration on the Bellman equation (36).
+    """Return the best policy and its value: Bellman's equation, Kapteyn et al. 2021, eq. (36).
 
-    Value iteration finds a policy; policy iteration improves it until no control is better by more
-    than rounding. The value is that of the returned policy: the solution of its linear equations,
-    or with more than 1,000 states iterated to rounding.
+    Value iteration finds a first policy. Policy iteration improves it until no control is better by
+    more than rounding. The value is that of the returned policy: with up to 1,000 states it is the
+    solution of a linear system, with more it is iterated to rounding.
 
     Parameters
     ----------
@@ -467,10 +489,11 @@ def value_iteration(
     greedy = np.argmax(problem.action_value(iteration.value), axis=1)
     control, value = problem.improve_policy(greedy, iteration.value)
 
-    # The first of equally good controls.
+    # Take the first of controls that are equally good but for rounding, so that the policy does not
+    # depend on rounding.
     action_value = problem.action_value(value)
-    least = action_value.max(axis=1) - problem.rounding_error(value)
-    first_of_equals = np.argmax(action_value >= least[:, None], axis=1)
+    least_of_equals = action_value.max(axis=1) - problem.rounding_error(value)
+    first_of_equals = np.argmax(action_value >= least_of_equals[:, None], axis=1)
     policy = np.eye(len(problem.discount))[first_of_equals]
     if not np.array_equal(first_of_equals, control):
         value = problem.evaluate(policy, value)
@@ -481,7 +504,7 @@ def value_iteration(
 def evaluate_policy(
     transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: Float
 ) -> PlannedPolicy:
-    """Return a given policy with its value.
+    """Return a given policy with its value, as if it had been planned.
 
     Parameters
     ----------

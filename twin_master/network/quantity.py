@@ -22,7 +22,7 @@ from twin_master.errors import InvalidModelError
 from twin_master.network.transition import check_shape, distribution
 
 ROUNDING = 1e-12
-"""A cumulative probability reaches a level if it misses it by no more than this."""
+"""A cumulative probability counts as having reached a level if it is this far below it."""
 HEALTH = 0
 """Index of the health reward."""
 CONTROL = 1
@@ -34,7 +34,7 @@ REWARD_COUNT = 3
 
 
 class SortedValues(NamedTuple):
-    """The N = S U E values of each sensor, in rising order.
+    """The N = S U E values of each of G sensors in rising order, for S states, U controls, E draws.
 
     Attributes
     ----------
@@ -55,9 +55,10 @@ class SortedValues(NamedTuple):
 def _fill_quantiles(
     weight: Float, sorted_values: SortedValues, levels: Float, result: Float
 ) -> None:
-    """Fill result (B, P, G) with the quantiles of each sensor under each belief.
+    """Fill `result` with the quantiles of each of G sensors under each of B beliefs.
 
-    For each belief and sensor, the sorted values are passed until each level is reached.
+    For each belief and sensor the probabilities of the sorted values are summed until each of P
+    levels is reached.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def _fill_quantiles(
     levels : (P,) array
         The levels, increasing.
     result : (B, P, G) array
-        To be filled.
+        The quantiles, in the unit of the values; filled here.
     """
     pair, draw_weight, value = sorted_values
     for sensor in range(value.shape[0]):
@@ -86,7 +87,8 @@ def _fill_quantiles(
                         level += 1
                     if level == len(levels):
                         break
-            while level < len(levels):  # a level of one, and a sum that rounds below it
+            # By rounding the sum of all probabilities may stay below a level of one.
+            while level < len(levels):
                 result[belief, level, sensor] = last_value
                 level += 1
 
@@ -221,10 +223,11 @@ class QuantityModel:
 def _error_moments(
     observation: Float, mean: Float, variance: Float, scale: Float
 ) -> tuple[Float, Float]:
-    """Return mean and variance (...) of the error reward: minus the mean distance from the model.
+    """Return mean and variance (...) of the error reward.
 
-    Sensor values are independently normal. The distance of a normal variable from a point has a
-    folded normal distribution.
+    The reward is minus the mean, over the present sensors, of |observation - value| / scale. The
+    values are independently normal, so that each distance has a folded normal distribution (Leone,
+    Nelson and Nottingham 1961).
 
     Parameters
     ----------
@@ -238,14 +241,18 @@ def _error_moments(
     is_present = ~np.isnan(observation)
     distance = np.abs(observation - mean)[..., is_present]
     variance = variance[..., is_present]
-    deviation = np.sqrt(variance)
+    standard_deviation = np.sqrt(variance)
     standardized = np.full_like(distance, np.inf)  # for a value without variance
-    np.divide(distance, deviation, out=standardized, where=deviation > 0.0)
+    np.divide(distance, standard_deviation, out=standardized, where=standard_deviation > 0.0)
     folded_mean = distance * (1.0 - 2.0 * ndtr(-standardized))
-    folded_mean += deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * standardized**2)
+    folded_mean += standard_deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * standardized**2)
     folded_variance = np.maximum(distance**2 + variance - folded_mean**2, 0.0)
-    cost = 1.0 / (np.broadcast_to(scale, mean.shape)[..., is_present] * is_present.sum())
-    return -(folded_mean * cost).sum(axis=-1), (folded_variance * cost**2).sum(axis=-1)
+    cost_per_distance = 1.0 / (
+        np.broadcast_to(scale, mean.shape)[..., is_present] * is_present.sum()
+    )
+    return -(folded_mean * cost_per_distance).sum(axis=-1), (
+        folded_variance * cost_per_distance**2
+    ).sum(axis=-1)
 
 
 def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float, Float]:
@@ -261,8 +268,10 @@ def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float
     weight = weight.reshape(len(weight), -1)
     mean = mean.reshape(len(mean), -1)
     variance = variance.reshape(len(variance), -1)
-    # A sum gives each belief what it has alone; a product of matrices does not, to the last bit.
+    # With einsum the last bit of a result does not depend on the number of beliefs; with a product
+    # of matrices it does.
     mixture_mean = np.einsum("bn,rn->br", weight, mean)
+    # Law of total variance: mean of the variances, plus variance of the means.
     mixture_variance = np.einsum("bn,rn->br", weight, variance)
     for b in range(len(weight)):
         deviation = mean - mixture_mean[b][:, None]
@@ -309,8 +318,8 @@ class RewardModel:
         It is one without load, zero if one sensor reaches its limit, and negative beyond.
         """
         sensors = slice(None) if self.health_sensors is None else list(self.health_sensors)
-        # Divided by the limit first: for one limit the result is that of the largest value, because
-        # rounding is monotonic.
+        # The division comes before the maximum, because each sensor may have its own limit. With
+        # one limit the order makes no difference, because rounding is monotonic.
         fraction_of_limit = values[..., sensors] / np.asarray(self.limit)
         return np.asarray(1.0 - fraction_of_limit.max(axis=-1))
 
@@ -351,8 +360,8 @@ class RewardModel:
         joint : (..., S, U) array
             p(D, U); use `known_control` for a control that is known.
         observation : (..., G) array, optional
-            SI, NaN for a lost sensor. Without any observed value, as in a prediction, the error
-            reward is NaN.
+            The observed values, SI; NaN for a lost sensor. If no value was observed, as in a
+            prediction, the error reward is NaN.
 
         Raises
         ------
@@ -382,9 +391,17 @@ class RewardModel:
         return mean.reshape(shape), np.sqrt(variance).reshape(shape)
 
     def _error_reward(self, belief: Float, observation: Float) -> tuple[float, float]:
-        """Return mean and variance of the error reward of an observation (G,) under (S, U)."""
-        state, control = np.nonzero(belief)
-        value = self.quantity.value_per_draw[:, state, control]  # (E, n, G)
+        """Return mean and variance of the error reward of an observation (G,).
+
+        Parameters
+        ----------
+        belief : (S, U) array
+            The joint belief over states and controls.
+        observation : (G,) array
+            The observed values, SI; NaN for a lost sensor.
+        """
+        state, control = np.nonzero(belief)  # pairs of positive probability
+        value = self.quantity.value_per_draw[:, state, control]  # (E, n, G) of n pairs
         error, _ = _error_moments(
             observation, value, np.zeros_like(value), self._error_scale[control]
         )
@@ -402,12 +419,14 @@ class RewardModel:
         variance: Float,
         observation: Float | None = None,
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation (B, 3) under beliefs that contain static hypotheses.
+        """Return mean and standard deviation of each reward (B, 3), for a learning filter.
+
+        Its B beliefs are over K static hypotheses, S states and U' of the controls together.
 
         Parameters
         ----------
         weight : (B, K, S, U') array
-            The beliefs over hypotheses, states and controls, which sum to one.
+            The beliefs; each sums to one.
         draw : (K,) array
             The draw of the parameter of each hypothesis.
         controls : slice
@@ -415,7 +434,7 @@ class RewardModel:
         mean, variance : (K, S, U', G) array
             Moments of each sensor's value without noise, independently normal, SI.
         observation : (G,) array, optional
-            SI, NaN for a lost sensor; if left out, the error reward is NaN.
+            The observed values, SI; NaN for a lost sensor. If left out, the error reward is NaN.
         """
         reward_mean = np.full((REWARD_COUNT, *mean.shape[:-1]), np.nan)
         reward_variance = np.zeros_like(reward_mean)

@@ -25,7 +25,7 @@ from twin_master.network.transition import check_controls, check_shape
 Averaging = Literal["outside", "inside"]
 """Whether the likelihoods of the draws are averaged, or those of each sensor."""
 _WORST_LISTED = 3
-"""Sensors that are listed as the worst ones."""
+"""Number of sensors in the list of those that fit worst."""
 LARGEST_DISTANCE = 1e140
 """Distances are cut to this; its square is still a number."""
 LEAST_ONE_MINUS_LEVERAGE = 1e-12
@@ -57,16 +57,19 @@ class IntervalFit:
 
 
 class _DensityTerms(NamedTuple):
-    """What all observations by the same sensors under one control share, see `log_densities`.
+    """Terms of the density that all observations by the same sensors under one control share.
+
+    The kernel `log_densities` has the formula.
 
     Attributes
     ----------
     log_scale : (S,) array
         The log of the density's factor.
     draw_offset : (S, E) array
-        Half the square of the difference of each draw from the mean.
+        Half the squared distance of each draw from the mean over the draws.
     mean, inverse_deviation : (S, G) array
-        The mean over the draws, and one over the noise; zero for a lost sensor.
+        The mean over the draws, SI, and one over the standard deviation of noise and model error,
+        1/SI; the latter is zero for a lost sensor.
     interval_directions : (S, F, G) array
         The directions in which the interval of a state moves the sensors.
     draw_directions : (S, G, R) array
@@ -151,7 +154,7 @@ class GaussianSensorModel(QuantityModel):
         )
         self.standard_deviation: Float = np.full(self.sensor_count, noise)
         self.model_error: Float = np.full(self.sensor_count, relative_error)
-        # Not the root of a sum of squares, which rounds where there is no model error.
+        # hypot(x, 0) is exactly x; the root of a sum of squares would round.
         independent = np.hypot(self.standard_deviation, self.model_error * self.mean)
 
         if interval is None:
@@ -171,7 +174,8 @@ class GaussianSensorModel(QuantityModel):
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
 
-        # The draws differ from their mean by few directions (S, U, G, R) times coefficients (R, E).
+        # The differences of the draws from their mean, in standard deviations, are a matrix of low
+        # rank R: directions (S, U, G, R) times coefficients (R, E).
         difference = (self.value_per_draw - self.mean) / independent
         largest = float(np.max(np.abs(self.value_per_draw) / independent))
         rows_of_draws = np.moveaxis(difference, 0, -1).reshape(-1, self.draw_count)
@@ -227,24 +231,40 @@ class GaussianSensorModel(QuantityModel):
         values : (..., G) array
             The values of the sensors, SI.
         log_density : (..., S) array
-            The log density of what does not pass through the sensors, in each state; zero here.
+            The log density of the other parts in each state, such as readings of inspections; zero
+            for this class.
         """
         return self.check_observation(observation), np.zeros(self.state_count)
 
     def draw_observations(
         self, state: Index, control_index: int, generator: np.random.Generator
     ) -> Float:
-        """Return one observation drawn in each of N states (N,) under a control: (N, G), SI."""
+        """Draw one observation in each of N states under a control.
+
+        Parameters
+        ----------
+        state : (N,) array
+            The index of each state.
+        control_index : int
+            The control in force.
+        generator : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        (N, G) array
+            The sensor values with noise, SI.
+        """
         count = len(state)
         # With the average inside, each sensor has a draw of its own.
         draws_per_row = self.sensor_count if self.averages_inside else 1
         draw = generator.choice(self.draw_count, (count, draws_per_row), p=self.draw_weight)
         sensors = np.arange(self.sensor_count)
         values = self.value_per_draw[draw, state[:, None], control_index, sensors]
-        within = generator.standard_normal((count, self.interval.shape[-1]))
+        interval_factors = generator.standard_normal((count, self.interval.shape[-1]))
         deviation = self.independent_standard_deviation[state, control_index]
         noise = deviation * generator.standard_normal((count, self.sensor_count))
-        change = np.einsum("ngf,nf->ng", self.interval[state, control_index], within)
+        change = np.einsum("ngf,nf->ng", self.interval[state, control_index], interval_factors)
         return np.asarray(values + noise + change)
 
     def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
@@ -253,7 +273,7 @@ class GaussianSensorModel(QuantityModel):
         Parameters
         ----------
         observation : (G,) array
-            SI; NaN where the sensor is lost. If all are lost, the result is zero.
+            The sensor values, SI; NaN where a sensor is lost. If all are lost, the result is zero.
         control_index : int
             The control in force.
 
@@ -267,9 +287,9 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        values, log_density_beside = self.split_observation(observation)
+        values, other_log_density = self.split_observation(observation)
         log_density = self._log_densities(values[None], [control_index], 1)[0, :, 0]
-        return np.asarray(log_density + log_density_beside)
+        return np.asarray(log_density + other_log_density)
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
@@ -279,9 +299,9 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        values, log_density_beside = self.split_observation(observations)
+        values, other_log_density = self.split_observation(observations)
         log_density = self._log_densities(values, control_index, 1)[..., 0]
-        return np.asarray(log_density + log_density_beside)
+        return np.asarray(log_density + other_log_density)
 
     def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t, e) of a sequence for each draw e: (T, G), (T,) -> (T, S, E).
@@ -291,9 +311,9 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        values, log_density_beside = self.split_observation(observations)
+        values, other_log_density = self.split_observation(observations)
         log_density = self._log_densities(values, control_index, self.draw_count)
-        return log_density + log_density_beside[..., None]
+        return log_density + other_log_density[..., None]
 
     def _log_densities(
         self, observations: ArrayLike, control_index: ArrayLike, draws: int
@@ -312,7 +332,7 @@ class GaussianSensorModel(QuantityModel):
         Returns
         -------
         (T, S, draws) array
-            In SI.
+            The log densities of values in SI.
         """
         observations = self.check_observation(observations)
         control = np.array(control_index, dtype=np.int64)
@@ -324,7 +344,8 @@ class GaussianSensorModel(QuantityModel):
         if not self.averages_inside or draws != 1:
             self._add_log_densities(observations, control, is_present, result)
             return result
-        for is_sensor in np.eye(self.sensor_count, dtype=bool):  # each sensor by itself
+        # The average inside the product over sensors: each sensor is averaged by itself, eq. (32).
+        for is_sensor in np.eye(self.sensor_count, dtype=bool):
             self._add_log_densities(observations, control, is_sensor & is_present, result)
         return result
 
@@ -335,11 +356,14 @@ class GaussianSensorModel(QuantityModel):
 
         Steps with the same control and the same sensors are computed together.
         """
+        # The row of truth values as bytes is a key of a dictionary.
         present_bytes = is_present.view(f"V{self.sensor_count}")[:, 0].tolist()
-        rows_by_kind: dict[tuple[int, bytes], list[int]] = {}
-        for row, kind in enumerate(zip(control.tolist(), present_bytes, strict=True)):
-            rows_by_kind.setdefault(kind, []).append(row)
-        for (one_control, sensors), rows in rows_by_kind.items():
+        rows_by_control_and_sensors: dict[tuple[int, bytes], list[int]] = {}
+        for row, control_and_sensors in enumerate(
+            zip(control.tolist(), present_bytes, strict=True)
+        ):
+            rows_by_control_and_sensors.setdefault(control_and_sensors, []).append(row)
+        for (one_control, sensors), rows in rows_by_control_and_sensors.items():
             result[rows] += self._log_densities_by_same_sensors(
                 observations[rows], one_control, sensors, result.shape[-1]
             )
@@ -424,7 +448,7 @@ class GaussianSensorModel(QuantityModel):
         Parameters
         ----------
         observation : (G,) array
-            SI; NaN where the sensor is lost.
+            The sensor values, SI; NaN where a sensor is lost.
         control_index : int
             The control in force.
         value : (E, S, G) array
@@ -450,7 +474,8 @@ class GaussianSensorModel(QuantityModel):
         point = (regression @ residual[..., None])[..., 0]  # (E, S, F)
         change = (interval @ point[..., None])[..., 0]  # (E, S, G)
 
-        # Without one sensor its residual is larger by one over (1 - leverage).
+        # Leave-one-out residual of a linear regression: the residual over (1 - leverage), where the
+        # leverage is the derivative of the fitted value by the observed one.
         leverage = np.einsum("sgf,sfg->sg", design, regression)
         one_minus_leverage = (1.0 - leverage).clip(LEAST_ONE_MINUS_LEVERAGE)
         residual_by_others = (distance - change) / one_minus_leverage
@@ -463,11 +488,14 @@ class GaussianSensorModel(QuantityModel):
         )
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
-        """Return the sensors that fit worst in the state that fits best, in standard deviations."""
+        """Return the residuals of the sensors that fit worst, in the state that fits best.
+
+        They are in standard deviations, by names such as "sensor 1".
+        """
         observation = np.asarray(observation)[: self.sensor_count]
         predicted = self.mean[:, control_index]
         deviation = self.total_standard_deviation[:, control_index]
-        with np.errstate(over="ignore"):  # an absurd observation is what this is for
+        with np.errstate(over="ignore"):  # absurd observations overflow
             residual = (observation - predicted) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
             best_state = int(np.argmin(distance.sum(axis=1)))
@@ -478,7 +506,7 @@ class GaussianSensorModel(QuantityModel):
         }
 
     def noise(self, joint: ArrayLike, _rows: Float | None = None) -> Float:
-        """Return the standard deviation (..., G) of sensors about their values under beliefs, SI.
+        """Return the standard deviation (..., G) of the noise of each sensor under beliefs, SI.
 
         It contains noise, model error and the change within the interval of the state.
 
@@ -494,17 +522,17 @@ class GaussianSensorModel(QuantityModel):
 
 
 def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequence[str]) -> None:
-    """Check that the noise of no sensor hides everything that the sensors of its unit can show.
+    """Refuse a noise that is larger than all values that the sensors of its unit can show.
 
-    Such a noise is a unit that was forgotten. The sensors of a unit are taken together, because a
-    single one may be insensitive to everything.
+    The cause is most likely a forgotten unit. All sensors of a unit are taken together, because a
+    single sensor may be insensitive to every state.
 
     Parameters
     ----------
     key : str
         The key of the noise in the scenario.
     deviation : float or (G,) array
-        Its standard deviation, SI.
+        The standard deviation of the noise, SI.
     predicted : (E, S, U, G) array
         The sensor values without noise, SI.
     units : sequence of str
@@ -513,7 +541,8 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
     Raises
     ------
     InvalidModelError
-        If it does; the message names the sensor, what it can show, and the likely unit.
+        If the noise of a sensor is that large; the message names the sensor, the range of values
+        that it can show, and the likely unit.
     """
     noise = np.broadcast_to(np.asarray(deviation, dtype=np.float64), len(units))
     lowest = predicted.min(axis=(0, 1, 2))

@@ -9,7 +9,7 @@ from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.planner import BeliefPolicy
 
 LIVES = 200
-"""Lives that are drawn for each twin."""
+"""Number of futures ("lives") that are simulated for each twin."""
 Decide = Callable[[Float, Float, int], Index]
 """Decides the controls (B,) of a step.
 
@@ -27,10 +27,10 @@ def simulated_returns(
 ) -> Float:
     """Return the discounted returns of B missions whose beliefs are exact: (B,).
 
-    A step counts its expected reward under the belief, which has the mean of the drawn reward and
-    varies less. A mission of a certain number has the same random numbers for every policy, and for
-    every problem of the same states, if the generator is the same. So returns of two policies
-    differ by less than either varies.
+    The reward of a step is its expectation under the belief: it has the same mean as the reward of
+    the drawn state, and a smaller variance. With an equal generator, mission number b has the same
+    random numbers for every policy, and for every problem of the same states (common random
+    numbers). So the difference of the returns of two policies varies less than either of them.
 
     Parameters
     ----------
@@ -53,32 +53,38 @@ def simulated_returns(
     belief = np.tile(problem.prior, (missions, 1))
     states = _draw_indices(belief, uniform_transition[steps])
     filtered = belief.copy()
-    total = np.zeros(missions)
-    weight = np.ones(missions)  # product of the discounts
+    returns = np.zeros(missions)
+    discount_product = np.ones(missions)
     for step in range(steps):
         control = decide(belief, filtered, step)
-        total += weight * np.einsum("bs,sb->b", belief, problem.reward[:, control])
-        weight *= problem.discount[control]
-        for one_control in np.unique(control).tolist():
-            rows = np.flatnonzero(control == one_control)
-            likelihood = problem.likelihood[one_control]
+        returns += discount_product * np.einsum("bs,sb->b", belief, problem.reward[:, control])
+        discount_product *= problem.discount[control]
+        for control_index in np.unique(control).tolist():
+            missions_with_control = np.flatnonzero(control == control_index)
+            likelihood = problem.likelihood[control_index]
             # Draw the next state, and the observation.
-            states_before = states[rows]
-            next_probability = _rows_of_states(problem, one_control, states_before)
-            states[rows] = _draw_indices(next_probability, uniform_transition[step, rows])
-            observed_states = states[rows] if problem.moves_first else states_before
+            states_before = states[missions_with_control]
+            next_probability = _rows_of_states(problem, control_index, states_before)
+            states[missions_with_control] = _draw_indices(
+                next_probability, uniform_transition[step, missions_with_control]
+            )
+            observed_states = (
+                states[missions_with_control] if problem.moves_first else states_before
+            )
             observation = _draw_indices(
-                likelihood[:, observed_states].T, uniform_observation[step, rows]
+                likelihood[:, observed_states].T, uniform_observation[step, missions_with_control]
             )
             # Correct the belief.
-            unnormalized = problem.next_beliefs(belief[rows], one_control, observation)
+            unnormalized = problem.next_beliefs(
+                belief[missions_with_control], control_index, observation
+            )
             if problem.moves_first:
                 unnormalized_filtered = unnormalized
             else:
-                unnormalized_filtered = belief[rows] * likelihood[observation]
-            filtered[rows] = _normalize(unnormalized_filtered)
-            belief[rows] = _normalize(unnormalized)
-    return total
+                unnormalized_filtered = belief[missions_with_control] * likelihood[observation]
+            filtered[missions_with_control] = _normalize(unnormalized_filtered)
+            belief[missions_with_control] = _normalize(unnormalized)
+    return returns
 
 
 def leaving_probability(
@@ -89,7 +95,9 @@ def leaving_probability(
     steps: int,
     generator: np.random.Generator,
 ) -> Float:
-    """Return the fraction of lives in which a policy leaves a control within some steps: (B,).
+    """Return the probability that a policy chooses another control within some steps: (B,).
+
+    It is estimated as a fraction of simulated futures ("lives") of each twin.
 
     Parameters
     ----------
@@ -100,7 +108,7 @@ def leaving_probability(
     belief : (B, S) array
         The belief of each twin before the first of the steps.
     control : int
-        The control in force until it is left.
+        The control in force until the policy chooses another one.
     steps : int
         The number of decisions; the first one is by `belief`.
     generator : numpy.random.Generator
@@ -109,24 +117,25 @@ def leaving_probability(
     fraction = np.empty(len(belief))
     uniform = generator.random((steps - 1, LIVES))
     for twin, twin_belief in enumerate(belief):
-        rows = np.tile(twin_belief, (LIVES, 1))
-        has_left = policy.decide(rows) != control
-        # All lives begin with the same belief: if the first decision leaves, all have left.
+        beliefs = np.tile(twin_belief, (LIVES, 1))
+        has_left = policy.decide(beliefs) != control
+        # All lives begin with the same belief, and so with the same first decision. If this is
+        # another control, no further step is needed.
         later_steps = uniform[:0] if has_left.all() else uniform
         for uniform_of_step in later_steps:
-            probability = rows @ problem.likelihood[control].T
+            probability = beliefs @ problem.likelihood[control].T
             observation = _draw_indices(probability, uniform_of_step)
-            rows = _normalize(problem.next_beliefs(rows, control, observation))
-            has_left |= policy.decide(rows) != control
+            beliefs = _normalize(problem.next_beliefs(beliefs, control, observation))
+            has_left |= policy.decide(beliefs) != control
         fraction[twin] = has_left.mean()
     return fraction
 
 
 def _rows_of_states(problem: DecisionProblem, control: int, states: Index) -> Float:
     """Return p(next state | state, control) for states (B,): (B, S)."""
-    distinct, position = np.unique(states, return_inverse=True)
-    rows = [problem.transition.row(control, state) for state in distinct.tolist()]
-    return np.array(rows)[position]
+    distinct, index_of_distinct = np.unique(states, return_inverse=True)
+    distributions = [problem.transition.row(control, state) for state in distinct.tolist()]
+    return np.array(distributions)[index_of_distinct]
 
 
 def _normalize(rows: Float) -> Float:

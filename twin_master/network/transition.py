@@ -29,7 +29,9 @@ NUMBER = 8
 TRANSITION_COPIES = 3
 """Copies of a joint table while it is built: of each control, of all of them, and the checked."""
 JOINT_NON_ZEROS = 512
-"""Non-zero transitions of a control up to which one table is used: it takes some microseconds."""
+"""Largest number of non-zero transitions of a control for which one joint table is used.
+
+With so few, a transition takes some microseconds."""
 
 
 def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
@@ -64,7 +66,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
 
 
 def _check_rows(matrix: Float, is_wrong: NDArray[np.bool_], name: str, fault: str) -> None:
-    """Refuse a matrix (..., n) of which some rows (...) are wrong, and name the first of them."""
+    """Refuse a matrix (..., n) if some of its rows (...) are wrong, and name the first of them."""
     if not np.any(is_wrong):
         return
     if matrix.ndim == 1:
@@ -99,7 +101,7 @@ def check_shape(
     *expected: int | str,
     error: type[TwinMasterError] = InvalidModelError,
 ) -> None:
-    """Refuse an array of another shape.
+    """Raise an error if the shape of an array is not the expected one.
 
     Parameters
     ----------
@@ -108,7 +110,7 @@ def check_shape(
     shape : tuple of int
         Its shape.
     *expected : int or str
-        The expected length of each axis; a word stands for any length.
+        The expected length of each axis; a word, such as "draws", stands for any length.
     error : type
         The error that is raised.
     """
@@ -132,19 +134,19 @@ def check_controls(index: int | Index, count: int) -> None:
 
 
 def check_fits(parts: Mapping[str, float], advice: str) -> None:
-    """Check that arrays fit in memory together.
+    """Raise an error if arrays together need more memory than is available.
 
     Parameters
     ----------
     parts : dict of str to float
         The size of each array [bytes], by a description in words.
     advice : str
-        What makes them smaller.
+        What the user can do to make them smaller, for the message.
 
     Raises
     ------
     InvalidModelError
-        If they do not fit; the message has all sizes.
+        If the arrays do not fit in memory; the message lists their sizes.
     """
     needed = sum(parts.values())
     available = available_memory()
@@ -162,21 +164,30 @@ def transition_bytes(states: int, controls: int) -> float:
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
-    """Return the predecessors of each level of blocks (U, L, L), one block after the other.
+    """Return the non-zero transitions of several blocks as sparse rows (the CSR format).
 
-    Unsigned indices spare the compiled loops the test for negative ones.
+    A row belongs to a block, a control and a level, and lists the levels from which that level is
+    reached in a step.
+
+    Parameters
+    ----------
+    blocks : sequence of (U, L, L) array
+        For each block p(next level | level) under each of U controls; the number L of levels may
+        differ from block to block.
     """
-    # One row for each control and level: the probabilities to come from each level.
-    rows = [block.transpose(0, 2, 1).reshape(-1, block.shape[1]) for block in blocks]
-    non_zero_counts = np.concatenate([np.count_nonzero(table, axis=1) for table in rows])
-    probability = np.concatenate([table[table != 0.0] for table in rows])
-    predecessor = np.concatenate([np.nonzero(table)[1] for table in rows])
-    first_row = np.cumsum([0, *map(len, rows)])[:-1]
-    start = np.cumsum([0, *non_zero_counts])
+    # Tables (U L, L) of each block: row (control, next level), column level.
+    tables = [block.transpose(0, 2, 1).reshape(-1, block.shape[1]) for block in blocks]
+    non_zero_counts = np.concatenate([np.count_nonzero(table, axis=1) for table in tables])
+    probability = np.concatenate([table[table != 0.0] for table in tables])
+    predecessor = np.concatenate([np.nonzero(table)[1] for table in tables])
+    # The rows of all blocks stand one after the other, and so do the entries of all rows.
+    first_row = np.cumsum([0, *map(len, tables)])[:-1]
+    first_entry = np.cumsum([0, *non_zero_counts])
+    # Indices are unsigned, so that the compiled loops need not test for negative ones.
     return PredecessorLists(
         levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
         first_row=first_row,
-        start=start.astype(np.uint64),
+        start=first_entry.astype(np.uint64),
         predecessor=predecessor.astype(np.uint64),
         probability=probability,
         log_probability=np.log(probability),
@@ -283,16 +294,16 @@ class TransitionModel:
 
     @cached_property
     def forward_lists(self) -> PredecessorLists:
-        """The predecessors of each level of each block."""
+        """The predecessors of each level of each block, to move a belief forward in time."""
         return predecessor_lists(self.blocks)
 
     @cached_property
     def backward_lists(self) -> PredecessorLists:
-        """The successors of each level of each block."""
+        """The successors of each level of each block, to move a value backward in time."""
         return predecessor_lists([block.transpose(0, 2, 1) for block in self.blocks])
 
     def row(self, control: int, state: int) -> Float:
-        """Return p(D_t | D_{t-1} = state, control): (S,)."""
+        """Return the distribution p(D_t | D_{t-1} = state, control) of the next state: (S,)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
         return _kronecker_product(
             block[control, level] for block, level in zip(self.blocks, levels, strict=True)
@@ -301,13 +312,14 @@ class TransitionModel:
     def rows(self, control: Index, state: Index) -> Float:
         """Return p(D_t | D_{t-1} = state, control) of N pairs of a control and a state: (N, S)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
-        result = np.ones((len(state), 1))
+        # Kronecker product over the blocks, for all N pairs at once.
+        probability = np.ones((len(state), 1))
         for block, level in zip(self.blocks, levels, strict=True):
-            next_level = block[control, level]
-            states = result.shape[1] * next_level.shape[1]
-            products = result[:, :, None] * next_level[:, None, :]
-            result = products.reshape(len(state), states)
-        return result
+            block_probability = block[control, level]
+            states = probability.shape[1] * block_probability.shape[1]
+            products = probability[:, :, None] * block_probability[:, None, :]
+            probability = products.reshape(len(state), states)
+        return probability
 
     def forward(self, control: int, belief: Float) -> Float:
         """Return beliefs (..., S) one step later, without logarithms."""
@@ -328,12 +340,15 @@ def _is_square(shape: tuple[int, ...]) -> bool:
 
 
 def _apply_along_axes(matrices: Sequence[Float], vectors: Float) -> Float:
-    """Apply a matrix (L, L) along each axis of joint states, and return vectors (..., S)."""
+    """Return vectors (..., S) with a matrix (L, L) applied along each axis of the joint state.
+
+    The joint state is in C order: the last axis varies fastest.
+    """
     shape = vectors.shape
-    inner = shape[-1]
+    inner_count = shape[-1]
     for matrix in matrices:
-        inner //= len(matrix)  # states behind one level of this axis
-        vectors = np.matmul(matrix, vectors.reshape(-1, len(matrix), inner)).ravel()
+        inner_count //= len(matrix)  # joint levels of the axes after this one
+        vectors = np.matmul(matrix, vectors.reshape(-1, len(matrix), inner_count)).ravel()
     return vectors.reshape(shape)
 
 

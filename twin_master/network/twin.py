@@ -1,6 +1,6 @@
 """The twin: it receives observations and the control in force, and decides on the next control.
 
-It never has the truth.
+It never receives the true state.
 """
 
 import re
@@ -40,7 +40,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
 _LARGEST_CARRIED = np.float64(1e150)
-"""Carried numbers are below this, so that numbers that follow from them are finite, too."""
+"""Upper bound of carried numbers: their squares are still finite."""
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DecisionBasis = Literal["filtered", "predicted"]
@@ -48,11 +48,13 @@ DecisionBasis = Literal["filtered", "predicted"]
 DEFAULT_LAG = 50
 """Steps back over which a twin smooths and which may be revised."""
 _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
-"""Former name of the arrays `steps` in saved states, also behind a prefix."""
+"""Pattern of the former name `turns` of arrays in saved states, with or without a prefix."""
 
 
 def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
-    """Return the transitions (levels, levels) of each factor under each control, with repairs.
+    """Return the transitions of each factor under each control, with the repairs by actions.
+
+    The result has a table (levels, levels) by the name of the control and that of the factor.
 
     Parameters
     ----------
@@ -140,14 +142,14 @@ class TwinStep(Estimate):
 
 @dataclass(frozen=True)
 class _KeptStep:
-    """A step that is kept.
+    """A step that the twin keeps, for smoothing and late observations.
 
     Attributes
     ----------
     observation : (G,) array
-        What was observed.
+        The observed values, SI; NaN where nothing was received.
     carried : Carried
-        What the estimator carries on from it.
+        The arrays that the estimator needs of the step.
     """
 
     observation: Float
@@ -183,12 +185,13 @@ class Twin:
     first_control : int or str
         The control of the first step, if none is given with it.
     estimator : Estimator, optional
-        Holds the belief in the place of the exact filter of model and sensor model.
+        The estimator of the belief; the exact filter of model and sensor model if left out.
     safest : int or str, optional
-        The control if no state is believed. If left out, the policy under the hypotheses that
-        believe in a state decides alone.
+        The control to take if no state explains the sensors. If left out, that case is ignored: the
+        policy decides by the belief alone.
     on_belief : BeliefPolicy, optional
-        Decides by p(D_{t+1} | o_0..o_t) in the place of `policy`, which then only predicts.
+        A policy that decides by p(D_{t+1} | o_0..o_t). If it is given, `policy` serves only to
+        predict.
 
     Raises
     ------
@@ -227,7 +230,8 @@ class Twin:
         self.decide_on = decide_on
         self._on_belief = on_belief
         self.lag = lag
-        # The present step, `lag` steps before it, and the step from which the first of these came.
+        # The present step, `lag` steps before it, and one more: to filter the first of these again,
+        # the arrays carried on from the step before it are needed.
         most_kept = None if lag is None else lag + 2
         self._kept_steps: deque[_KeptStep] = deque(maxlen=most_kept)
         self._steps = 0
@@ -291,7 +295,7 @@ class Twin:
     def revise(
         self, step: int, observation: ArrayLike, control: int | str | None = None
     ) -> TwinStep:
-        """Take in an observation that came late, and filter anew from its step on.
+        """Assimilate a late observation: filter again from its step to the last one.
 
         The result is that of a twin which had the observation in time, to the last bit, if the
         controls in force were the same.
@@ -306,9 +310,8 @@ class Twin:
         Returns
         -------
         TwinStep
-            What the twin now concludes in its last step, with the notices of all steps that were
-            filtered anew. Without these, what the late observation reveals about an earlier step
-            would never be reported.
+            The estimate and the decision in the last step, with the notices of all steps that were
+            filtered again: what a late observation reveals about an earlier step is reported too.
 
         Raises
         ------
@@ -338,17 +341,17 @@ class Twin:
         rows : sequence of (G,) array and int
             The observation and the control in force of each step.
         """
-        steps_before = first - self._first_in_memory
-        before = self._kept_steps[steps_before - 1].carried if steps_before else None
+        kept_before = first - self._first_in_memory
+        previous_carried = self._kept_steps[kept_before - 1].carried if kept_before else None
         new_steps: list[_KeptStep] = []
         notices: list[Notice] = []
         for step, (observation, control_index) in enumerate(rows, start=first):
-            estimate = self._estimate(before, observation, control_index, step)
-            before = estimate.carried
-            new_steps.append(_KeptStep(observation, before))
+            estimate = self._estimate(previous_carried, observation, control_index, step)
+            previous_carried = estimate.carried
+            new_steps.append(_KeptStep(observation, previous_carried))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
-        for _ in range(len(self._kept_steps) - steps_before):
+        for _ in range(len(self._kept_steps) - kept_before):
             self._kept_steps.pop()
         self._kept_steps.extend(new_steps)
         self._steps = first + len(rows)
@@ -370,13 +373,14 @@ class Twin:
     def smoothed(self) -> Float:
         """Return p(D_k | o_0..o_t) for the steps k = `first_kept`..t: (n, S).
 
-        The decision does not need it. After each step it would cost as much as all kept steps.
+        Smoothing takes a time proportional to the number of kept steps. So it is not done in every
+        step; the decision does not need it.
         """
         return self.estimator.smoothed(self.carried)
 
     @property
     def carried(self) -> tuple[Carried, ...]:
-        """What the estimator carried on from the steps `first_kept`..t."""
+        """The arrays that the estimator carried on from each of the steps `first_kept`..t."""
         return tuple(kept.carried for kept in self._smoothed_steps())
 
     def save_state(self) -> bytes:
@@ -386,8 +390,8 @@ class Twin:
     def settled(self) -> tuple[int, bytes] | None:
         """Return the last step that cannot be revised any more, and the state after it.
 
-        All later steps follow from that state, which `restore_state` takes. Before there is such a
-        step, None is returned.
+        All later steps follow from that state, which can be given to `restore_state`. If all steps
+        can still be revised, the result is None.
         """
         step = self.first_kept - 1
         if step < 0:
@@ -405,9 +409,9 @@ class Twin:
         return arrays_to_bytes(arrays)
 
     def restore_state(self, state: bytes) -> None:
-        """Go on from the saved state of a twin of the same model, sensors and estimator.
+        """Continue from the saved state of a twin of the same model, sensors and estimator.
 
-        The twin goes on to the last bit as the saved one would.
+        All later results equal those of the saved twin, to the last bit.
 
         Raises
         ------
@@ -472,7 +476,10 @@ class Twin:
         return int(control)
 
     def _decide(self, estimate: Estimate) -> TwinStep:
-        """Return an estimate with prediction and decision, and propose the next control."""
+        """Return an estimate with prediction and decision, and set the proposed control.
+
+        With the probability that no state explains the sensors, the safest control is taken.
+        """
         control_index = estimate.carried.control_index
         prediction = predict(
             self.model, estimate.filtered, control_index, self.policy, self.prediction_steps

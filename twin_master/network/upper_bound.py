@@ -1,8 +1,9 @@
-"""An upper bound of the return of a decision problem: values at beliefs, and at the corners.
+"""An upper bound of the return of a decision problem, from values at beliefs and at the corners.
 
-A corner is the belief that is certain of a state. With each control first the return is convex and
-of degree one in the belief. So a row of probabilities is worth at most the sum of the values of
-beliefs of which it is composed, each times its weight in the row (the sawtooth bound).
+A corner is the belief that is certain of a state. For each first control the best return is convex
+in the belief, and proportional to it if the row of probabilities is scaled. So if a row is a sum of
+beliefs, each times a weight, its return is at most the sum of their values times the weights (the
+sawtooth bound, Hauskrecht 2000).
 """
 
 from dataclasses import dataclass
@@ -16,13 +17,15 @@ from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.planner import value_iteration
 
 _MOST_PARTS = 4
-"""Beliefs of which a row is composed at most, beside the corners."""
+"""Largest number of beliefs of which a row is composed; the corners are not counted."""
 _ROUNDED_PROBABILITY = 0.15
-"""Smaller probabilities, relative to the largest, are left out of the beliefs that are composed."""
+"""Probabilities below this fraction of the largest are left out of a simplified belief."""
 _MOST_PRODUCTS = 1e9
-"""Products that are summed to compose all beliefs once, at most."""
+"""Largest number of products that are summed to compose all next beliefs once."""
 _MOST_KEPT_PARTS = 5e7
-"""Parts of compositions that are kept at most while the bound settles; each takes 50 bytes."""
+"""Largest number of parts of compositions that are kept while the bound settles.
+
+Each takes 50 bytes."""
 _PASSES = 6
 """How often beliefs are composed anew while the bound settles."""
 _SWEEPS = 15
@@ -48,7 +51,7 @@ class SparseBeliefs(NamedTuple):
 
 
 class Composition(NamedTuple):
-    """Of which beliefs rows (K, S) are composed, and the bound that follows.
+    """Rows (K, S) as sums of at most P beliefs and of corners, and the bound that follows.
 
     Attributes
     ----------
@@ -57,7 +60,7 @@ class Composition(NamedTuple):
     corner_bound : (K, U) array
         The bound by the corners alone, with each control first.
     chosen : (K, U, P) array
-        The beliefs that are taken out of each row, one after the other.
+        The indices of the beliefs that are subtracted from each row, one after the other.
     weight : (K, U, P) array
         The weight of each in the row; zero for parts that are not used.
     """
@@ -77,10 +80,11 @@ def _compose_rows(
     order: Index,
     composition: Composition,
 ) -> None:
-    """Compose rows of beliefs and corners, so that the bound at each row is low.
+    """Write rows as sums of beliefs and corners, so that the upper bound at each row is low.
 
-    Parts are taken out of a row greedily: each is the belief that lowers the bound most, with the
-    largest weight that fits into what remains of the row. The corners make up the rest.
+    Beliefs are subtracted from a row greedily: each time the belief that lowers the bound most,
+    with the largest weight for which no entry of the remainder is negative. The corners make up the
+    remainder.
 
     Parameters
     ----------
@@ -95,27 +99,28 @@ def _compose_rows(
     order : (J, U) array
         The beliefs in rising order of `drop`, for each control.
     composition : Composition
-        To be filled; `weight` is zero before.
+        The result, filled here; `weight` must be zero before the call.
     """
     start, state, probability = beliefs
     bound, corner_bound, chosen, weight = composition
     for row in range(len(rows)):
         corner_bound[row] = corner @ rows[row]
-        best = -np.inf
-        # The most promising control first: others end as soon as they fall below it.
+        largest_bound = -np.inf
+        # Begin with the control of the largest bound by the corners: the search for another control
+        # ends as soon as its bound falls below the best one.
         for control in np.argsort(-corner_bound[row]):
-            total = corner_bound[row, control]
+            control_bound = corner_bound[row, control]
             remaining = rows[row].copy()
             remaining_mass = rows[row].sum()
             for part in range(chosen.shape[2]):
-                if total <= best:
+                if control_bound <= largest_bound:
                     break
                 # The belief that lowers the bound most.
                 lowest = 0.0
                 lowest_weight = 0.0
                 for j in order[:, control]:
                     if remaining_mass * drop[j, control] >= lowest:
-                        break  # no later belief lowers it more
+                        break  # `order` is rising: no later belief lowers the bound more
                     largest_weight = remaining_mass
                     for i in range(start[j], start[j + 1]):
                         if largest_weight * drop[j, control] >= lowest:
@@ -128,21 +133,21 @@ def _compose_rows(
                         chosen[row, control, part] = j
                 if lowest_weight == 0.0:
                     break
-                # Take it out of the row.
+                # Subtract it from the row.
                 weight[row, control, part] = lowest_weight
                 j = chosen[row, control, part]
                 for i in range(start[j], start[j + 1]):
-                    rest = remaining[state[i]] - lowest_weight * probability[i]
-                    remaining[state[i]] = max(rest, 0.0)
-                total = total + lowest
+                    remainder = remaining[state[i]] - lowest_weight * probability[i]
+                    remaining[state[i]] = max(remainder, 0.0)
+                control_bound = control_bound + lowest
                 remaining_mass = remaining_mass - lowest_weight
-            best = max(best, total)
-        bound[row] = best
+            largest_bound = max(largest_bound, control_bound)
+        bound[row] = largest_bound
 
 
 @dataclass(frozen=True)
 class _NextRows:
-    """The compositions of all next beliefs of all beliefs, which sweeps go over.
+    """The compositions of all N next beliefs of the J beliefs, for sweeps of value iteration.
 
     Attributes
     ----------
@@ -153,9 +158,9 @@ class _NextRows:
     weight : (N, U, P) array
         Their weights.
     certain_probability : (N, C) array
-        The probability of each state that is among the beliefs as a corner.
+        The probability of each of the C states whose corner is one of the beliefs.
     first_row : (J U,) array
-        The first of the next beliefs of each belief under each control.
+        The index of the first next belief of each belief under each control.
     """
 
     corner_bound: Float
@@ -168,13 +173,13 @@ class _NextRows:
 class UpperBound:
     """Upper bound of the return at any belief.
 
-    It is known at some beliefs and at the corners, with each control first. The bound is the
-    largest over the controls.
+    For each first control it is known at some beliefs and at the corners. The bound at a belief is
+    the largest over the first controls.
 
     Parameters
     ----------
     problem : DecisionProblem
-        The problem; the bound begins with the return if the state were observed.
+        The problem. The first bound is the return of the problem whose state is observed.
     """
 
     def __init__(self, problem: DecisionProblem) -> None:
@@ -187,7 +192,7 @@ class UpperBound:
         self._update_lists()
 
     def _update_lists(self) -> None:
-        """List the beliefs without their zeros, the largest probability first."""
+        """Update the sparse form of the beliefs: without zeros, the largest probability first."""
         order = np.argsort(-self._beliefs, axis=1, kind="stable")
         count = np.count_nonzero(self._beliefs, axis=1)
         is_positive = np.arange(self._beliefs.shape[1]) < count[:, None]  # in sorted order
@@ -200,12 +205,12 @@ class UpperBound:
         self._update_drop()
 
     def _update_drop(self) -> None:
-        """Update how far the bound at each belief lies below that of the corners."""
+        """Update the difference of the bound at each belief from the bound by the corners alone."""
         self._drop = np.minimum(self._value - self._beliefs @ self._corner.T, 0.0)
         self._order = np.argsort(self._drop, axis=0)
 
     def _compose(self, rows: Float) -> Composition:
-        """Return of which beliefs rows (K, S) are composed."""
+        """Return rows (K, S) as sums of beliefs and corners, with the bounds that follow."""
         rows = np.ascontiguousarray(rows)
         shape = (len(rows), len(self._corner))
         composition = Composition(
@@ -224,19 +229,19 @@ class UpperBound:
         return self._compose(rows).bound
 
     def action_bound(self, belief: Float) -> Float:
-        """Return the bound at a belief (S,) with each control first (U,), one step ahead."""
+        """Return the bound at a belief (S,) for each first control, by one Bellman backup: (U,)."""
         problem = self._problem
-        later = [
+        bound_later = [
             self.bound_at(problem.next_beliefs(belief, control)).sum()
             for control in range(len(self._corner))
         ]
-        return np.asarray(belief @ problem.reward + problem.discount * later)
+        return np.asarray(belief @ problem.reward + problem.discount * bound_later)
 
     def improve_at(self, belief: Float) -> None:
-        """Improve the bound at a belief (S,) and at simpler beliefs near it.
+        """Improve the bound at a belief (S,), and at simpler beliefs if they are new.
 
-        These are the corners of its most probable states, and the belief without its improbable
-        states. Beliefs of few states fit into many others.
+        The simpler beliefs are the corners of its most probable states, and the belief without its
+        improbable states. A belief of few states is a component of many other beliefs.
         """
         rounded = np.where(belief < _ROUNDED_PROBABILITY * belief.max(), 0.0, belief)
         corner_count = min(_MOST_PARTS, np.count_nonzero(rounded))
@@ -253,26 +258,26 @@ class UpperBound:
         self._update_lists()
 
     def _index_of(self, belief: Float) -> Index:
-        """Return which of the beliefs (J,) is a given one, as truth values."""
+        """Return whether each of the J beliefs equals a given belief (S,): (J,) truth values."""
         return np.asarray(np.all(self._beliefs == belief, axis=1))
 
     def _add_belief(self, belief: Float) -> None:
-        """Add a belief with its bound; the lists are not updated."""
+        """Add a belief (S,) with its bound; the caller must call `_update_lists` afterwards."""
         self._beliefs = np.vstack((self._beliefs, belief))
         self._value = np.vstack((self._value, self.action_bound(belief)))
 
     def can_settle(self) -> bool:
-        """Return whether time and memory allow to compose all next beliefs of all beliefs."""
+        """Return whether `settle` takes an acceptable time and memory with the present beliefs."""
         beliefs, states = self._beliefs.shape
-        rows = beliefs * sum(len(table) for table in self._problem.likelihood)
-        rows_and_controls = rows * len(self._corner)
-        is_fast = rows_and_controls * states <= _MOST_PRODUCTS
-        return is_fast and rows_and_controls * _MOST_PARTS <= _MOST_KEPT_PARTS
+        next_beliefs = beliefs * sum(len(table) for table in self._problem.likelihood)
+        compositions = next_beliefs * len(self._corner)
+        is_fast = compositions * states <= _MOST_PRODUCTS
+        return is_fast and compositions * _MOST_PARTS <= _MOST_KEPT_PARTS
 
     def settle(self) -> None:
-        """Improve the bound at all beliefs at once, until improvements have reached all of them.
+        """Improve the bound at all beliefs by sweeps of value iteration with fixed compositions.
 
-        If there is too much to compose, the bound is left as it is.
+        If that takes too much time or memory (`can_settle`), the bound is not changed.
         """
         if not self.can_settle():
             return
@@ -283,23 +288,31 @@ class UpperBound:
         corner_states = np.argmax(self._beliefs[corner_beliefs], axis=1)
         reward = self._beliefs @ problem.reward
         for _ in range(_PASSES):
-            rows = self._compose_next_rows(corner_states)
+            next_rows = self._compose_next_rows(corner_states)
             for _ in range(_SWEEPS):
-                # Bound of all next beliefs, with the compositions as they are; then of all beliefs.
-                drop = self._drop.ravel()[rows.belief_and_control]
-                bound = rows.corner_bound + np.einsum("kup,kup->ku", rows.weight, drop)
-                later = np.add.reduceat(bound.max(axis=1), rows.first_row)
-                later = later.reshape(-1, controls)
-                self._value = np.minimum(self._value, reward + problem.discount * later)
-                # A belief at a corner is a bound of that corner, and so of rows that contain it.
+                # Bound at all next beliefs, with fixed compositions. Then a Bellman backup at all
+                # beliefs: sum over the next beliefs of each belief and control.
+                drop = self._drop.ravel()[next_rows.belief_and_control]
+                bound = next_rows.corner_bound + np.einsum("kup,kup->ku", next_rows.weight, drop)
+                bound_later = np.add.reduceat(bound.max(axis=1), next_rows.first_row)
+                bound_later = bound_later.reshape(-1, controls)
+                self._value = np.minimum(self._value, reward + problem.discount * bound_later)
+                # The value of a belief that is a corner also lowers the bound by the corners: that
+                # of a next belief in proportion to its probability of the corner's state.
                 corner_value = self._value[corner_beliefs].T
                 lowering = np.minimum(corner_value - self._corner[:, corner_states], 0.0)
                 self._corner[:, corner_states] += lowering
-                rows.corner_bound[:] += rows.certain_probability @ lowering.T
+                next_rows.corner_bound[:] += next_rows.certain_probability @ lowering.T
                 self._update_drop()
 
     def _compose_next_rows(self, corner_states: Index) -> _NextRows:
-        """Return compositions of all next beliefs; `corner_states` (C,) are known corners."""
+        """Return the compositions of all next beliefs of all beliefs.
+
+        Parameters
+        ----------
+        corner_states : (C,) array
+            The states whose corners are among the beliefs.
+        """
         controls = len(self._corner)
         compositions = []
         certain_probabilities = []
