@@ -116,7 +116,7 @@ def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
 def _add_flown_fleet(
     page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
 ) -> None:
-    """Add the sections of a fleet that is flown, given the records of its groups in `config.json`."""
+    """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
@@ -183,21 +183,21 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
     first_alarm = np.concatenate(
         [group["first_notice"].values[:, alarm_column] for group in groups]
     )
-    first_alarm_steps = first_alarm[first_alarm >= 0]
-    if not len(first_alarm_steps):
+    steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
+    if not len(steps):
         return ""
-    return f"{counted(len(first_alarm_steps), 'asset')} first_alarm_steps an alarm_column, first in {step_word} {min(first_alarm_steps)}."
+    return f"{counted(len(steps), 'asset')} raised an alarm, first in {step_word} {min(steps)}."
 
 
 def _fallback_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
     """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
     delay = np.concatenate([group["delay"].values for group in groups])
-    delays_when_called_for = delay[~np.isnan(delay)]
-    if not len(delays_when_called_for):
+    called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
+    if not len(called_for_delays):
         return ""
-    fraction_in_time = float(np.mean(delays_when_called_for <= WITHIN))
+    fraction_in_time = float(np.mean(called_for_delays <= WITHIN))
     return (
-        f"In {counted(len(delays_when_called_for), 'asset')} the damage called for another control; "
+        f"In {counted(len(called_for_delays), 'asset')} the damage called for another control; "
         f"the fallback came within {WITHIN} {step_word}s of it in {100 * fraction_in_time:.0f} %."
     )
 
@@ -277,7 +277,7 @@ def _add_lessons(page: Page, folder: Path) -> None:
 
 
 def _add_map(page: Page, standing: Standing, failed: int) -> None:
-    """Add the map of the health of a group's assets; assets that failed in flight are grey cells."""
+    """Add the map of the states of a group's assets; assets that failed in flight are grey."""
     if not standing.names:
         page.add_paragraph("Nothing is known of its assets yet.")
         return
