@@ -268,8 +268,8 @@ class _AssetPool(ExitStack):
     def open_stateless_assets(self) -> list[Asset]:
         """Return a stateless asset for each twin; empty if the assets have a memory.
 
-        Twins with equal assets share one object. Assets other than the reduced model are also taken
-        to have a memory if they differ between the twins.
+        Twins with equal assets share one object. The list is also empty if assets other than the
+        reduced model differ between the twins.
         """
         if self._kit.wing is not None:
             return self._open_models()

@@ -120,7 +120,8 @@ class WatchedAsset:
             for _step, notice in notices_since(watch, self.first_new_step):
                 if notice.kind == "alarm":
                     self.alarms.add(notice.sentence)
-            # Resuming a watch does not restore its last belief: compute it from the filter.
+            # A resumed watch has no filtered belief yet. The smoothed belief of its last step alone
+            # is the filtered one.
             last_carried = watch.twin.carried[-1:]
             watch.filtered = watch.twin.estimator.smoothed(last_carried)[0]
 

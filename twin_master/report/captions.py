@@ -79,7 +79,7 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
 
 
 def _decision_sentence(run: Run, now: int) -> str:
-    """Return the sentence on the control that the twin chose at the end of step `now`, a row."""
+    """Return the sentence on the control chosen at the end of the step in row `now`."""
     probability = run["filtered/decision_probability"][now]
     chosen_control = int(np.argmax(probability))
     if run.decides_on_prediction:

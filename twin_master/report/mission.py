@@ -62,8 +62,8 @@ class Course(NamedTuple):
 def default_now(run: Run) -> int:
     """Return the row of the step that is the present of the mission's figure by default.
 
-    It lies `_STEPS_BEFORE_CHANGE` steps before the flown control first changes, so that the figure
-    shows the prediction of this change. If the control never changes, or if fewer than
+    It lies `_STEPS_BEFORE_CHANGE` steps before the flown control first changes, so that this
+    change still lies ahead. If the control never changes, or if fewer than
     `_LEAST_PAST` steps would lie before the present, it lies two thirds into the mission.
     """
     change_rows = np.flatnonzero(np.diff(run.control_index)) + 1
@@ -96,7 +96,7 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
     if np.all(expected > 0.0):
         for sensitivity in _sensitivities(run, expected):
             order = np.argsort(-sensitivity, kind="stable")
-            # A sensor with a response below 1e-3 per unit of the factor shows nothing of it.
+            # A sensor whose relative change is below 1e-3 hardly depends on the factor.
             other_sensors = [int(sensor) for sensor in order if int(sensor) not in chosen]
             if other_sensors and sensitivity[other_sensors[0]] > 1e-3:
                 chosen.append(other_sensors[0])

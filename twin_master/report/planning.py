@@ -162,7 +162,7 @@ def _draw_information(
 def _draw_chosen_sensors(
     axes: Axes, positions: Float, chosen: Sequence[int], outlines: Sequence[Float]
 ) -> None:
-    """Draw sensors at positions (G, 2) [m] and outlines; chosen sensors have their ranks, from 1."""
+    """Draw sensors at positions (G, 2) [m] and outlines; chosen sensors have their ranks."""
     for outline in outlines:
         x, y = outline.T
         axes.fill(x, y, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)
