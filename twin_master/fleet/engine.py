@@ -33,7 +33,7 @@ ALLOWED_DEATHS = 2
 
 @dataclass(frozen=True)
 class Engine:
-    """The processes that fly a fleet.
+    """The processes in which the shards of a fleet are flown.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Engine:
 
     @property
     def needs_dask(self) -> bool:
-        """Whether other processes than this one fly."""
+        """Whether shards are flown by other processes, which Dask manages."""
         return self.workers > 0 or self.cluster is not None
 
 

@@ -80,7 +80,7 @@ def _evidence_at_points(
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
-    """Return why a fleet cannot learn the transitions of a scenario; empty if it can."""
+    """Return the reason why transitions of a scenario cannot be learnt; empty if they can."""
     if scenario.transition.kind != _LEARNABLE_KIND:
         return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
     count = len(_assumed_probabilities(scenario))
@@ -91,7 +91,7 @@ def reason_transitions_are_fixed(scenario: Scenario) -> str:
 
 
 class _Cause(NamedTuple):
-    """The control and the state factor to which a probability to worsen (of damage growth) belongs.
+    """The control and the state factor for which a probability to worsen holds.
 
     The factor is empty if the control has one probability for all factors.
     """

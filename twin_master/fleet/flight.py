@@ -47,7 +47,7 @@ _PACKED_KITS = 2
 
 @dataclass(frozen=True)
 class FleetOutcome:
-    """What the flight of a fleet has led to.
+    """Numbers of flown twins and shards, and the reasons of flights that ended early.
 
     Attributes
     ----------

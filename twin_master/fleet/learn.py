@@ -104,7 +104,7 @@ def learn_from_fleet(
 
 
 def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Return the record of what the store of a fleet teaches; see `learn_from_fleet`.
+    """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
 
     The prior of each probability is uniform; if there are several groups, it is a Beta
     distribution that they share.

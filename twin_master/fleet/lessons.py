@@ -19,7 +19,7 @@ HEADING = """\
 """
 
 Record = Mapping[str, Any]
-"""A part of the record of what was learnt; see `learn_from_fleet`."""
+"""A part of the record that `learn_from_fleet` returns."""
 
 
 def write_learnt(path: Path, folder: Path, record: Record) -> Path:
@@ -126,7 +126,7 @@ def _deviation_of_new_asset(population: Record) -> float:
 
 
 class LessonRow(NamedTuple):
-    """A row of the table of what was learnt.
+    """A row of the table of learnt quantities.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class LessonRow(NamedTuple):
 
 
 def lesson_rows(record: Record) -> list[LessonRow]:
-    """Return what was learnt as rows of a table."""
+    """Return the learnt quantities of all groups as rows of a table."""
     rows = []
     for name, group in record["groups"].items():
         first_row, *other_rows = _group_rows(group)
@@ -169,7 +169,7 @@ def _group_heading(name: str, group: Record) -> str:
 
 
 def _group_rows(group: Record) -> Iterator[LessonRow]:
-    """Yield what was learnt of a group: probabilities, noise, and population."""
+    """Yield the rows of a group: probabilities to worsen, noise, and moments of the population."""
     for control, probability in group["probability"].items():
         yield _probability_row(control, probability)
     if "transitions_kept_because" in group:

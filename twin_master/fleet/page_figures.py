@@ -27,7 +27,8 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
     scenario : Scenario
         The scenario with F factors of the state.
     mean : (B, F) array
-        The last mean states, in SI units; NaN if no state is believed.
+        The last mean states, in SI units; NaN if no state of the model explains the
+        observations of an asset.
     failed : int
         The number of assets that failed in flight.
     """

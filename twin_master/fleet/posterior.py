@@ -67,7 +67,7 @@ def logistic(log_odds: Float) -> Float:
 
 @dataclass(frozen=True)
 class Distribution:
-    """The distribution of a quantity on a grid.
+    """The distribution of a quantity: probabilities of equally spaced values of a coordinate.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class Distribution:
         }
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the ends of the central interval with a probability."""
+        """Return the ends of the central interval that has the given probability."""
         x, probability_of_x = self._interpolated
         # Half of the probability of a value lies below it.
         cumulative = np.cumsum(probability_of_x) - 0.5 * probability_of_x
@@ -143,8 +143,8 @@ class Distribution:
 def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
     """Find a grid that resolves a density, by narrowing the axes of a wide grid step by step.
 
-    A grid resolves a density if the spacing of each axis is small beside the standard deviation of
-    its marginal, and if at least a third of the points of each axis is relevant.
+    A grid resolves a density if the spacing of each axis is small compared with the standard
+    deviation of its marginal, and if at least a third of the points of each axis is relevant.
 
     Parameters
     ----------

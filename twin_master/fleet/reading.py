@@ -147,7 +147,7 @@ def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
 
 
 def notice_counts(group: "xr.Dataset", kind: str) -> Index:
-    """Return how many notices of a kind each twin of a group gave, a (B,) array."""
+    """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
     return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
@@ -170,7 +170,7 @@ def last_steps(group: "xr.Dataset") -> Index:
 
 
 def severity(scenario: Scenario, mean: ArrayLike) -> Float:
-    """Return how severely assets are damaged, so that they can be ranked.
+    """Return the severity of the damage of assets, a dimensionless number for ranking them.
 
     Each factor of the state counts by its position between its lowest level (0) and its highest
     level (1); the severity is the sum over the factors.
@@ -358,7 +358,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
 
 
 def _counts_of_twins(group: "xr.Dataset") -> dict[str, Estimated | int]:
-    """Return how many twins flew, failed, ended early, and gave which notices."""
+    """Return the numbers of twins that flew, failed, ended early, or gave notices, by title."""
     status = group["status"].values
     figures: dict[str, Estimated | int] = {
         "twins": len(status),

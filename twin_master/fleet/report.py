@@ -204,10 +204,10 @@ def _fallback_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
 
 def _damage_sentence(standings: Sequence[Standing]) -> str:
     """Return the most severely damaged asset and its state; empty if no state is estimated."""
-    believed = [standing for standing in standings if standing.most_damaged is not None]
-    if not believed:
+    standings_with_state = [standing for standing in standings if standing.most_damaged is not None]
+    if not standings_with_state:
         return ""
-    worst_group = max(believed, key=lambda standing: np.nanmax(standing.severity))
+    worst_group = max(standings_with_state, key=lambda standing: np.nanmax(standing.severity))
     number = worst_group.most_damaged
     assert number is not None
     states = []
@@ -303,7 +303,7 @@ class _AttentionTable(NamedTuple):
 
 
 def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> None:
-    """Add the table of the assets of a group that need attention next."""
+    """Add the table of the assets that need attention first, of at most `most_assets` rows."""
     if not standing.names:
         return
     order = _attention_order(standing)[:most_assets]

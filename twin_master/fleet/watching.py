@@ -70,7 +70,7 @@ def _do_nothing() -> None:
 
 
 class FleetWatch:
-    """A fleet under watch by this process.
+    """The watch of a fleet of real assets by this process.
 
     Parameters
     ----------
@@ -301,7 +301,10 @@ class FleetWatch:
         return asset
 
     def _hand_on(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
-        """Hand a decision on to the operator and to the source of the observations."""
+        """Send a decision to the operator and to the feed of the asset, and record its alarms.
+
+        A notice between two steps, which has no control, does not replace the last decision.
+        """
         if "control" in decision:
             asset.decision = decision
         self._tell(asset, decision)

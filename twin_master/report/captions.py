@@ -39,7 +39,7 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
     run : Run
         The run of T steps.
     figure : Figure
-        The figure, which shows what the twin knows and predicts at the present step.
+        The figure, with the twin's estimates and predictions at the present step.
     now : int
         The row of the present step in the run's arrays, from 0 to T - 1. Its printed number is
         larger by the number of the run's first step.

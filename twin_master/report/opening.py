@@ -194,9 +194,9 @@ def _belief_sentence(run: Run) -> str:
 
 
 def _decided_by(run: Run) -> str:
-    """Return what decided the last control according to the run's summary; "model" if it has none.
+    """Return what decided on the last control according to the run's summary.
 
-    It is something else while an alarm overrides the model.
+    This is "model" unless an alarm overrides the model.
     """
     for figure in run.summary.get("figures", ()):
         if figure["key"] == "decided_by":
