@@ -303,7 +303,7 @@ class FleetWatch:
     def _hand_on(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
         """Send a decision to the operator and to the feed of the asset, and record its alarms.
 
-        A notice between two steps, which has no control, does not replace the last decision.
+        A notice before the first step has no control, and is not kept as the last decision.
         """
         if "control" in decision:
             asset.decision = decision

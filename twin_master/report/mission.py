@@ -63,8 +63,8 @@ def default_now(run: Run) -> int:
     """Return the row of the step that is the present of the mission's figure by default.
 
     It lies `_STEPS_BEFORE_CHANGE` steps before the flown control first changes, so that this
-    change still lies ahead. If the control never changes, or if fewer than `_LEAST_PAST` steps would
-    lie before the present, it lies two thirds into the mission.
+    change still lies ahead. If the control never changes, or if fewer than `_LEAST_PAST` steps
+    would lie before the present, it lies two thirds into the mission.
     """
     change_rows = np.flatnonzero(np.diff(run.control_index)) + 1
     if len(change_rows) and change_rows[0] >= _STEPS_BEFORE_CHANGE + _LEAST_PAST:
