@@ -1,4 +1,4 @@
-"""Checks of a fleet before its first twin flies; what flies in a fleet."""
+"""Checks of a fleet before its first twin flies, and the sources of its assets."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,9 +19,9 @@ _ROUNDING = 1e-12
 
 
 def flies_model(scenario: Scenario) -> bool:
-    """Return whether the reduced model of a wing is flown itself, without an FMU packed from it.
+    """Return whether the asset is simulated by the twin's reduced model, without an FMU.
 
-    This is so if the asset and the belief are of one design.
+    This is possible if the asset and the twin's model are of the same wing design.
     """
     asset = scenario.asset
     belief = scenario.belief
@@ -31,14 +31,14 @@ def flies_model(scenario: Scenario) -> bool:
 
 
 def source_of(scenario: Scenario, *, is_real: bool = False) -> AssetSource:
-    """Return the source of what flies in a fleet, and of what its twins believe.
+    """Return the source of the assets of a fleet and of the model that its twins use.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
     is_real : bool
-        Whether the assets are real, so that only the twins' belief is needed.
+        Whether the assets are real, so that only the twins' model is needed.
     """
     if is_real or flies_model(scenario):
         return believed_source(scenario)
@@ -46,7 +46,7 @@ def source_of(scenario: Scenario, *, is_real: bool = False) -> AssetSource:
 
 
 def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
-    """Return a scenario whose asset has these true parameters beside its other ones."""
+    """Return a scenario with true parameters of the asset [SI] added, or replaced by name."""
     if not parameters:
         return scenario
     return scenario.with_changes(
@@ -60,7 +60,7 @@ def check_fleet(fleet: Fleet) -> None:
     Raises
     ------
     FleetError
-        If any asset cannot fly; the sentence lists all such assets and the reasons.
+        If any asset cannot fly; the message lists all such assets and the reasons.
     """
     objections = []
     for group in fleet.groups:
@@ -107,7 +107,7 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
     Raises
     ------
     FleetError
-        If it cannot.
+        If the scenario cannot be flown in a fleet; the message says why.
     """
     if scenario.observation.role == "modes":
         raise FleetError(
@@ -136,7 +136,13 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
 
 
 def _check_recordings(group: Group) -> None:
-    """Check that a group of real assets has recordings, each with a name of its own."""
+    """Check that a group of real assets has recordings, and that no two have the same name.
+
+    Raises
+    ------
+    FleetError
+        If there is no recording, or if two recordings have the same name.
+    """
     names = {member.name for member in group.members}
     if not names:
         raise FleetError(
@@ -148,7 +154,13 @@ def _check_recordings(group: Group) -> None:
 
 
 def _check_true_parameters(group: Group, scenario: Scenario) -> None:
-    """Check that the reduced model of a wing holds at the true parameter of every asset."""
+    """Check that every asset's true factor on Young's modulus is in the reduced model's range.
+
+    Raises
+    ------
+    FleetError
+        If the factor of any asset is outside of this range.
+    """
     from fe.wing.design import wing_structure
 
     usual_value = scenario.asset.true_parameters.get(_WING_PARAMETER, 1.0)

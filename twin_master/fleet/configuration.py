@@ -19,7 +19,7 @@ KIND = "uav-twin fleet"
 WATCHED_KIND = "uav-twin fleet watch"
 """The kind in the configuration of a fleet that is watched."""
 GROUPS = "groups"
-"""The folder of what the twins of each group know."""
+"""The folder with the prepared knowledge of the twins of each group: model, policy and draws."""
 
 _SCENARIOS = "fleet.groups.scenarios"
 PRESENT_NAMES = {
@@ -52,7 +52,7 @@ def locked_fleet_folder(
     kind : str
         `KIND` or `WATCHED_KIND`.
     record : mapping
-        The fleet, as the configuration keeps it.
+        The record of the fleet for `config.json`.
     replace_old : bool
         Whether another fleet in the folder is removed.
     check : callable
@@ -117,5 +117,5 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
 
 
 def group_folder(folder: Path, group: Group, scenario_number: int) -> Path:
-    """Return the folder of what the twins of a group know that fly one of its scenarios."""
+    """Return the folder with the prepared knowledge of a group's twins for one of its scenarios."""
     return folder / GROUPS / group.name / str(scenario_number)

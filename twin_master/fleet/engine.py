@@ -1,4 +1,4 @@
-"""Who flies the shards of a fleet: this process, worker processes of this machine, or a cluster.
+"""Distribution of the shards of a fleet: to this process, to local workers, or to a Dask cluster.
 
 Results of workers come back in any order.
 """
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 WAITING_PER_CORE = 2
-"""Shards that wait at each core beside the one that it flies; the others wait here."""
+"""Number of shards that wait at each core of the workers; the others wait in this process."""
 CONNECTING = 10.0
-"""Time in which a scheduler must answer [s]."""
+"""Longest time that a scheduler may take to answer [s]."""
 ALLOWED_DEATHS = 2
-"""Number of workers that may die over a shard before its twins fly one by one."""
+"""Number of workers that may die while they fly a shard before its twins are flown one by one."""
 
 
 @dataclass(frozen=True)
 class Engine:
-    """The processes that fly a fleet.
+    """The processes in which the shards of a fleet are flown.
 
     Attributes
     ----------
@@ -48,12 +48,14 @@ class Engine:
 
     @property
     def needs_dask(self) -> bool:
-        """Whether other processes than this one fly."""
+        """Whether shards are flown by other processes, which Dask manages."""
         return self.workers > 0 or self.cluster is not None
 
 
 class Piece(NamedTuple):
-    """A shard, or one twin of a shard that has cost a worker its life.
+    """The twins that are sent to a worker together: a shard, or one twin of it.
+
+    The twins of a shard are sent one by one if workers died while they flew the shard.
 
     Attributes
     ----------
@@ -78,14 +80,14 @@ class FlownPiece(NamedTuple):
 
 
 def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[FlownPiece]:
-    """Fly pieces, and yield each with its result once it is done.
+    """Fly pieces with the processes of an engine, and yield each with its result once it is done.
 
     Parameters
     ----------
     engine : Engine
         The processes that fly.
     pieces : iterator of Piece
-        The pieces; they are taken as they are needed.
+        The pieces; the next one is taken from the iterator when a worker is free for it.
     progress : Progress
         Shows the address of the dashboard of workers.
 
@@ -106,8 +108,8 @@ def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> I
 def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[FlownPiece]:
     """Fly pieces by workers.
 
-    The twins of a piece over which workers died are flown one by one, and the one over which a
-    worker dies again has failed.
+    If more than `ALLOWED_DEATHS` workers died while they flew a piece, its twins are flown one by
+    one. A single twin for which this happens again is returned as failed.
     """
     from distributed import CancelledError, as_completed
     from distributed.scheduler import KilledWorker
@@ -150,7 +152,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
 
 @cache
 def program_version() -> str:
-    """Return a hash of this program and of the packages on which its numbers depend."""
+    """Return a hash of this program, of Python and of the packages on which results depend."""
     provenance = collect_provenance().as_dict()
     python = list(sys.version_info[:2])
     return hash_record([provenance["versions"], provenance["source_hashes"], python])
@@ -162,7 +164,7 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
     Raises
     ------
     FleetError
-        If it runs another version.
+        If the worker runs another version.
     """
     if version != program_version():
         raise FleetError(
@@ -175,7 +177,7 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
 
 @contextmanager
 def _connected_client(engine: Engine) -> "Iterator[Client]":
-    """Return a context with a client of the cluster, or of workers that live as long as it."""
+    """Return a context with a client of the cluster, or of local workers that end with it."""
     import dask
 
     # Importing `distributed` adds its defaults to the configuration. That must happen before the
@@ -249,8 +251,8 @@ def _local_client(workers: int) -> "Iterator[Client]":
 def _hidden_main_module() -> Iterator[None]:
     """Return a context in which new processes do not run the caller's script again.
 
-    `multiprocessing` would have them do so, at the start and whenever a worker that died is
-    replaced.
+    `multiprocessing` imports the main module of its parent in each new process, both at the start
+    and when it replaces a worker that died. An empty module in its place prevents this.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

@@ -1,8 +1,8 @@
-"""The log evidence of each twin's observations, as a function of what a fleet can learn.
+"""The log evidence of each twin's observations, as a function of the quantities to be learnt.
 
 Twins are independent given the quantities that they share. The log evidence of a fleet is therefore
-the sum of theirs: exact, in any order, shard by shard. The controls that the twins chose take no
-part, because they were chosen from past observations alone.
+exactly the sum over its twins. The probability of the chosen controls is not a factor of the
+evidence, because they depend on past observations alone.
 """
 
 from collections.abc import Mapping
@@ -32,10 +32,11 @@ def _evidence_at_points(
     likelihood: Float,
     result: Float,
 ) -> None:
-    """Fill `result` with the log evidence of B twins for the transitions at each of P points.
+    """Fill `result` with the log evidence of B twins in T steps for P transition models.
 
-    This is the normalised forward pass of a hidden Markov model: each step predicts the belief,
-    weighs it with the likelihood, adds the logarithm of its sum, and normalises it.
+    This is the normalised forward pass of a hidden Markov model with S joint states. In each step
+    the belief is propagated through the transition, multiplied by the likelihood, and divided by
+    its sum; the log evidence is the sum of the logarithms of these sums.
 
     Parameters
     ----------
@@ -44,41 +45,42 @@ def _evidence_at_points(
     lists : PredecessorLists
         The predecessors of the levels of each factor; their probabilities are not used.
     probability : (P, non-zeros) array
-        The probabilities of the transitions in the lists at each point.
+        The probabilities of the entries of the lists, for each of the P models.
     control : (B, T) array
         The control in force in each step.
     likelihood : (B, T, S) array
-        The likelihood of the states, scaled so that the largest of each step is 1.
+        The likelihood of the states in each step, divided by its largest value.
     result : (B, P) array
         The log evidence; -inf if the observations are impossible.
     """
-    twins, steps, size = likelihood.shape
+    twins, steps, state_count = likelihood.shape
     levels, first_row, start, source, _, _ = lists
-    belief = np.empty(size)
-    work = np.empty(size)
+    belief = np.empty(state_count)
+    work = np.empty(state_count)
     for twin in range(twins):
         for point in range(len(probability)):
-            # The loop takes no logarithms, so that the place of theirs can hold anything.
+            # `apply_blocks` does not read the last field, the log probabilities, so that the
+            # probabilities can be passed in its place.
             point_lists = levels, first_row, start, source, probability[point], probability[point]
             belief[:] = prior
             result[twin, point] = 0.0
             for t in range(steps):
                 if t > 0:
                     apply_blocks(point_lists, control[twin, t - 1], belief, belief, work)
-                total = 0.0
-                for state in range(size):
+                predictive_probability = 0.0
+                for state in range(state_count):
                     belief[state] *= likelihood[twin, t, state]
-                    total += belief[state]
-                if total <= 0.0:
+                    predictive_probability += belief[state]
+                if predictive_probability <= 0.0:
                     result[twin, point] = -np.inf
                     break
-                result[twin, point] += np.log(total)
-                for state in range(size):
-                    belief[state] /= total
+                result[twin, point] += np.log(predictive_probability)
+                for state in range(state_count):
+                    belief[state] /= predictive_probability
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
-    """Return why a fleet cannot learn the transitions of a scenario; empty if it can."""
+    """Return the reason why transitions of a scenario cannot be learnt; empty if they can."""
     if scenario.transition.kind != _LEARNABLE_KIND:
         return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
     count = len(_assumed_probabilities(scenario))
@@ -89,9 +91,9 @@ def reason_transitions_are_fixed(scenario: Scenario) -> str:
 
 
 class _Cause(NamedTuple):
-    """The control and the factor of the state to which a probability to worsen belongs.
+    """The control and the state factor for which a probability to worsen holds.
 
-    The factor is empty if the probability holds for all factors.
+    The factor is empty if the control has one probability for all factors.
     """
 
     control: str
@@ -99,7 +101,7 @@ class _Cause(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of the probability in records and files."""
+        """The name of the probability in records and files: "CONTROL" or "CONTROL, FACTOR"."""
         return f"{self.control}, {self.factor}" if self.factor else self.control
 
 
@@ -127,10 +129,11 @@ def _predecessors(scenario: Scenario) -> PredecessorLists:
 
 @dataclass(frozen=True)
 class TransitionFamily:
-    """The transitions of a scenario as a linear function of K probabilities to worsen.
+    """The transition probabilities of a scenario as a function of K probabilities to worsen.
 
-    Each entry of the lists of predecessors depends on one of the probabilities. K is 0 if the
-    transitions stay as the scenario assumes them.
+    A probability to worsen is the probability that a factor of the state moves to its next level in
+    a step. Each entry of the lists of predecessors is a linear function of one of them. K is 0 if
+    the transitions are not learnt.
 
     Attributes
     ----------
@@ -145,7 +148,7 @@ class TransitionFamily:
     entries_at_zero, entries_at_one : (non-zeros,) array
         The entries of the lists if their probability to worsen is 0, and if it is 1.
     prior : (S,) array
-        The belief p(D_0) before the first step.
+        The belief p(D_0) over the S joint states before the first step.
     reason_fixed : str
         Why the transitions are not learnt; empty if they are.
     """
@@ -161,7 +164,7 @@ class TransitionFamily:
 
     @classmethod
     def fixed(cls, scenario: Scenario, reason: str) -> "TransitionFamily":
-        """Return the transitions of a scenario that are not learnt, for a reason."""
+        """Return the constant transitions of a scenario, with the reason why none is learnt."""
         lists = _predecessors(scenario)
         entries = lists.probability
         return cls(
@@ -179,8 +182,8 @@ class TransitionFamily:
     def learnable(cls, scenario: Scenario) -> "TransitionFamily":
         """Return the transitions of a scenario of the kind `independent_worsening`."""
         probabilities = _assumed_probabilities(scenario)
-        # Entries are linear in their probability, so that two values of it give all others. At
-        # 0 and 1 themselves some entries would vanish from the lists.
+        # Each entry is linear in its probability p, so that its values at p = 1/4 and 3/4 determine
+        # it: slope = difference / (1/2). At p = 0 or 1 zero entries would be left out of the lists.
         lists = _predecessors_at(scenario, 0.25)
         entries = lists.probability
         slope = 2.0 * (_predecessors_at(scenario, 0.75).probability - entries)
@@ -195,7 +198,7 @@ class TransitionFamily:
         )
 
     def entries(self, points: Float) -> Float:
-        """Return the entries of the lists at points (P, K), a (P, non-zeros) array."""
+        """Return the entries of the lists, (P, non-zeros), for P values of K probabilities."""
         if not self.names:
             return np.tile(self.entries_at_zero, (len(points), 1))
         probability = points.take(self.parameter_index, axis=1)
@@ -205,14 +208,14 @@ class TransitionFamily:
 
 
 def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists:
-    """Return the predecessors of a scenario in which all probabilities to worsen are equal."""
+    """Return the predecessor lists of a scenario with this value of all probabilities to worsen."""
     equal = {"probability": dict.fromkeys(scenario.control_names, probability)}
     transition = scenario.transition.model_copy(update=equal)
     return _predecessors(scenario.model_copy(update={"transition": transition}))
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return the index of the probability on which each entry of lists depends, (non-zeros,).
+    """Return for each entry of the lists the index of its probability to worsen, (non-zeros,).
 
     Rows of the lists are ordered by factor, then by control, then by level.
     """
@@ -234,9 +237,9 @@ class ScaledLikelihood(NamedTuple):
     Attributes
     ----------
     values : (B, T, S) array
-        p(o_t | D_t, u_t), scaled so that the largest of each step is 1.
+        p(o_t | D_t, u_t) divided by its largest value over the S states, for each step t.
     log_scale : (B,) array
-        The logarithm of the product of the scales of all steps.
+        The sum over the steps of the logarithms of these largest values.
     """
 
     values: Float
@@ -246,7 +249,7 @@ class ScaledLikelihood(NamedTuple):
 def scaled_likelihood(
     model: GaussianSensorModel, observed: Float, control: Index
 ) -> ScaledLikelihood:
-    """Return the likelihood of the states given the observations of B twins.
+    """Return the likelihood of each state in each step, given the observations of B twins.
 
     Parameters
     ----------
@@ -264,7 +267,7 @@ def scaled_likelihood(
 
 
 def _scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return a likelihood scaled by its largest value in each step, from logarithms (B, T, S)."""
+    """Return the likelihood divided by its largest value in each step, from its log (B, T, S)."""
     largest = log_likelihood.max(axis=2, keepdims=True)
     return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
 
@@ -272,7 +275,9 @@ def _scaled(log_likelihood: Float) -> ScaledLikelihood:
 def transition_evidence(
     family: TransitionFamily, points: Float, likelihood: Float, control: Index
 ) -> Float:
-    """Return the log evidence of B twins at P points, up to a constant of each twin.
+    """Return the log evidence of B twins for P values of the probabilities to worsen.
+
+    A constant of each twin is missing: the `log_scale` of its likelihood.
 
     Parameters
     ----------
@@ -303,7 +308,9 @@ def parameter_evidence(
     observed: Float,
     control: Index,
 ) -> Float:
-    """Return the log evidence of B twins at E values of a parameter that is constant in time.
+    """Return the log evidence of B twins for E values of a parameter that is constant in time.
+
+    For each value the likelihood of all steps is computed with this value.
 
     Parameters
     ----------
@@ -326,8 +333,9 @@ def parameter_evidence(
     result = np.empty((len(control), model.draw_count))
     for twin in range(len(control)):
         log_density = model.log_density_of_draws(observed[twin], control[twin])  # (T, S, E)
-        draws_first = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
-        likelihood = _scaled(draws_first)
+        log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
+        # The E values take the place of twins: all have the same controls.
+        likelihood = _scaled(log_density_by_draw)
         control_of_draws = np.tile(control[twin], (model.draw_count, 1))
         evidence = transition_evidence(
             family, probability[None], likelihood.values, control_of_draws

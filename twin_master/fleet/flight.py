@@ -1,4 +1,7 @@
-"""The flight of a fleet into its store: shard by shard, and on from where it stopped."""
+"""The flight of a fleet, whose results go into its store shard by shard.
+
+A flight that was interrupted is continued with the first shard that is not in the store.
+"""
 
 import pickle
 import time
@@ -39,12 +42,12 @@ if TYPE_CHECKING:
 RESULT_NAME = "fleet.json"
 """The file in the folder of a fleet that says how its flight ended."""
 _PACKED_KITS = 2
-"""Number of packed kits that are kept in memory."""
+"""Number of packed kits (scenario, prepared folder and model) that are kept in memory."""
 
 
 @dataclass(frozen=True)
 class FleetOutcome:
-    """A flown fleet.
+    """Numbers of flown twins and shards, and the reasons of flights that ended early.
 
     Attributes
     ----------
@@ -53,13 +56,14 @@ class FleetOutcome:
     twins : int
         The number of twins.
     failures : dict of str to str
-        Why the flight of each twin that failed ended, by group and name.
+        The error that ended the flight of each twin that failed, by GROUP/NAME.
     ended : dict of str to str
-        How each asset ended that ended its simulation early; what it has flown counts.
+        The reason of each asset that ended its simulation early, by GROUP/NAME; its flown steps are
+        in the store.
     seconds : float
         The wall-clock time of this call [s].
     shards_flown, shards_kept : int
-        How many shards this call flew, and how many had been flown before.
+        The number of shards that this call flew, and of those that an earlier call had flown.
     """
 
     folder: Path
@@ -79,7 +83,7 @@ def fly_fleet(
     replace_old: bool = False,
     progress: Progress | None = None,
 ) -> FleetOutcome:
-    """Fly a fleet, or what is still to be flown of it.
+    """Fly all twins of a fleet that are not in its store yet.
 
     Parameters
     ----------
@@ -103,14 +107,16 @@ def fly_fleet(
     Raises
     ------
     FleetError
-        If an asset cannot fly: the sentence lists all such assets, and nothing was begun. If the
-        cluster cannot be used: what was flown is kept. If the extra `fleet` is not installed.
+        If an asset cannot fly: the message lists all such assets, and no twin has flown. If the
+        cluster cannot be used: shards that were flown stay in the store. If the extra `fleet` is
+        not installed.
     RunFolderError
         If the folder holds something else.
     NotResumableError
         If the fleet was begun with another version of the program.
     FileNotWrittenError
-        If the disk is full or the folder cannot be written; what was flown is kept.
+        If the disk is full or the folder cannot be written; shards that were flown stay in the
+        store.
     """
     start = time.perf_counter()
     fleet = fleet if isinstance(fleet, Fleet) else load_fleet(fleet)
@@ -143,7 +149,7 @@ def fly_fleet(
 
 
 def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
-    """Tell the user of which groups no transitions can be learnt, and why."""
+    """Tell the user for which groups `fleet learn` cannot learn transitions, and why."""
     for group in fleet.groups:
         reason = reason_transitions_are_fixed(group.scenarios[0])
         if reason:
@@ -153,14 +159,14 @@ def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
 
 
 class Endings(NamedTuple):
-    """How flights ended before the mission was over, each by group and name of the twin.
+    """Reasons of flights that ended before the end of the mission, by GROUP/NAME of the twin.
 
     Attributes
     ----------
     failures : dict of str to str
-        Why flights failed.
+        The errors of flights that failed.
     ended : dict of str to str
-        How assets ended their simulations early.
+        The reasons of assets that ended their simulations early.
     """
 
     failures: dict[str, str]
@@ -168,9 +174,9 @@ class Endings(NamedTuple):
 
 
 def endings_of(folder: Path) -> Endings:
-    """Return how flights of a fleet ended early.
+    """Return the reasons of flights of a fleet that ended early.
 
-    They come from the journal or, if there is none, from the result of the whole flight.
+    They are read from the journal or, if the folder has no journal, from `fleet.json`.
     """
     journal = folder / JOURNAL_NAME
     result = folder / RESULT_NAME
@@ -187,21 +193,24 @@ def endings_of(folder: Path) -> Endings:
 
 
 def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> bytes:
-    """Prepare a scenario in a folder, and return the packed kit with which it is flown.
+    """Prepare the twins' knowledge of a scenario in a folder, and pack all that a flight needs.
+
+    Knowledge that the folder holds already is not computed again.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario.
     folder : Path
-        The folder of what the twins know.
+        The folder of the prepared knowledge; files are written to it.
     is_real : bool
-        Whether the assets are real, so that nothing but their twins flies.
+        Whether the assets are real, so that no asset is simulated.
 
     Returns
     -------
     bytes
-        The pickled parts of a `Kit`.
+        The pickled content of a `Kit`: the scenario, the files of the folder, and the reduced
+        model if it simulates the asset, else None.
     """
     located = scenario.portable().with_paths_from(folder)
     write_members(folder, source_of(scenario, is_real=is_real).files())
@@ -217,7 +226,7 @@ def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> b
 
 
 class Shard(NamedTuple):
-    """Twins of one group that are flown in one piece.
+    """Twins of one group that one process flies together.
 
     Attributes
     ----------
@@ -232,7 +241,10 @@ class Shard(NamedTuple):
 
 
 def _shards(fleet: Fleet) -> Iterator[Shard]:
-    """Yield all shards of a fleet in their order."""
+    """Yield the shards of a fleet in the order of its groups and of their members.
+
+    If the members have different scenarios, each is a shard of its own.
+    """
     for number, group in enumerate(fleet.groups):
         size = fleet.head.shard if len(group.scenarios) == 1 else 1
         for first in range(0, len(group.members), size):
@@ -240,7 +252,7 @@ def _shards(fleet: Fleet) -> Iterator[Shard]:
 
 
 class _ShardCounts(NamedTuple):
-    """How many shards were flown now, and how many had been flown before."""
+    """Numbers of shards that this call flew, and of those that an earlier call had flown."""
 
     flown: int
     kept: int
@@ -256,7 +268,7 @@ class _FleetFlight:
     folder : Path
         The folder of the fleet.
     journal : JournalFile
-        The journal, in which a shard is entered once it is in the store.
+        The journal, in which a shard is recorded after it is in the store.
     """
 
     def __init__(self, fleet: Fleet, folder: Path, journal: JournalFile) -> None:
@@ -282,7 +294,8 @@ class _FleetFlight:
     def _remaining(self, shards: Sequence[Shard]) -> list[Shard]:
         """Return the shards of which not all twins are in the store.
 
-        Rows are compared, because a shard may have been stored in parts.
+        The rows of single twins are compared, because the twins of a shard are stored one by one if
+        workers died over it.
         """
         stored = set()
         for record, *_ in records(self._journal.path):
@@ -298,7 +311,8 @@ class _FleetFlight:
     def _pieces(self, shards: Sequence[Shard]) -> Iterator[Piece]:
         """Yield the shards with all that workers need to fly them.
 
-        If a single asset with a file of its own cannot be prepared, it is stored as failed.
+        If the scenario of a single asset, with its own FMU or calibration, cannot be prepared, the
+        asset is stored as failed and the other shards are flown.
         """
         for number, members in shards:
             group = self._fleet.groups[number]
@@ -313,7 +327,7 @@ class _FleetFlight:
                 yield Piece(number, kit, recorded)
 
     def _pack_kit(self, group_number: int, scenario_number: int) -> bytes:
-        """Return the packed kit of a scenario of a group."""
+        """Prepare a scenario of a group and return its packed kit."""
         group = self._fleet.groups[group_number]
         return prepare_kit(
             group.scenarios[scenario_number],
@@ -348,12 +362,12 @@ class _FleetFlight:
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:
-    """Return sentences by group and name of the twin, from sentences by its name."""
+    """Return sentences by GROUP/NAME of the twin, given sentences by its name alone."""
     return {f"{group.name}/{name}": sentence for name, sentence in sentences.items()}
 
 
 def _with_recording(group: Group, member: Member) -> Member:
-    """Return a member with the observations of its real asset, so that workers need no files."""
+    """Return a member with the messages of its real asset, so that workers read no files."""
     if not group.observations or member.file is None:
         return member
     messages = file_feed(member.file, group.scenarios[0]).messages(None)

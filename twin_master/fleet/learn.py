@@ -1,6 +1,6 @@
-"""What a fleet teaches: how fast damage grows, how noisy the sensors are, how the assets differ.
+"""Learning from the store of a fleet: growth of damage, noise of sensors, spread of a parameter.
 
-The result is written for people, and as `learnt.toml`, with which a scenario is flown.
+The results are a record for the report, and `learnt.toml`, which replaces values of a scenario.
 """
 
 from collections.abc import Sequence
@@ -46,23 +46,32 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NOISE_TWINS = 100
-"""Twins of a group from which the noise is learnt, to one part in a few hundred."""
+"""Largest number of twins of a group from which the noise is learnt.
+
+They determine the factor on the noise to a few parts in a thousand.
+"""
 LARGEST_NOISE = 3.0
 """Largest factor on the assumed noise that is considered; the smallest is its inverse."""
 NOISE_POINTS = 13
-"""Points of the grid of that factor."""
+"""Number of points of the grid of the factor on the noise."""
 NODES = 61
 """Number of values of the calibrated parameter at which the evidence is computed."""
 NODE_DEVIATIONS = 6.0
-"""Standard deviations of the calibration that these values reach to either side."""
+"""Distance of the first and the last of these values from the calibrated mean.
+
+The unit is the standard deviation of the calibration.
+"""
 _MOST_SHARED = 2
-"""Largest number of probabilities of which groups share a distribution."""
+"""Largest number of probabilities to worsen for which groups share a distribution."""
 
 
 def learn_from_fleet(
     folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Learn from all twins of a fleet: growth of damage, noise of sensors, differences of assets.
+    """Learn from all twins of a fleet, and write what was learnt to a file.
+
+    Learnt are the probabilities that damage grows, the noise of the sensors, and the distribution
+    of the calibrated parameter over the assets. The record is also written to the fleet's folder.
 
     Parameters
     ----------
@@ -77,15 +86,16 @@ def learn_from_fleet(
     Returns
     -------
     dict
-        What was learnt beside what was assumed. `groups` holds for each group by name
-        `probability` (by control; else `transitions_kept_because`), `noise_factor` and
-        `population`; `shared` what several groups share; `source` where it comes from.
+        The learnt and the assumed values. `groups` holds for each group by name `probability` (by
+        control), `noise_factor` and, if it was learnt, `population`; `transitions_kept_because` is
+        the reason if no probability is learnt. `shared` is the distribution of the probabilities
+        over groups, if groups share one; `source` identifies the fleet and the program.
 
     Raises
     ------
     RunFolderError, FleetError
-        If there is no fleet, if nothing has flown, or if no state of its twins explains what was
-        observed.
+        If the folder holds no fleet, if no twin has flown to its end, or if no course of states
+        explains the observations of any twin of a group.
     """
     record = learn_fleet(folder, progress=progress)
     write_learnt(Path(out), Path(folder), record)
@@ -94,7 +104,7 @@ def learn_from_fleet(
 
 
 def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Return the record of what the store of a fleet teaches; see `learn_from_fleet`.
+    """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
 
     The prior of each probability is uniform; if there are several groups, it is a Beta
     distribution that they share.
@@ -109,8 +119,8 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     Raises
     ------
     RunFolderError, FleetError
-        If there is no fleet, if nothing has flown, or if no state of its twins explains what was
-        observed.
+        If the folder holds no fleet, if no twin has flown to its end, or if no course of states
+        explains the observations of any twin of a group.
     """
     folder = Path(folder)
     config = fleet_config(folder)
@@ -130,7 +140,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
 
 @dataclass(frozen=True)
 class _GroupLessons:
-    """What the twins of one group teach, as long as no other group takes part.
+    """What is learnt from the twins of one group alone.
 
     Attributes
     ----------
@@ -139,9 +149,9 @@ class _GroupLessons:
     grid : LikelihoodGrid or None
         The likelihood of the probabilities; None if the transitions are not learnt.
     flown_controls : set of str
-        The controls under which a step was followed by another.
+        The controls under which a transition from one step to the next was flown.
     record : dict
-        The record of the group without its probabilities.
+        The record of the group without its probabilities to worsen.
     """
 
     family: TransitionFamily
@@ -157,14 +167,14 @@ class _GroupLessons:
     def with_probabilities(
         self, posteriors: Sequence[Distribution], flown_controls: set[str]
     ) -> dict[str, Any]:
-        """Return the record of the group with its probabilities.
+        """Return the record of the group with its probabilities to worsen.
 
         Parameters
         ----------
         posteriors : sequence of Distribution
             The posterior of each probability.
         flown_controls : set of str
-            The controls of which something was learnt.
+            The controls for which observations contribute to the posterior.
         """
         probabilities = {}
         for name, assumed, posterior in zip(
@@ -182,7 +192,7 @@ class _GroupLessons:
 def _lessons_of_groups(
     folder: Path, records: Sequence[dict[str, Any]], progress: Progress
 ) -> dict[str, _GroupLessons]:
-    """Return what each group teaches, by name; groups of which nothing has flown are left out."""
+    """Learn from each group by itself; groups without a flown twin are left out."""
     lessons = {}
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
@@ -195,7 +205,10 @@ def _lessons_of_groups(
 
 
 def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
-    """Return the records of all groups, and of what they share."""
+    """Return the records of all groups, and of the distribution of probabilities that they share.
+
+    They share one if several groups have learnt the same one or two probabilities to worsen.
+    """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
     names = next(iter(lessons.values())).family.names
     have_same_probabilities = {lesson.family.names for lesson in lessons.values()} == {names}
@@ -212,7 +225,8 @@ def _records_with_shared_distribution(
 ) -> dict[str, Any]:
     """Return the records of groups whose probabilities share a distribution.
 
-    A control that flew in any group teaches something of it to all groups.
+    A control that was flown in any group counts as flown in all, because the shared distribution
+    carries what was learnt of it to the other groups.
     """
     posterior = shared_posterior(grids)
     flown_controls: set[str] = set()
@@ -226,12 +240,12 @@ def _records_with_shared_distribution(
 
 
 class _Observations(NamedTuple):
-    """The observations of B twins that share what they know, in T steps.
+    """The observations of B twins of one scenario in T steps.
 
     Attributes
     ----------
     knowledge : Knowledge
-        What the twins know.
+        The knowledge that the twins share: model, policy and calibration draws.
     observed : (B, T, G + I) array
         The readings of sensors and inspections in SI units; NaN where there is none.
     control : (B, T) array
@@ -259,22 +273,23 @@ def _learn_group(
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
-    The noise comes first, because everything else rests on it; then the probabilities to worsen,
-    then the population of the calibrated parameter.
+    The noise is learnt first, because the likelihoods for the other two need it; then the
+    probabilities to worsen, and then the distribution of the calibrated parameter.
 
     Parameters
     ----------
     record : dict
-        The group in `config.json`.
+        The record of the group in `config.json`.
     group : Dataset
-        The group in the store.
+        The stored results of the group.
     flown : sequence of TwinsOfScenario
         The twins that have flown, by scenario.
     """
     scenario = flown[0].knowledge.scenario
     family = _transition_family(scenario)
     observations = _observations(group, flown)
-    # With several scenarios, each twin has a calibration of its own, and there is no population.
+    # With several scenarios each twin has its own calibration, and no common distribution of the
+    # parameter is learnt.
     nodes = None
     if len(flown) == 1:
         nodes = _parameter_nodes(flown[0], is_real="recordings" in record)
@@ -314,8 +329,8 @@ def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list
     """Return the observations of the twins of a group that have flown, by scenario."""
     observed = group["observed"].values.astype(np.float64)
     control = group["control_index"].values.astype(np.int64)
-    # After the end of a recording the store has control -1. Nothing is observed there, so that
-    # the evidence is the same for any control: take the first.
+    # Steps that were not flown have the control -1. They have no observations, so that the
+    # evidence does not depend on their control: the first control takes its place.
     control = np.maximum(control, 0)
     return [
         _Observations(twins.knowledge, observed[twins.rows], control[twins.rows]) for twins in flown
@@ -323,7 +338,7 @@ def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list
 
 
 def _followed_controls(group: "xr.Dataset", rows: Index, control_names: Sequence[str]) -> set[str]:
-    """Return the controls under which a step of some twin in the rows was followed by another."""
+    """Return the controls under which a twin in the rows has flown a step that is not its last."""
     control = group["control_index"].values.astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
@@ -332,7 +347,10 @@ def _followed_controls(group: "xr.Dataset", rows: Index, control_names: Sequence
 def _explained_steps(
     observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
 ) -> list[_WeighedSteps]:
-    """Return the likelihoods of the twins whose observations some course of states explains."""
+    """Return the likelihoods of the twins whose observations have a probability above 0.
+
+    The likelihoods are computed with a factor on the assumed noise.
+    """
     point = _with_all_transitions_possible(family.assumed)[None]
     parts = []
     for knowledge, observed, control in observations:
@@ -345,12 +363,12 @@ def _explained_steps(
 
 
 def _with_all_transitions_possible(probability: Float) -> Float:
-    """Return assumed probabilities, moved away from 0 and 1 so that any damage may occur."""
+    """Return probabilities clipped to 0.001 to 0.9, so that damage may grow or stay in any step."""
     return probability.clip(1e-3, 0.9)
 
 
 def _probability_grid(family: TransitionFamily, steps: Sequence[_WeighedSteps]) -> LikelihoodGrid:
-    """Return the likelihood of the probabilities to worsen, given all twins of a group."""
+    """Return the likelihood of the probabilities to worsen on a grid, given a group's twins."""
 
     def log_likelihood(points: Float) -> Float:
         evidence = [
@@ -371,7 +389,7 @@ class _ParameterNodes:
     values : (E,) array
         The equally spaced values.
     prior : (E,) array
-        Their probabilities after the calibration.
+        Their probabilities by the calibration, a normal distribution.
     predicted : (E, S, U, G) array
         The noise-free readings of the sensors for each value, state and control, in SI units.
     """
@@ -382,9 +400,10 @@ class _ParameterNodes:
 
 
 def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNodes | None:
-    """Return values of the parameter about its calibration.
+    """Return values of the calibrated parameter, with the readings that a model predicts for each.
 
-    None if the parameter is fixed, or if no model predicts readings at any value of it.
+    Return None if the calibration has no uncertainty, or if the source of the readings cannot
+    compute them at chosen values of the parameter.
     """
     knowledge = twins.knowledge
     draws = knowledge.draws
@@ -397,7 +416,7 @@ def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNode
     source.prepare(twins.folder, SilentProgress())
     nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
     predicted = source.observation_table(nodes, knowledge.model)
-    if len(predicted) != NODES:  # an observation library has draws of its own
+    if len(predicted) != NODES:  # a stored library of observations has fixed draws
         return None
     return _ParameterNodes(values, prior / prior.sum(), predicted)
 
@@ -405,14 +424,14 @@ def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNode
 def with_noise_factor(
     model: GaussianSensorModel, factor: float, predicted: Float | None = None
 ) -> GaussianSensorModel:
-    """Return a sensor model with a factor on its noise.
+    """Return a copy of a sensor model with its noise multiplied by a factor.
 
     Parameters
     ----------
     model : GaussianSensorModel
         The model.
     factor : float
-        The factor.
+        The factor on the standard deviation of the noise.
     predicted : (E, S, U, G) array, optional
         The noise-free readings at other values of the parameter; by default those of the model.
     """
@@ -429,17 +448,23 @@ def with_noise_factor(
 def _noise_factor(
     observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
 ) -> Distribution:
-    """Return the posterior of the factor on the assumed noise, uniform in its logarithm a priori.
+    """Return the posterior of the factor on the assumed noise; its logarithm has a uniform prior.
 
-    The parameter of an asset is the same in all its steps: a twin that averages over it in each
-    step anew would mistake a part of the noise for it. The nodes of the parameter avoid this.
+    The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
+    it in each step separately would attribute a part of the noise to the parameter. With nodes, the
+    evidence of all steps is computed at each value first and averaged over the values then.
     """
-    some_twins = [part.first_twins(NOISE_TWINS) for part in observations[:NOISE_TWINS]]
+    observations_of_first_twins = [
+        part.first_twins(NOISE_TWINS) for part in observations[:NOISE_TWINS]
+    ]
 
     def log_likelihood(axes: Axes) -> Float:
         factors = np.exp(axes[0])
         return np.array(
-            [_evidence_of_noise(some_twins, family, nodes, float(factor)) for factor in factors]
+            [
+                _evidence_of_noise(observations_of_first_twins, family, nodes, float(factor))
+                for factor in factors
+            ]
         )
 
     bound = np.log(LARGEST_NOISE)
@@ -454,7 +479,10 @@ def _evidence_of_noise(
     nodes: _ParameterNodes | None,
     factor: float,
 ) -> float:
-    """Return the log evidence of twins for a factor on the noise; impossible twins are left out."""
+    """Return the log evidence of twins for a factor on the noise.
+
+    Twins whose observations no course of states explains are left out.
+    """
     probability = _with_all_transitions_possible(family.assumed)
     total = 0.0
     for knowledge, observed, control in observations:

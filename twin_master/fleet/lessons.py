@@ -1,4 +1,4 @@
-"""What a fleet has taught: as `learnt.toml`, with which scenarios are flown, and as a table."""
+"""What was learnt from a fleet, as the file `learnt.toml` for scenarios and as rows of a table."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,21 +19,22 @@ HEADING = """\
 """
 
 Record = Mapping[str, Any]
-"""A part of the record of what was learnt; see `learn_from_fleet`."""
+"""A part of the record that `learn_from_fleet` returns."""
 
 
 def write_learnt(path: Path, folder: Path, record: Record) -> Path:
-    """Write the tables that replace those of a scenario, for a new asset and for each group.
+    """Write `learnt.toml`, whose tables replace those of a scenario.
 
-    A new asset has the mean probabilities that the groups share, and the population of the
-    parameter over the largest group. All numbers are in SI units.
+    Its first tables are for a new asset: the mean probabilities to worsen that the groups share,
+    and the noise and the distribution of the parameter of the group with the most twins. If there
+    are several groups, each has its own tables as well. All numbers are in SI units.
 
     Parameters
     ----------
     path : Path
         The file to write.
     folder : Path
-        The folder of the fleet, which knows what was assumed of the sensors.
+        The folder of the fleet, whose configuration has the assumed noise of the sensors.
     record : mapping
         What was learnt; see `learn_from_fleet`.
 
@@ -71,7 +72,7 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str
     means : mapping
         Records with the mean of each probability, of the group or shared by all groups.
     scenario : mapping
-        The scenario of the group.
+        The scenario of the group, with the assumed noise.
     """
     tables: dict[str, Any] = {}
     probability = _mean_probabilities(group, means)
@@ -93,7 +94,7 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str
 def _mean_probabilities(group: Record, means: Record) -> dict[str, Any]:
     """Return the mean probabilities to worsen by control, or by control and factor.
 
-    For a control that never flew nothing was learnt, and its assumed probability is returned.
+    For a control that was never flown nothing was learnt: its assumed probability is returned.
     """
     probabilities: dict[str, Any] = {}
     for name, learnt in group["probability"].items():
@@ -107,9 +108,10 @@ def _mean_probabilities(group: Record, means: Record) -> dict[str, Any]:
 
 
 def _deviation_of_new_asset(population: Record) -> float:
-    """Return the standard deviation of the parameter of an asset that nothing was observed of.
+    """Return the predictive standard deviation of the parameter of an asset without observations.
 
-    It unites the deviation of the population, and what is uncertain of it and of its mean.
+    The variances of three sources are added: the spread of the population (the square of its
+    posterior mean, plus its posterior variance), and the posterior variance of the mean.
     """
     deviation = population["spread"]
     return float(
@@ -124,12 +126,12 @@ def _deviation_of_new_asset(population: Record) -> float:
 
 
 class LessonRow(NamedTuple):
-    """A row of the table of what was learnt.
+    """A row of the table of learnt quantities.
 
     Attributes
     ----------
     group : str
-        The group, in its first row; else empty.
+        The name and the size of the group in the first of its rows; empty in the others.
     quantity : str
         The quantity that was learnt.
     assumed, mean, interval : str
@@ -144,7 +146,7 @@ class LessonRow(NamedTuple):
 
 
 def lesson_rows(record: Record) -> list[LessonRow]:
-    """Return what was learnt as rows of a table."""
+    """Return the learnt quantities of all groups as rows of a table."""
     rows = []
     for name, group in record["groups"].items():
         first_row, *other_rows = _group_rows(group)
@@ -167,7 +169,7 @@ def _group_heading(name: str, group: Record) -> str:
 
 
 def _group_rows(group: Record) -> Iterator[LessonRow]:
-    """Yield what was learnt of a group: probabilities, noise, and population."""
+    """Yield the rows of a group: probabilities to worsen, noise, and moments of the population."""
     for control, probability in group["probability"].items():
         yield _probability_row(control, probability)
     if "transitions_kept_because" in group:

@@ -16,21 +16,25 @@ _LETTERS = "abcdefgh"
 
 @style.publication_style()
 def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
-    """Draw a cell for each asset, coloured by its state, in a panel for each factor of the state.
+    """Draw the map of the assets of a group: a panel for each factor of the state.
 
-    The most severely damaged asset comes first; assets that failed in flight are grey.
+    In each panel one cell for each asset has the colour of the factor's value. The cells are in
+    descending order of severity of damage, row by row; assets that failed in flight, and assets
+    without an estimated state, are grey.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario with F factors of the state.
     mean : (B, F) array
-        The last mean states, in SI units; NaN if no state is believed.
+        The last mean states, in SI units; NaN if no state of the model explains the
+        observations of an asset.
     failed : int
         The number of assets that failed in flight.
     """
     factors = printed_factors(scenario)
     count = len(mean) + failed
+    # About twice as many columns as rows, because a panel is wider than it is high.
     columns = max(1, int(np.ceil(np.sqrt(2.0 * count))))
     rows = -(-count // columns)  # rounded up
     order = np.argsort(-severity(scenario, mean), kind="stable")
@@ -62,7 +66,10 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
 
 @style.publication_style()
 def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
-    """Draw the states of B assets over T steps: bands of the estimates, and medians.
+    """Draw the states of B assets over T steps, a panel for each factor of the state.
+
+    Bands hold the central 50 % and 90 % of the assets' estimates; lines are the medians of the
+    estimates and, if it is known, of the true values.
 
     Parameters
     ----------
@@ -71,7 +78,7 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
     mean : (B, T, F) array
         The mean states, in SI units; NaN in steps that were not flown.
     state : (B, T, F) array
-        The true states, in SI units; NaN where nobody knows them.
+        The true states, in SI units; NaN where they are not known.
     """
     factors = printed_factors(scenario)
     figure, (panels,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
@@ -84,7 +91,7 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
         style.band(axes, steps, low, high, style.PRESENT)
         style.band(axes, steps, lower_quartile, upper_quartile, style.PRESENT)
         axes.plot(steps, median, color=style.PRESENT, label="median of the filtered means")
-        is_truth_known = ~np.isnan(truths).all(axis=0)  # assets may have ended before
+        is_truth_known = ~np.isnan(truths).all(axis=0)  # false after the end of all flights
         true_median = np.nanmedian(truths[:, is_truth_known], axis=0)
         axes.plot(
             steps[is_truth_known],

@@ -1,4 +1,4 @@
-"""What a fleet flies: its file, its groups, and the seed of every twin."""
+"""The plan of a fleet: its file, its groups, and the seed of every twin."""
 
 import zlib
 from collections.abc import Iterator, Mapping
@@ -131,11 +131,11 @@ class Member:
     seed : int
         The seed of its mission; ``uav-twin run --seed`` flies the same mission.
     parameters : dict of str to float
-        Its true parameters in SI units, if they differ from asset to asset.
+        Its true parameters in SI units, by name; only those that differ between the assets.
     scenario_number : int
         The number of its scenario in the group.
     file : Path or None
-        The file that sets it apart: its FMU, its calibration, or the recording of a real asset.
+        The file of this asset alone: its FMU, its calibration, or the recording of a real asset.
     recording : tuple of FeedItem or None
         The observations of a real asset, as they are sent to a worker.
     """
@@ -151,7 +151,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Group:
-    """Assets that share a scenario, or that fly it each with a file of its own.
+    """Assets that share a scenario, or that each fly it with their own FMU or calibration.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Group:
     parameter_spreads : dict of str to Spread
         The parameters that differ from asset to asset.
     members : tuple of Member
-        The assets; empty if a broker will tell which there are.
+        The assets; empty if they become known by their messages to a broker.
     observations : str
         Where the observations of real assets come from, a pattern of files or an address; empty if
         assets are flown.
@@ -178,7 +178,7 @@ class Group:
     scenario_file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
-        """Return the group for `config.json`."""
+        """Return the record of the group for `config.json`."""
         record: dict[str, Any] = {
             "name": self.name,
             "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
@@ -196,7 +196,7 @@ class Group:
 
 
 def _hash_recording(path: Path) -> str:
-    """Return the hash of a recording: of a file, or of the journal of a run folder."""
+    """Return the hash of a recording, which is a file or the folder of a run with its journal."""
     return hash_file(path / JOURNAL_NAME if path.is_dir() else path)
 
 
@@ -221,12 +221,14 @@ class Fleet:
         return sum(len(group.members) for group in self.groups)
 
     def record(self) -> dict[str, Any]:
-        """Return the fleet for `config.json`."""
+        """Return the record of the fleet for `config.json`."""
         return self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
 
 
 def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
-    """Read a fleet file; relative paths in it start at its folder.
+    """Read the plan of a fleet from its TOML file.
+
+    Relative paths in the file are relative to the folder of the file.
 
     Parameters
     ----------
@@ -238,28 +240,29 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
     Raises
     ------
     FleetError
-        If the file cannot be read or breaks the schema, or if groups are wrong: the sentence lists
-        all of them.
+        If the file cannot be read or does not fit the schema `FleetFile`, or if groups cannot be
+        flown: the message of the error lists all such groups and the reasons.
     """
     path = Path(path)
     table = read_toml(path, FleetError, what="fleet")
+    # Files of earlier versions may have former names of keys.
     table = with_present_names(table, PRESENT_NAMES, str(path), FleetError)
     fleet_file = validate(FleetFile, table, str(path), FleetError, what="a fleet")
-    head = fleet_file.fleet
+    fleet_section = fleet_file.fleet
     if seed is not None:
-        head = head.model_copy(update={"seed": seed})
+        fleet_section = fleet_section.model_copy(update={"seed": seed})
     groups = []
     objections = []
-    for section in fleet_file.group:
+    for group_section in fleet_file.group:
         try:
-            group = _group(section, path.resolve().parent, head.seed)
-            _check_shared_inspections(group, head)
+            group = _group(group_section, path.resolve().parent, fleet_section.seed)
+            _check_shared_inspections(group, fleet_section)
             groups.append(group)
         except TwinMasterError as error:
-            objections.append(f"group {section.name}: {error}")
+            objections.append(f"group {group_section.name}: {error}")
     if objections:
         raise FleetError("\n".join([f"{path}: nothing was begun, for", *objections]))
-    return Fleet(head, tuple(groups))
+    return Fleet(fleet_section, tuple(groups))
 
 
 def _check_shared_inspections(group: Group, head: FleetSection) -> None:
@@ -282,9 +285,10 @@ def _check_shared_inspections(group: Group, head: FleetSection) -> None:
 def ensemble(
     scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD
 ) -> Fleet:
-    """Return one asset under many seeds, as a fleet of one group.
+    """Return a fleet of one group in which one scenario is flown under many seeds.
 
-    The calibration is drawn once for all seeds, under the seed of the scenario or the overrides.
+    The draws of the calibration are the same for all seeds; their seed is that of the scenario or
+    of the overrides.
 
     Parameters
     ----------
@@ -306,12 +310,12 @@ def ensemble(
 
 
 def seed_range(text: str) -> range:
-    """Return the seeds that the text ``FIRST:END`` stands for; END is left out.
+    """Return the range of seeds in a text ``FIRST:END``, without END itself.
 
     Raises
     ------
     FleetError
-        If the text is not a range of seeds, or if it has too many.
+        If the text is not a range of seeds, or if the range has more than `LARGEST` seeds.
     """
     first, colon, end = text.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
@@ -327,7 +331,7 @@ def seed_range(text: str) -> range:
 
 
 def _group(section: GroupSection, folder: Path, seed: int) -> Group:
-    """Return a group of a fleet file.
+    """Return the group that a section of a fleet file describes.
 
     Parameters
     ----------
@@ -343,6 +347,7 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     TwinMasterError
         If the group cannot be flown.
     """
+    # The scenario is a file beside the fleet file, or the name of a shipped scenario.
     local_file = folder / section.scenario
     loaded = load_scenario(local_file if local_file.is_file() else section.scenario)
     observations = section.observations or ""
@@ -360,12 +365,12 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
 
 
 def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
-    """Return the files that set the assets of a group apart; empty if no pattern is given.
+    """Return the FMUs or calibrations of the assets of a group; empty if it has no pattern.
 
     Raises
     ------
     FleetError
-        If no file fits the pattern.
+        If no file matches the pattern.
     """
     pattern = section.fmus or section.calibrations
     if not pattern:
@@ -379,12 +384,12 @@ def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
 def _scenarios(
     section: GroupSection, folder: Path, seed: int, loaded: LoadedScenario, files: list[Path]
 ) -> tuple[Scenario, ...]:
-    """Return the scenario of a group, or one for each of the files of its assets.
+    """Return the one scenario of a group, or a scenario for each FMU or calibration of its assets.
 
     Raises
     ------
     TwinMasterError
-        If a scenario cannot be resolved; for files, the sentence lists all that are wrong.
+        If a scenario cannot be resolved; the message lists all files for which this is so.
     """
     common = _common_overrides(section, folder, seed)
     if not files:
@@ -405,7 +410,7 @@ def _scenarios(
 
 
 def _common_overrides(section: GroupSection, folder: Path, seed: int) -> Overrides:
-    """Return the values of a group that replace those of its scenario, for all its assets."""
+    """Return the overrides of the scenario that hold for all assets of a group."""
     overrides = Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name)
     files: dict[str, Any] = {}
     for key in ("fmu", "binding", "calibration", "learnt"):
@@ -416,7 +421,7 @@ def _common_overrides(section: GroupSection, folder: Path, seed: int) -> Overrid
 
 
 def _with_values_of_group(section: GroupSection, scenario: Scenario) -> Scenario:
-    """Return a scenario with the values that its group gives instead."""
+    """Return a scenario in which the values that the group's section sets replace its own."""
     table = scenario.to_dict()
     if section.steps is not None:
         table["mission"]["steps"] = section.steps
@@ -441,7 +446,7 @@ def _members(
     observations : str
         The pattern of the recordings of real assets, or an address; empty if assets are flown.
     files : list of Path
-        The files that set the assets apart; empty if they are counted.
+        The FMU or calibration of each asset; empty if the section gives the number of assets.
     """
     if observations:
         if is_broker(observations):
@@ -456,27 +461,27 @@ def _members(
 
 
 def _member(section: GroupSection, seed: int, row: int, file: Path | None = None) -> Member:
-    """Return an asset of a group with its own seed and parameters.
+    """Return an asset of a group with a seed and normally distributed true parameters.
 
-    The seed follows from the seed of the fleet, the name of the group and the row of the asset
-    alone: the mission of a twin is the same whatever else flies.
+    The seed depends on the seed of the fleet, the name of the group and the row of the asset alone,
+    so that the mission of a twin does not change if other assets or groups are added.
     """
     key = (zlib.crc32(section.name.encode()), row)
     sequence = np.random.SeedSequence(seed, spawn_key=key)
-    # One bit less than a word, so that the seed fits into a signed integer of the store.
-    own_seed = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
-    deviates = generator(own_seed, "population").standard_normal(len(section.parameters))
+    # 63 of the 64 random bits, so that the seed fits into a signed 64-bit integer of the store.
+    member_seed = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+    deviates = generator(member_seed, "population").standard_normal(len(section.parameters))
     parameters = {}
-    for name, deviate in zip(sorted(section.parameters), deviates, strict=True):
+    for name, standard_normal_value in zip(sorted(section.parameters), deviates, strict=True):
         spread = section.parameters[name]
-        parameters[name] = spread.mean + spread.standard_deviation * float(deviate)
+        parameters[name] = spread.mean + spread.standard_deviation * float(standard_normal_value)
     if file is None:
-        return Member(row, f"{section.name}-{row}", own_seed, parameters)
-    return Member(row, file.stem, own_seed, parameters, scenario_number=row, file=file)
+        return Member(row, f"{section.name}-{row}", member_seed, parameters)
+    return Member(row, file.stem, member_seed, parameters, scenario_number=row, file=file)
 
 
 def recording_files(pattern: str) -> list[Path]:
-    """Return the files of real assets that fit a pattern, sorted; hidden files are left out."""
+    """Return the recordings of real assets that match a pattern, sorted, without hidden files."""
     paths = sorted(Path(pattern).parent.glob(Path(pattern).name))
     return [path for path in paths if not path.name.startswith(".")]
 

@@ -19,13 +19,16 @@ Transform = Callable[[Float], Float]
 GRID_POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
 """Points of each axis of the grid of probabilities, by the number of axes."""
 LOWEST, HIGHEST = 1e-4, 0.9
-"""Bounds of a probability to worsen."""
+"""Bounds of a probability to worsen, which keep its log odds finite."""
 RELEVANT_DROP = 13.0
-"""Largest distance of a relevant log density below its maximum: five deviations of a normal."""
+"""Points whose log density is further below the maximum than this are not relevant.
+
+A normal density reaches 13 below its maximum at 5.1 standard deviations: 5.1^2 / 2 = 13.
+"""
 RESOLVED_SPACING = 1.2
-"""Spacing over the standard deviation up to which the sums of a grid are exact to 1e-6."""
+"""Largest ratio of spacing to standard deviation for which sums over a grid are exact to 1e-6."""
 LEAST_SHRINKAGE = 0.95
-"""Fraction of its length to which an axis must shrink to be worth another grid."""
+"""A further grid is computed only if an axis becomes shorter than this fraction of its length."""
 NEGLIGIBLE_WEIGHT = 1e-9
 """Fraction of the largest weight below which the tails of a distribution are cut."""
 FINE_POINTS = 2001
@@ -40,9 +43,12 @@ LEAST_LOG_LIKELIHOOD = -60.0
 POPULATION_POINTS = 41
 """Points of the mean and of the standard deviation of a population."""
 PRIOR_FREEDOM = 4.0
-"""Degrees of freedom of a deviation's prior: twice the scale is as usual as nearly none of it."""
+"""Degrees of freedom of the half-t prior of a population's standard deviation.
+
+Few degrees of freedom give it a heavy tail, so that large deviations remain possible.
+"""
 POINTS_BETWEEN_NODES = 4
-"""Points between two nodes of a member's evidence."""
+"""Number of intervals into which each interval between two nodes of the evidence is divided."""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
 _TINY = 1e-300
@@ -61,7 +67,7 @@ def logistic(log_odds: Float) -> Float:
 
 @dataclass(frozen=True)
 class Distribution:
-    """The distribution of a quantity on a grid.
+    """The distribution of a quantity: probabilities of equally spaced values of a coordinate.
 
     Attributes
     ----------
@@ -125,7 +131,7 @@ class Distribution:
         }
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the ends of the central interval with a probability."""
+        """Return the ends of the central interval that has the given probability."""
         x, probability_of_x = self._interpolated
         # Half of the probability of a value lies below it.
         cumulative = np.cumsum(probability_of_x) - 0.5 * probability_of_x
@@ -135,7 +141,10 @@ class Distribution:
 
 
 def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
-    """Narrow the axes of a grid until it resolves a density.
+    """Find a grid that resolves a density, by narrowing the axes of a wide grid step by step.
+
+    A grid resolves a density if the spacing of each axis is small compared with the standard
+    deviation of its marginal, and if at least a third of the points of each axis is relevant.
 
     Parameters
     ----------
@@ -155,10 +164,13 @@ def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
     while True:
         values = log_density(axes)
         weight = cell_probabilities(values)
+        # For each axis: the range of its relevant points, and whether the grid is fine enough.
         ranges = []
         is_resolved = True
         for number, axis in enumerate(axes):
-            other_axes = tuple(other for other in range(len(axes)) if other != number)
+            other_axes = tuple(
+                other_number for other_number in range(len(axes)) if other_number != number
+            )
             highest = values.max(axis=other_axes)
             relevant = np.flatnonzero(highest > values.max() - RELEVANT_DROP)
             ranges.append(_relevant_range(axis, relevant, bounds[number]))
@@ -175,9 +187,10 @@ def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
 def _relevant_range(
     axis: Float, relevant: Index, bounds: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the range of the relevant points of an axis, a little widened, within its bounds.
+    """Return the range of the relevant points of an axis, widened at both ends, within its bounds.
 
-    Three quarters of a step are added: with a whole step, grids of few points would stay too wide.
+    Each end is moved outwards by three quarters of a step. With a whole step, the range of a grid
+    of few points would hardly become smaller than the axis.
     """
     lowest, highest = bounds
     step = axis[1] - axis[0]
@@ -187,7 +200,7 @@ def _relevant_range(
 
 
 def _is_fine(axis: Float, marginal: Float) -> bool:
-    """Return whether an axis is fine enough for its marginal distribution, an (N,) array."""
+    """Return whether the spacing of an axis suits the deviation of its marginal, an (N,) array."""
     step = axis[1] - axis[0]
     mean = marginal @ axis
     deviation = np.sqrt(marginal @ (axis - mean) ** 2)
@@ -195,7 +208,7 @@ def _is_fine(axis: Float, marginal: Float) -> bool:
 
 
 def _would_shrink(axes: Axes, ranges: Sequence[tuple[float, float]]) -> bool:
-    """Return whether any axis would get notably shorter; not so for a posterior at its bounds."""
+    """Return whether any of the ranges is notably shorter than its axis."""
     return not all(
         high - low > LEAST_SHRINKAGE * (axis[-1] - axis[0])
         for (low, high), axis in zip(ranges, axes, strict=True)
@@ -227,13 +240,19 @@ class LikelihoodGrid:
 
 
 def _log_uniform_prior(axes: Axes) -> Float:
-    """Return the log density of uniform probabilities, as a density of their log odds."""
+    """Return the log prior density of log odds if the probabilities p are uniform.
+
+    The density of log odds is that of p times dp / d(log odds) = p (1 - p).
+    """
     log_odds = np.meshgrid(*axes, indexing="ij")
     return np.asarray(sum(np.log(logistic(x) * logistic(-x)) for x in log_odds))
 
 
 def cell_probabilities(log_density: Float) -> Float:
-    """Return the probability of each point of a grid; points at bounds have half an interval."""
+    """Return the probability of each point of a grid, from its log density.
+
+    This is the trapezoidal rule: the first and the last point of an axis have half an interval.
+    """
     weight = np.exp(log_density - log_density.max())
     for axis in range(weight.ndim):
         np.moveaxis(weight, axis, 0)[[0, -1]] *= 0.5
@@ -302,10 +321,11 @@ class SharedPosterior:
 def shared_posterior(grids: Sequence[LikelihoodGrid]) -> SharedPosterior:
     """Infer the Beta distribution that the probabilities of several groups share.
 
-    A probability of a group has the distribution Beta(m kappa, (1 - m) kappa). Before the data, m
-    is uniform in its log odds between the bounds of a probability, and kappa in its logarithm. Each
-    group is summed over axes of its own: a group that is known well is a thousand times narrower
-    than one of few twins.
+    A probability of a group has the distribution Beta(m kappa, (1 - m) kappa) with the mean m and
+    the concentration kappa, which are the hyperparameters. Their prior is uniform in the log odds
+    of m, between the bounds of a probability, and in the logarithm of kappa. The sum over the
+    probabilities of each group has its own axes, because the posterior of a group with many twins
+    can be a thousand times narrower than that of a group with few.
 
     Parameters
     ----------
@@ -336,9 +356,10 @@ def shared_posterior(grids: Sequence[LikelihoodGrid]) -> SharedPosterior:
 
 @dataclass(frozen=True)
 class _GroupOnAxes:
-    """A group under all values of the hyperparameters; P = `SHARED_POINTS`, H hyperparameters.
+    """A group's likelihood, and the priors of its probabilities for all hyperparameters.
 
-    One probability is treated as two, of which the second has one value and says nothing.
+    P is `SHARED_POINTS`, and H the number of pairs of mean and concentration. If there is only one
+    probability, the second one is a placeholder with a single value and the density 1.
 
     Attributes
     ----------
@@ -370,7 +391,8 @@ class _GroupOnAxes:
         hyper_weight : (H, H) or (H, 1) array
             The posterior of the hyperparameters given all groups.
         """
-        # Each pair of hyperparameters counts by its weight over the evidence of this group.
+        # p(probabilities | data) = sum over hyperparameters of their posterior times prior times
+        # likelihood over this group's evidence; the likelihood does not depend on them.
         hyper_ratio = hyper_weight / np.maximum(self.evidence, _TINY)
         mixed_prior = self.prior_of_first.T @ hyper_ratio @ self.prior_of_second
         joint = self.likelihood * mixed_prior
@@ -383,7 +405,7 @@ class _GroupOnAxes:
 def _group_on_axes(
     grid: LikelihoodGrid, mean_axis: Float, concentration_axis: Float
 ) -> _GroupOnAxes:
-    """Return a group on fine axes, under all pairs of mean and concentration.
+    """Return a group's likelihood on fine axes, with its priors for all pairs of hyperparameters.
 
     Parameters
     ----------
@@ -410,7 +432,8 @@ def _group_on_axes(
 def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
     """Return the densities Beta(a, b) as densities of log odds, an (H, P) array.
 
-    A density of log odds is that of p times p (1 - p), so that no exponent is reduced by 1.
+    The density of log odds is that of p times p (1 - p), so that its exponents are a and b in place
+    of a - 1 and b - 1.
 
     Parameters
     ----------
@@ -427,7 +450,7 @@ def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
 
 
 def _hyperparameter_records(marginals: Sequence[Distribution]) -> list[dict[str, float]]:
-    """Return what is recorded of mean and concentration, which alternate in the marginals."""
+    """Return the records of the hyperparameters, from mean and concentration in turn."""
     records = []
     for mean, concentration in zip(marginals[::2], marginals[1::2], strict=True):
         records.append(
@@ -442,10 +465,11 @@ def _hyperparameter_records(marginals: Sequence[Distribution]) -> list[dict[str,
 
 
 def _interpolated_likelihood(grid: LikelihoodGrid, axes: Axes) -> Float:
-    """Return the likelihood of a grid on finer axes, times intervals, a (P, P) or (P, 1) array."""
+    """Interpolate a likelihood to finer axes, and return normalised weights, (P, P) or (P, 1)."""
     from scipy.interpolate import RegularGridInterpolator
 
-    # Far below the maximum there is nothing, but its logarithm would make the spline swing.
+    # Large negative logarithms, where the likelihood is practically 0, would make the cubic spline
+    # oscillate: cut them off.
     log_likelihood = grid.log_likelihood - grid.log_likelihood.max()
     log_likelihood = np.maximum(log_likelihood, LEAST_LOG_LIKELIHOOD)
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -462,17 +486,17 @@ class PopulationPosterior:
 
 
 def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> PopulationPosterior:
-    """Infer a normal population of which B members were observed.
+    """Infer mean and standard deviation of a normal population of which B members were observed.
 
-    The prior of the mean is uniform over the nodes. That of the standard deviation is half a
-    Student's t distribution of `PRIOR_FREEDOM` degrees of freedom.
+    The prior of the mean is uniform over the range of the nodes. The prior of the standard
+    deviation is a half-t distribution with `PRIOR_FREEDOM` degrees of freedom (Gelman 2006).
 
     Parameters
     ----------
     nodes : (E,) array
         Equally spaced values of the parameter.
     log_evidence : (B, E) array
-        The log evidence of each member's observations if its parameter is a node.
+        The log evidence of each member's observations if its parameter has the value of a node.
     scale : float
         The scale of the prior of the standard deviation.
     """
@@ -482,6 +506,7 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
     values = np.linspace(nodes[0], nodes[-1], count)
     step = values[1] - values[0]
     likelihood = _member_likelihood(nodes, log_evidence, values)
+    # Each value stands for the interval between two edges half a step away.
     edges = np.append(values, values[-1] + step) - 0.5 * step
 
     def log_density(axes: Axes) -> Float:
@@ -492,10 +517,11 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
             probability = np.diff(ndtr((edges[:, None] - means) / deviation), axis=0)
             evidence_of_members = np.maximum(likelihood @ probability, _TINY)
             log_evidence_of_all[:, column] = np.log(evidence_of_members).sum(axis=0)
-        log_prior = (
+        # The density of Student's t is (1 + (x / scale)^2 / freedom)^(-(freedom + 1) / 2).
+        minus_log_prior = (
             0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)
         )
-        return log_evidence_of_all - log_prior
+        return log_evidence_of_all - minus_log_prior
 
     mean_axis = np.linspace(nodes[0], nodes[-1], POPULATION_POINTS)
     deviation_axis = np.linspace(0.25 * step, 0.5 * (nodes[-1] - nodes[0]), POPULATION_POINTS)
@@ -508,7 +534,8 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
 def _member_likelihood(nodes: Float, log_evidence: Float, values: Float) -> Float:
     """Return the normalised likelihood of each member at finer values of its parameter.
 
-    Members whose observations are impossible at a node are left out.
+    Members whose observations have the probability 0 at a node are left out, because their log
+    evidence cannot be interpolated.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the store of a fleet says, as figures with their standard errors."""
+"""Outcomes, damage and decisions of the twins of a fleet, read from the fleet's store."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Estimated:
-    """A figure with its standard error."""
+    """An estimated quantity with its standard error; NaN if it cannot be estimated."""
 
     value: float
     error: float
@@ -44,8 +44,9 @@ class Outcomes:
     Attributes
     ----------
     prompt_fallbacks : Estimated
-        The fraction of the fallbacks that were called for and came within `WITHIN` steps; NaN if
-        none was called for. A fallback counts if so many steps were flown after the call.
+        Of the missions whose true damage called for a fallback to a gentler control, the fraction
+        in which it came within `WITHIN` steps; NaN if there is no such mission. A mission that
+        ended within `WITHIN` steps of the call, without a fallback, is not counted.
     early_fallbacks : Estimated
         The fraction of missions with a fallback before the damage that calls for it; NaN if no
         damage calls for one.
@@ -72,7 +73,12 @@ class Outcomes:
     def from_store(cls, stored: Mapping[Any, Any]) -> "Outcomes":
         """Return the outcomes of all twins in a group of the store that have flown.
 
-        Twins whose assets ended their simulations early count with what they have flown.
+        Of a twin whose asset ended its simulation early, the flown steps are counted.
+
+        Parameters
+        ----------
+        stored : mapping of str to array
+            The variables of the group by name, with a row for each twin.
         """
         flown = flown_rows(np.asarray(stored["status"]))
 
@@ -80,14 +86,14 @@ class Outcomes:
             return np.asarray(stored[name])[flown].astype(np.float64)
 
         delay = values("delay")
-        called_for = delay[~np.isnan(delay)]
-        early = values("early")
+        delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
+        early = values("early")  # 1: early, 0: not early, -1: not defined
         error = np.ma.masked_invalid(values("mean") - values("state"))  # masked: steps not flown
-        # Means over the steps of each mission, (F, N).
+        # Means over the steps of each mission: (N, T, F) becomes (F, N).
         mean_square = (error**2).mean(axis=1).filled(np.nan).T
         mean_error = error.mean(axis=1).filled(np.nan).T
         return cls(
-            prompt_fallbacks=_fraction(called_for <= WITHIN),
+            prompt_fallbacks=_fraction(delays_when_called_for <= WITHIN),
             early_fallbacks=_fraction(early[early >= 0.0] > 0.0),
             rms=tuple(_root(_mean(factor)) for factor in mean_square),
             bias=tuple(_mean(factor) for factor in mean_error),
@@ -97,28 +103,28 @@ class Outcomes:
 
 
 def _fraction(hits: NDArray[np.bool_]) -> Estimated:
-    """Return the fraction of hits; NaN if there is no trial.
+    """Return the fraction of hits among trials; NaN if there is no trial.
 
-    Its error is the standard deviation of its posterior under a uniform prior, a Beta
-    distribution: 0 of 20 is not 0 ± 0.
+    Its error is the standard deviation of the posterior Beta(hits + 1, misses + 1) of the
+    probability of a hit under a uniform prior. It is above 0 even if no trial is a hit.
     """
     if not len(hits):
         return Estimated(float("nan"), float("nan"))
     a = np.sum(hits) + 1.0
     b = np.sum(~hits) + 1.0
-    error = np.sqrt(a * b / (a + b + 1.0)) / (a + b)
+    error = np.sqrt(a * b / (a + b + 1.0)) / (a + b)  # standard deviation of Beta(a, b)
     return Estimated(float(np.mean(hits)), float(error))
 
 
 def _mean(values: Float) -> Estimated:
-    """Return the mean over missions, which are independent; the steps of a mission are not."""
+    """Return the mean of one value for each of N independent missions, with its standard error."""
     count = len(values)
     error = float(np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
     return Estimated(float(np.mean(values)), error)
 
 
 def _root(mean_square: Estimated) -> Estimated:
-    """Return the root of a mean square, with its error to first order."""
+    """Return the root r of a mean square, with its first-order error: d(r^2) / (2 r)."""
     root = float(np.sqrt(mean_square.value))
     return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
@@ -141,28 +147,30 @@ def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
 
 
 def notice_counts(group: "xr.Dataset", kind: str) -> Index:
-    """Return how many notices of a kind each twin of a group gave, a (B,) array."""
+    """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
     return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
 def believed_means(group: "xr.Dataset") -> Float:
     """Return the mean states of B twins in T steps, a (B, T, F) array in SI units.
 
-    They are NaN in steps in which no state is believed, because none explains the observations.
+    They are NaN in steps in which the probability that no state of the model explains the
+    observations is above `BELIEVED`.
     """
     is_unexplained = group["unexplained"].values > BELIEVED
     return np.where(is_unexplained[..., np.newaxis], np.nan, group["mean"].values)
 
 
 def last_steps(group: "xr.Dataset") -> Index:
-    """Return the last step of each twin, a (B,) array; recordings and simulations may end early."""
+    """Return the number of the last flown step of each twin, a (B,) array; 0 if none was flown."""
+    # Steps that were not flown, at the end of a mission, have the control -1.
     flown_steps = (group["control_index"].values >= 0).sum(axis=1)
     last: Index = np.maximum(flown_steps - 1, 0)
     return last
 
 
 def severity(scenario: Scenario, mean: ArrayLike) -> Float:
-    """Return how severely assets are damaged, so that they can be ranked.
+    """Return the severity of the damage of assets, a dimensionless number for ranking them.
 
     Each factor of the state counts by its position between its lowest level (0) and its highest
     level (1); the severity is the sum over the factors.
@@ -182,16 +190,17 @@ def severity(scenario: Scenario, mean: ArrayLike) -> Float:
     lowest = np.array([factor.levels[0] for factor in scenario.state])
     highest = np.array([factor.levels[-1] for factor in scenario.state])
     has_one_level = highest == lowest
-    length = np.where(has_one_level, 1.0, highest - lowest)
+    length = np.where(has_one_level, 1.0, highest - lowest)  # one level: avoids 0 / 0
     position = (np.asarray(mean) - lowest) / length
     return np.asarray(position.sum(axis=-1))
 
 
 def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) -> Float:
-    """Return the probability that twins leave a control within the predicted steps.
+    """Return the probability that twins leave a control within the scenario's `prediction_steps`.
 
-    If the policy decides by states, this is the probability that some state on the way calls for
-    another control. If the policy decides by beliefs, it is estimated from drawn lives.
+    If the policy maps states to controls, this is the probability that the predicted course of
+    states reaches one for which the policy chooses another control. If the policy maps beliefs to
+    controls, it is the fraction of simulated missions in which the control changes.
 
     Parameters
     ----------
@@ -200,7 +209,7 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
     belief : (B, S) array
         Their beliefs after the last step.
     control : int
-        The index of the control in force; it stays so until it is left.
+        The index of the control in force, under which the states change until it is left.
 
     Returns
     -------
@@ -219,7 +228,8 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
             steps,
             generator(scenario.mission.seed, "planning"),
         )
-    # Backwards: the probability that the control is kept from a state on, for more and more steps.
+    # Backward recursion over the steps: k_1(s) = 1 if the policy keeps the control in state s, else
+    # 0; k_n(s) = k_1(s) E[k_(n-1)(next state) | s] is the probability that n decisions keep it.
     keeps_control = (knowledge.plan.control_index == control).astype(np.float64)
     probability_kept = keeps_control.copy()
     for _ in range(steps - 1):
@@ -230,16 +240,16 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
 
 
 class TwinsOfScenario(NamedTuple):
-    """Twins of a group that share a scenario, and thus what they know.
+    """Twins of a group that share a scenario, and thus a model and a policy.
 
     Attributes
     ----------
     rows : (B,) array
         Their rows in the store.
     folder : Path
-        The folder of what they know.
+        The folder of their prepared knowledge.
     knowledge : Knowledge
-        What they know.
+        Their knowledge: model, policy and calibration draws.
     """
 
     rows: Index
@@ -264,64 +274,70 @@ def flown_twins(
     Raises
     ------
     RunFolderError
-        If what the twins know is missing or damaged.
+        If a file of the twins' prepared knowledge is missing or damaged.
     """
     flown = flown_rows(group["status"].values)
     scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[flown]
     for number in np.unique(scenario_numbers).tolist():
-        home = folder / GROUPS / record["name"] / str(number)
-        scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(home)
+        knowledge_folder = folder / GROUPS / record["name"] / str(number)
+        scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(
+            knowledge_folder
+        )
         rows = flown[scenario_numbers == number]
-        yield TwinsOfScenario(rows, home, load_knowledge(home, scenario))
+        yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
 def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
-    """Return the probability that each twin of a group leaves its control soon.
+    """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters
     ----------
     folder : Path
         The folder of the fleet.
     record : mapping
-        The group in `config.json`.
+        The record of the group in `config.json`.
     group : Dataset
-        The group in the store.
+        The stored results of the group, with a row for each twin.
 
     Returns
     -------
     (B,) array
-        The probabilities of `probability_of_leaving`; NaN for twins that have not flown, and for
-        twins that believe no state.
+        The probabilities of `probability_of_leaving` after the last step; NaN for twins that have
+        not flown, and for twins whose observations no state of the model explains.
 
     Raises
     ------
     RunFolderError
-        If what the twins know is missing or damaged.
+        If a file of the twins' prepared knowledge is missing or damaged.
     """
-    count = group.sizes["twin"]
-    at_last_step = (np.arange(count), last_steps(group))
+    twin_count = group.sizes["twin"]
+    at_last_step = (np.arange(twin_count), last_steps(group))
     belief = group["belief"].values.astype(np.float64)
-    control = group["control_index"].values[at_last_step]
-    probability = np.full(count, np.nan)
-    for twins in flown_twins(folder, record, group):
-        for index in np.unique(control[twins.rows]).tolist():
-            rows = twins.rows[control[twins.rows] == index]
-            probability[rows] = probability_of_leaving(twins.knowledge, belief[rows], index)
+    control_in_force = group["control_index"].values[at_last_step]
+    probability = np.full(twin_count, np.nan)
+    for scenario_twins in flown_twins(folder, record, group):
+        for control_index in np.unique(control_in_force[scenario_twins.rows]).tolist():
+            rows = scenario_twins.rows[control_in_force[scenario_twins.rows] == control_index]
+            probability[rows] = probability_of_leaving(
+                scenario_twins.knowledge, belief[rows], control_index
+            )
+    # `unexplained` is the filter's probability that no state explains the observations.
     probability[group["unexplained"].values[at_last_step] > BELIEVED] = np.nan
     return probability
 
 
 def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
-    """Return the figures of a group by their titles.
+    """Return counts of the twins of a group, and figures of their outcomes, by title.
 
-    A mean has its standard error over the twins.
+    The figures are means over the twins with their standard errors; a group without a flown twin
+    has counts alone. Figures that need the true state are left out for real assets.
     """
     status = group["status"].values
     figures = _counts_of_twins(group)
     if not len(flown_rows(status)):
         return figures
     outcomes = Outcomes.from_store(group)
-    is_truth_known = not np.isnan(outcomes.bias[0].value)  # of real assets nobody knows it
+    is_truth_known = not np.isnan(outcomes.bias[0].value)  # NaN for real assets
     if is_truth_known:
         if not np.isnan(outcomes.prompt_fallbacks.value):
             steps = f"{group.attrs['step_name']}s"
@@ -342,7 +358,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
 
 
 def _counts_of_twins(group: "xr.Dataset") -> dict[str, Estimated | int]:
-    """Return how many twins flew, failed, ended early, and gave which notices."""
+    """Return the numbers of twins that flew, failed, ended early, or gave notices, by title."""
     status = group["status"].values
     figures: dict[str, Estimated | int] = {
         "twins": len(status),
@@ -362,7 +378,7 @@ def _counts_of_twins(group: "xr.Dataset") -> dict[str, Estimated | int]:
 
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
     """Return the figures of groups as rows of a table: a title, and a cell for each group."""
-    titles: dict[str, None] = {}  # each once, in order
+    titles: dict[str, None] = {}  # used as an ordered set
     for figures in groups.values():
         titles |= dict.fromkeys(figures)
     rows = []

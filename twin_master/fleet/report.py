@@ -1,7 +1,7 @@
-"""The page of a fleet: health of its assets, who needs attention next, what was learnt, failures.
+"""The report of a fleet: health of its assets, assets to attend to next, lessons, failures.
 
 The page is made from the folder of the fleet alone, which may still be growing. Its size does not
-grow with the number of assets: it has a cell of a map for each, and tables of the few that matter.
+grow much with the number of assets: each has one cell of a map, and the tables have few rows.
 """
 
 import json
@@ -49,7 +49,7 @@ _FAILURE_EXAMPLES = 3
 
 
 def write_fleet_report(folder: Path | str) -> Path:
-    """Write the page of a fleet.
+    """Write the report of a fleet as `report.html` into the folder of the fleet.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def write_fleet_report(folder: Path | str) -> Path:
 
 
 def fleet_page(folder: Path, most_assets: int) -> str:
-    """Return the page of a fleet as it stands.
+    """Return the report of a fleet, flown or watched, as HTML.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def fleet_page(folder: Path, most_assets: int) -> str:
     RunFolderError
         If the folder does not hold a fleet.
     FleetError
-        If it is damaged.
+        If the configuration or the results in the folder are damaged.
     """
     config = fleet_config(folder, KIND, WATCHED_KIND)
     is_watched = config["kind"] == WATCHED_KIND
@@ -107,7 +107,7 @@ def fleet_page(folder: Path, most_assets: int) -> str:
 def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
     """Return the size of a fleet, its seed, and whether it is watched or flown."""
     group_count = counted(len(fleet["groups"]), "group")
-    if is_watched:  # the configuration does not know which assets there are
+    if is_watched:  # the configuration of a watched fleet has no list of assets
         return f"{group_count}, seed {fleet['seed']}, watched"
     asset_count = sum(len(group.get("members", ())) for group in fleet["groups"])
     return f"{counted(asset_count, 'asset')} in {group_count}, seed {fleet['seed']}, flown"
@@ -116,7 +116,7 @@ def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
 def _add_flown_fleet(
     page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
 ) -> None:
-    """Add the sections of a fleet that is flown; records are its groups in `config.json`."""
+    """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
@@ -151,9 +151,10 @@ def _add_flown_fleet(
 def _leaving_or_explanation(
     page: Page, folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
 ) -> Float | None:
-    """Return the probabilities that the flown twins of a group leave their controls soon.
+    """Return the probability that each flown twin of a group changes its control.
 
-    If they cannot be computed, the page says why, and None is returned.
+    The probabilities are those of `leaving_probabilities`. If they cannot be computed, add a
+    paragraph with the reason to the page, and return None.
     """
     try:
         probabilities = leaving_probabilities(folder, record, group)
@@ -164,7 +165,7 @@ def _leaving_or_explanation(
 
 
 def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> str:
-    """Return what a reader wants to know first: flights, alarms, fallbacks, the worst damage."""
+    """Return the opening sentences: on flights, alarms, fallbacks and the most severe damage."""
     asset_count = sum(group.sizes["twin"] for group in groups)
     flown_count = sum(len(standing.names) for standing in standings)
     sentences = [
@@ -177,34 +178,36 @@ def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> s
 
 
 def _alarm_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
-    """Return how many assets raised an alarm, and in which step the first; empty if none did."""
-    alarm = NOTICE_KINDS.index("alarm")
-    first_alarm = np.concatenate([group["first_notice"].values[:, alarm] for group in groups])
-    raised = first_alarm[first_alarm >= 0]
-    if not len(raised):
+    """Return the number of assets with an alarm and the first step of one; empty without alarms."""
+    alarm_column = NOTICE_KINDS.index("alarm")
+    first_alarm = np.concatenate(
+        [group["first_notice"].values[:, alarm_column] for group in groups]
+    )
+    steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
+    if not len(steps):
         return ""
-    return f"{counted(len(raised), 'asset')} raised an alarm, first in {step_word} {min(raised)}."
+    return f"{counted(len(steps), 'asset')} raised an alarm, first in {step_word} {min(steps)}."
 
 
 def _fallback_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
-    """Return how often the control fell back in time; empty if no damage called for it."""
+    """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
     delay = np.concatenate([group["delay"].values for group in groups])
-    called_for = delay[~np.isnan(delay)]
-    if not len(called_for):
+    called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
+    if not len(called_for_delays):
         return ""
-    fraction_in_time = float(np.mean(called_for <= WITHIN))
+    fraction_in_time = float(np.mean(called_for_delays <= WITHIN))
     return (
-        f"In {counted(len(called_for), 'asset')} the damage called for another control; "
+        f"In {counted(len(called_for_delays), 'asset')} the damage called for another control; "
         f"the fallback came within {WITHIN} {step_word}s of it in {100 * fraction_in_time:.0f} %."
     )
 
 
 def _damage_sentence(standings: Sequence[Standing]) -> str:
-    """Return which asset is damaged most severely, and its state; empty if no state is believed."""
-    believed = [standing for standing in standings if standing.most_damaged is not None]
-    if not believed:
+    """Return the most severely damaged asset and its state; empty if no state is estimated."""
+    standings_with_state = [standing for standing in standings if standing.most_damaged is not None]
+    if not standings_with_state:
         return ""
-    worst_group = max(believed, key=lambda standing: np.nanmax(standing.severity))
+    worst_group = max(standings_with_state, key=lambda standing: np.nanmax(standing.severity))
     number = worst_group.most_damaged
     assert number is not None
     states = []
@@ -219,7 +222,7 @@ def _damage_sentence(standings: Sequence[Standing]) -> str:
 def _add_watched_fleet(
     page: Page, folder: Path, groups: Sequence[dict[str, Any]], most_assets: int
 ) -> None:
-    """Add the sections of a fleet that is watched; groups are those in `config.json`."""
+    """Add the sections of a fleet that is watched, given the records of its groups."""
     standing = read_standing(folder)
     assets = standing["assets"]
     failures = standing["failures"]
@@ -244,20 +247,20 @@ def _add_watched_fleet(
 
 
 def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None:
-    """Add a table of why flights or watches ended, the most frequent reasons first.
+    """Add a table of the errors that ended flights or watches, the most frequent errors first.
 
     Parameters
     ----------
     page : Page
         The page.
     failures : mapping of str to str
-        The reason for each asset, by its name.
+        The error of each asset, by GROUP/NAME.
     caption : str
-        Where all failures stand.
+        A sentence that names the file with the complete list of failures.
     """
     rows = []
     for reason, count in Counter(failures.values()).most_common(_FAILURE_ROWS):
-        names = [name for name, its_reason in failures.items() if its_reason == reason]
+        names = [name for name, failure_reason in failures.items() if failure_reason == reason]
         examples = ", ".join(names[:_FAILURE_EXAMPLES])
         if count > _FAILURE_EXAMPLES:
             examples += ", ..."
@@ -266,7 +269,7 @@ def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None
 
 
 def _add_lessons(page: Page, folder: Path) -> None:
-    """Add what was learnt across the fleet beside what was assumed, if `fleet learn` has run."""
+    """Add a table of learnt and assumed values, if `fleet learn` has been run on the fleet."""
     path = folder / LESSONS_NAME
     if path.is_file():
         page.add_section("Learnt across the fleet")
@@ -274,7 +277,7 @@ def _add_lessons(page: Page, folder: Path) -> None:
 
 
 def _add_map(page: Page, standing: Standing, failed: int) -> None:
-    """Add the map of the assets of a group by health, of which some failed in flight."""
+    """Add the map of the states of a group's assets; assets that failed in flight are grey."""
     if not standing.names:
         page.add_paragraph("Nothing is known of its assets yet.")
         return
@@ -284,7 +287,7 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 
 def _add_courses(page: Page, standing: Standing, group: "xr.Dataset") -> None:
-    """Add the health of the assets of a group over time, if a state is believed in any step."""
+    """Add the figure of the assets' states over time, if any step has an estimated state."""
     flown = flown_rows(group["status"].values)
     mean = believed_means(group)[flown]
     if standing.names and not np.isnan(mean).all():
@@ -293,14 +296,14 @@ def _add_courses(page: Page, standing: Standing, group: "xr.Dataset") -> None:
 
 
 class _AttentionTable(NamedTuple):
-    """The columns beside name and step of a table of assets, and its rows."""
+    """The columns after name and step of a table of assets, and the rows with all columns."""
 
     columns: list[PageColumn]
     rows: list[list[str]]
 
 
 def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> None:
-    """Add the table of the assets of a group that need attention next."""
+    """Add the table of the assets that need attention first, of at most `most_assets` rows."""
     if not standing.names:
         return
     order = _attention_order(standing)[:most_assets]
@@ -321,24 +324,25 @@ def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> No
 
 
 def _leaving_percentage(standing: Standing) -> Float:
-    """Return the probability of leaving a control in whole percent, a (B,) array; 0 if unknown."""
+    """Return the probability of a change of control in whole percent, (B,); 0 if it is unknown."""
     return np.asarray(np.rint(100.0 * np.nan_to_num(standing.leaving)))
 
 
 def _attention_order(standing: Standing) -> Index:
-    """Return the numbers of assets by alarms, then by leaving a control soon, then by damage.
+    """Return the indices of the assets in the order in which they need attention.
 
-    Assets in no state that is believed count as the most damaged.
+    The order is by the number of alarms, then by the probability of a change of control, then by
+    severity of damage. Assets without an estimated state count as the most damaged.
     """
     damage = np.nan_to_num(standing.severity, nan=np.inf)
-    # The last key counts first.
+    # `lexsort` sorts by its last key first; minus signs give descending order.
     return np.lexsort((-damage, -_leaving_percentage(standing), -standing.alarms))
 
 
 def _attention_table(
     standing: Standing, order: Iterable[int], *, has_alarms: bool
 ) -> _AttentionTable:
-    """Return the table of assets in an order, with a column of alarms if there are any."""
+    """Return the table of the assets with the given indices, in their order."""
     factors = printed_factors(standing.scenario)
     columns = []
     for state, factor in zip(standing.scenario.state, factors, strict=True):
@@ -364,7 +368,7 @@ def _attention_table(
 
 
 def _state_cells(standing: Standing, factors: Sequence[PrintedFactor], number: int) -> list[str]:
-    """Return mean and standard deviation of each factor of the state of an asset, as printed."""
+    """Return one cell for each factor of an asset's state: mean and standard deviation, printed."""
     cells = []
     for index, factor in enumerate(factors):
         mean = factor.scale * standing.mean[number, index]

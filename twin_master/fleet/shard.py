@@ -1,7 +1,7 @@
-"""What a worker does: it flies some twins of one group, and returns arrays.
+"""The flight of some twins of one group, by any process of any machine.
 
-A shard comes with all that it needs, so that it can be flown on any machine, by any process, any
-number of times: the result is the same to the last bit.
+A shard contains all that its flight needs. However often it is flown, the result is the same to the
+last bit.
 """
 
 import pickle
@@ -48,12 +48,13 @@ def flights_of_recordings(
 ) -> Flights:
     """Return the beliefs and controls of B twins given recordings of real assets.
 
-    They are those of a watch of each asset.
+    Each recording is processed as `uav-twin watch` would process it. A recording that cannot be
+    processed gives its reason in `failure`.
 
     Parameters
     ----------
     knowledge : Knowledge
-        What the twins know.
+        The knowledge that the twins share: model, policy and draws.
     recordings : sequence of sequence of FeedItem
         The messages of each of the B assets.
     """
@@ -79,9 +80,10 @@ def flights_of_recordings(
 
 
 def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
-    """Return what a twin concludes from the messages of one real asset.
+    """Return the history of beliefs and controls of a twin given the messages of one real asset.
 
-    If any message comes late and revises a former step, all steps are filtered again at the end.
+    If a message comes late and changes the observation of a former step, all steps are filtered
+    again with the final observations.
     """
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
@@ -110,9 +112,9 @@ class ShardResult(NamedTuple):
     variables : dict of str to array
         The variables of the store, with B rows each.
     failures : dict of str to str
-        Why flights failed, by the name of the twin.
+        The errors of flights that failed, by the name of the twin.
     ended : dict of str to str
-        How assets ended their simulations early, by the name of the twin.
+        The reasons of assets that ended their simulations early, by the name of the twin.
     """
 
     variables: Mapping[str, NDArray[Any]]
@@ -121,7 +123,7 @@ class ShardResult(NamedTuple):
 
 
 def result_of_unflown(member: Member, reason: str) -> ShardResult:
-    """Return the result of a twin that could not fly, with the reason."""
+    """Return the result of one twin that could not fly, given the reason."""
     variables = {"status": np.array([FAILED]), "seed": np.array([member.seed])}
     return ShardResult(variables, {member.name: reason}, {})
 
@@ -146,18 +148,18 @@ class Kit:
         self.knowledge: Knowledge = load_knowledge(folder, self.scenario)
 
     def without_folder(self, sentence: str) -> str:
-        """Return a sentence without the temporary folder, which no user knows."""
+        """Return a sentence in which paths do not begin with the temporary folder of the kit."""
         return sentence.replace(f"{self._folder}/", "")
 
     def open_asset(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:
-        """Return an asset to fly: the model, or an FMU.
+        """Open a simulated asset: the reduced model if the kit has one, else an FMU.
 
         Parameters
         ----------
         parameters : mapping of str to float
-            Its true parameters, in SI units.
+            True parameters that replace those of the scenario, in SI units.
         seed : int, optional
-            The seed of the asset itself, if the scenario names one.
+            The seed with which the asset draws its own damage and noise, if it has such seeds.
         """
         scenario = with_parameters(self.scenario, parameters)
         if self.wing is not None:
@@ -173,7 +175,7 @@ class Kit:
 
 
 _unpacked_kit = lru_cache(maxsize=1)(Kit)
-"""Unpacks a kit, or returns the last one again: shards of a group follow each other."""
+"""Unpacks a kit. The last one is kept in memory, because successive shards share their kit."""
 
 
 def fly_shard(packed_kit: bytes, members: Sequence[Member]) -> ShardResult:
@@ -202,7 +204,7 @@ def fly_shard(packed_kit: bytes, members: Sequence[Member]) -> ShardResult:
 def _sentences_by_name(
     kit: Kit, members: Sequence[Member], sentences: Sequence[str]
 ) -> dict[str, str]:
-    """Return the sentences on twins by their names; empty sentences are left out."""
+    """Return one sentence for each twin by the twin's name; empty sentences are left out."""
     named_sentences = {}
     for member, sentence in zip(members, sentences, strict=True):
         if sentence:
@@ -211,12 +213,16 @@ def _sentences_by_name(
 
 
 def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
-    """Fly twins with their assets: side by side if that is possible, else one after the other."""
+    """Simulate the assets of some twins, and return the flights.
+
+    Assets without memory are flown side by side in array operations, unless the twins learn or give
+    notices; other assets are flown one after the other.
+    """
     knowledge = kit.knowledge
     truths = [knowledge.truth(member.seed) for member in members]
     with _AssetPool(kit, members) as pool:
         if kit.scenario.learning is None and kit.scenario.notice is None:
-            # If opening the assets fails, it will fail again, for each twin by itself.
+            # An error is suppressed here: it comes again below and is recorded for each twin.
             with suppress(*FLIGHT_ERRORS):
                 assets = pool.open_stateless_assets()
                 if assets:
@@ -225,21 +231,24 @@ def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
 
 
 class _AssetKey(NamedTuple):
-    """What makes an asset differ from others: its true parameters, and its seed if it has one."""
+    """True parameters and seed of an asset; assets with equal keys are equal.
+
+    The seed is None if the asset draws nothing itself.
+    """
 
     parameters: Mapping[str, float]
     seed: int | None
 
 
 class _AssetPool(ExitStack):
-    """The assets of some twins, of which one is open at a time if they have a memory.
+    """The simulated assets of some twins; at most one asset with memory is open at a time.
 
-    An asset whose flight failed is opened anew for the next twin.
+    After a failed flight the asset is closed, and a new one is opened for the next twin.
 
     Parameters
     ----------
     kit : Kit
-        What the twins need.
+        The scenario, knowledge and files of the twins.
     members : sequence of Member
         The twins.
     """
@@ -257,9 +266,10 @@ class _AssetPool(ExitStack):
         self._start_state = b""
 
     def open_stateless_assets(self) -> list[Asset]:
-        """Return an asset for each twin; empty if the assets have a memory.
+        """Return a stateless asset for each twin; empty if the assets have a memory.
 
-        Equal assets without memory are one object.
+        Twins with equal assets share one object. The list is also empty if assets other than the
+        reduced model differ between the twins.
         """
         if self._kit.wing is not None:
             return self._open_models()
@@ -269,7 +279,7 @@ class _AssetPool(ExitStack):
         return [asset] * len(self._keys) if isinstance(asset, StatelessAsset) else []
 
     def _open_models(self) -> list[Asset]:
-        """Return the reduced model with the parameters of each twin."""
+        """Return the reduced model of each twin; twins with equal parameters share one object."""
         parameters_of_twins = [tuple(sorted(key.parameters.items())) for key in self._keys]
         models = {}
         for parameters in set(parameters_of_twins):
@@ -277,14 +287,14 @@ class _AssetPool(ExitStack):
         return [models[parameters] for parameters in parameters_of_twins]
 
     def asset_at_start(self, twin: int, is_reusable: bool) -> Asset:
-        """Return the asset of a twin that flies alone, at its start.
+        """Return the asset of a twin that flies alone, in its state at the start of the mission.
 
         Parameters
         ----------
         twin : int
             The number of the twin in the shard.
         is_reusable : bool
-            Whether the flight before it went to its end, so that its asset can be set back.
+            Whether the previous flight ended without an error, so that its asset can be reset.
 
         Raises
         ------
@@ -298,7 +308,11 @@ class _AssetPool(ExitStack):
         return self._open_at_start(twin, is_reusable)
 
     def _open_at_start(self, twin: int, is_reusable: bool) -> Asset:
-        """Return the asset of a twin at its start: the open one set back, or a new one."""
+        """Return the asset of a twin in its start state.
+
+        The open asset is reset if it has the same parameters and seed; otherwise it is closed and a
+        new one is opened.
+        """
         key = self._keys[twin]
         if self._open_asset is not None and is_reusable and key == self._open_key:
             self._open_asset.restore_state(self._start_state)

@@ -1,4 +1,7 @@
-"""How the assets of a group stand after their last steps, from the store or from a watch."""
+"""State, control and alarms of the assets of a group after their last steps.
+
+They are read from the store of a flown fleet, or from the records of a watched one.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Standing:
-    """How B assets of a group stand after their last steps.
+    """State, control and alarms of B assets of a group after their last steps.
 
     Attributes
     ----------
@@ -30,13 +33,15 @@ class Standing:
     step : (B,) array
         The last step of each.
     mean, deviation : (B, F) array
-        Mean and standard deviation of the state, in SI units; NaN if no state is believed.
+        Mean and standard deviation of the state, in SI units; NaN if no state of the model
+        explains the observations.
     control : list of str
         The control in force.
     alarms : (B,) array
         The number of alarms.
     leaving : (B,) array
-        The probability that the control is left within the predicted steps; NaN if not known.
+        The probability that the control changes within the scenario's `prediction_steps`; NaN if
+        it is not known.
     """
 
     group: str
@@ -56,29 +61,31 @@ class Standing:
 
     @property
     def most_damaged(self) -> int | None:
-        """The number of the most severely damaged asset; None if no state is believed of any."""
+        """The index of the most severely damaged asset; None if no asset has an estimated state."""
         if np.isnan(self.severity).all():
             return None
         return int(np.nanargmax(self.severity))
 
 
 def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standing:
-    """Return how the twins of a group stood after their last steps.
+    """Return state, control and alarms of the flown twins of a group after their last steps.
 
-    The probabilities of leaving a control are NaN; computing them takes what the twins know.
+    The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
+    because they need the twins' model and policy, which the store does not hold.
 
     Parameters
     ----------
     record : mapping
-        The group in `config.json`.
+        The record of the group in `config.json`.
     group : Dataset
-        The group in the store.
+        The stored results of the group, with a row for each twin.
     """
+    # All scenarios of a group come from one scenario file, with equal states and controls.
     scenario = Scenario.model_validate(record["scenarios"][0])
     flown = flown_rows(group["status"].values)
     last_step = last_steps(group)[flown]
     at_last_step = (flown, last_step)
-    control = group["control_index"].values[at_last_step]
+    last_control = group["control_index"].values[at_last_step]
     names = [name for name, _seed, _scenario_number in record["members"]]
     return Standing(
         group=record["name"],
@@ -87,21 +94,22 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standin
         step=last_step,
         mean=believed_means(group)[at_last_step],
         deviation=group["standard_deviation"].values[at_last_step],
-        control=[scenario.control_names[index] for index in control],
+        control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm")[flown],
         leaving=np.full(len(flown), np.nan),
     )
 
 
 def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) -> Standing:
-    """Return how the assets of a watched group stand.
+    """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
     ----------
     record : mapping
-        The group in `config.json`.
+        The record of the group in `config.json`.
     assets : mapping
-        The records of assets with a decision by GROUP/NAME, of all groups; see `read_standing`.
+        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them;
+        each must have a last decision.
     """
     scenario = Scenario.model_validate(record["scenarios"][0])
     prefix = f"{record['name']}/"
@@ -123,16 +131,18 @@ def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) ->
 
 
 def _moments_of_states(scenario: Scenario, healths: list[dict[str, Any]], moment: str) -> Float:
-    """Return a moment of each factor of the state of B assets, a (B, F) array; NaN for None.
+    """Return a moment of each of F factors of the state of B assets, a (B, F) array.
+
+    It is NaN where the record has None.
 
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario, which names the factors.
     healths : list of dict
-        For each asset, the moments of each factor by its name.
+        For each asset, the moments of each factor by the factor's name.
     moment : str
-        The name of the moment.
+        The key of the moment: "mean" or "standard_deviation".
     """
     rows = []
     for health in healths:

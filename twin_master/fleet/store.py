@@ -1,4 +1,4 @@
-"""The store of a fleet: what is kept of each twin, in chunks of one shard."""
+"""The store of a fleet: arrays with a row for each twin, in chunks of one shard."""
 
 from collections.abc import Sequence
 from importlib import util
@@ -28,18 +28,21 @@ if TYPE_CHECKING:
 NOTICE_KINDS = ("alarm", "gauge_left_out")
 """The kinds of notices that are kept of each twin."""
 CREDIBILITY = 0.9
-"""Probability of the set of states in which the true one is looked for."""
+"""Probability of the credible set of states for which coverage of the true state is counted."""
 _TOLERANCE = 1e-9
-"""Rounding of probabilities: a difference below this is none."""
+"""Difference of two probabilities up to which they are taken as equal."""
 WITHIN = 2
 """Number of steps within which a fallback should follow the damage that calls for it."""
 
 FLOWN, FAILED, ENDED = 1, 2, 3
-"""Values of `status`; 0 has not flown yet."""
+"""Values of the variable `status`: mission flown to its end, flight failed, asset ended it early.
+
+The value 0 means that the twin has not flown yet.
+"""
 _NO_CONTROL = -1
-"""Control of steps that were not flown."""
+"""Value of `control_index` in steps that were not flown."""
 _NO_STEP = -1
-"""First step of a notice that was never given."""
+"""Value of `first_notice` for a kind of notice that was never given."""
 _NOT_DEFINED = -1
 """Value of `early` if the policy does not depend on the level of one factor alone."""
 
@@ -99,12 +102,12 @@ def dimension_sizes(scenario: Scenario) -> dict[str, int]:
 def stored_variables(
     knowledge: Knowledge, flights: Flights, members: Sequence[Member]
 ) -> dict[str, NDArray[Any]]:
-    """Return the variables of B twins as they are stored, with B rows each.
+    """Return the variables that are stored of B flown twins, with B rows each.
 
     Parameters
     ----------
     knowledge : Knowledge
-        What the twins know.
+        The knowledge that the twins share: model, policy and draws.
     flights : Flights
         Their flights.
     members : sequence of Member
@@ -112,7 +115,8 @@ def stored_variables(
     """
     has_failed = np.array([bool(sentence) for sentence in flights.failure])
     has_ended = np.array([bool(sentence) for sentence in flights.ended])
-    # Products of matrices twin by twin, so that a row does not depend on its neighbours.
+    # `np.matmul` multiplies (T, S) by (S, F) for each twin, so that the rounding of a row does not
+    # depend on the other twins of the shard. Variance: E[x^2] - E[x]^2.
     coordinates = knowledge.model.states.coordinates
     mean = np.matmul(flights.filtered, coordinates)
     variance = np.matmul(flights.filtered, coordinates**2) - mean**2
@@ -144,14 +148,14 @@ def stored_variables(
 
 
 def _steps_flown(flights: Flights) -> Index:
-    """Return how many steps each twin has flown, a (B,) array; a recording may end early."""
+    """Return the number of flown steps of each twin, a (B,) array."""
     return np.asarray((flights.control_index != _NO_CONTROL).sum(axis=1))
 
 
 def _last_belief(flights: Flights, has_failed: NDArray[np.bool_]) -> Float:
     """Return the belief after the last flown step of each twin, a (B, S) array.
 
-    Of a failed twin that of the last step of the mission is taken, which is NaN.
+    For a failed twin it is NaN: its row of the last step of the mission is NaN and is returned.
     """
     step_count = flights.control_index.shape[1]
     last_step = np.where(has_failed, step_count, _steps_flown(flights)) - 1
@@ -159,9 +163,9 @@ def _last_belief(flights: Flights, has_failed: NDArray[np.bool_]) -> Float:
 
 
 def _credible_fraction(knowledge: Knowledge, flights: Flights) -> Float:
-    """Return in which fraction of its steps each twin's credible set holds the true state, (B,).
+    """Return for each twin the fraction of steps with the true state in the credible set, (B,).
 
-    It is NaN for real assets, whose true state nobody knows.
+    It is NaN for real assets, whose true state is not known.
     """
     twin_count, step_count, factor_count = flights.state.shape
     is_inside = in_credible_set(
@@ -176,14 +180,14 @@ def _credible_fraction(knowledge: Knowledge, flights: Flights) -> Float:
 
 
 class _Notices(NamedTuple):
-    """The notices of B twins: lists with a row for each twin and a column for each kind.
+    """The notices of B twins: lists with a row for each twin and a column for each `NOTICE_KINDS`.
 
     Attributes
     ----------
     number : list of list of int
-        How many there are.
+        The number of notices.
     first_step : list of list of int
-        The step of the first one.
+        The step of the first notice; -1 if there is none.
     """
 
     number: list[list[int]]
@@ -191,7 +195,7 @@ class _Notices(NamedTuple):
 
 
 def _notices(flights: Flights) -> _Notices:
-    """Return how many notices of each kind twins gave, and in which step the first one."""
+    """Count the notices of each kind of each twin, and return the counts and the first steps."""
     numbers = []
     first_steps = []
     for notices_of_twin in flights.notices:
@@ -205,16 +209,20 @@ def _notices(flights: Flights) -> _Notices:
 
 
 class Fallbacks(NamedTuple):
-    """How the controls of B twins fell back to a gentler one.
+    """Fallbacks of B twins: changes from the first control to a gentler one because of damage.
+
+    A fallback is called for once the true state reaches a level at which the policy leaves the
+    first control.
 
     Attributes
     ----------
     delay : (B,) array
-        The steps from the damage that calls for the fallback to the fallback: infinite if it never
-        came, NaN if none was called for or the mission ended before it could be seen.
+        The number of steps from the call to the fallback. It is infinite if the fallback did not
+        come within the mission, and NaN if none was called for or if the mission ended within
+        `WITHIN` steps of the call without a fallback.
     early : (B,) array
-        Whether a fallback came before the damage that calls for it (1 or 0); -1 if the policy does
-        not depend on the level of one factor alone.
+        1 if a fallback came before it was called for, else 0; -1 if the policy does not depend on
+        the level of one factor alone.
     """
 
     delay: Float
@@ -222,7 +230,10 @@ class Fallbacks(NamedTuple):
 
 
 def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
-    """Return how the controls of twins fell back to a gentler one."""
+    """Return delays and early cases of the twins' fallbacks, from their flights.
+
+    Real assets have the delay NaN and -1 for `early`, because their true state is not known.
+    """
     scenario = knowledge.scenario
     first_control = scenario.control_names.index(scenario.mission.first_control)
     twin_count = len(flights.state)
@@ -230,7 +241,7 @@ def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
     early = np.full(twin_count, _NOT_DEFINED)
     for twin, steps_flown in enumerate(_steps_flown(flights).tolist()):
         true_state = flights.state[twin]
-        if np.isnan(true_state[0]).any():  # nobody knows the true state of a real asset
+        if np.isnan(true_state[0]).any():  # the true state of a real asset is not known
             continue
         fallback = find_fallback(
             knowledge.model.states,
@@ -253,10 +264,11 @@ def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
 def in_credible_set(
     model: GraphicalModel, probability: Float, true_state: Float, credibility: float = CREDIBILITY
 ) -> NDArray[np.bool_]:
-    """Return whether the smallest set of states with a probability holds the true state.
+    """Return whether the true state lies in the credible set of each of T beliefs.
 
-    Between the levels of a factor the true state counts as the nearest level, and half-way between
-    two levels as either. Of equally probable states, all are in the set or none.
+    The credible set is the smallest set of states whose probability is at least `credibility`; of
+    states with equal probabilities it contains all or none. A true value between two levels of a
+    factor is replaced by the nearest level; half-way between them, either level counts.
 
     Parameters
     ----------
@@ -267,20 +279,22 @@ def in_credible_set(
     true_state : (T, F) array
         The true state, in SI units.
     credibility : float
-        The probability of the set.
+        The least probability of the set.
 
     Returns
     -------
     (T,) array
-        Whether the set holds the true state.
+        Whether the set contains the true state.
     """
+    # Joint states whose level of every factor is nearest to the true value.
     is_nearest = np.ones((len(true_state), model.states.size), dtype=bool)
     for axis, factor in enumerate(model.states.factors):
         true_value = true_state[:, axis, None]
         least_distance = np.abs(np.asarray(factor.levels) - true_value).min(axis=1, keepdims=True)
         distance = np.abs(model.states.coordinates[:, axis] - true_value)  # (T, S)
         is_nearest &= distance <= least_distance + factor.slack
-    # The least probable state of the set: the first at which the sum reaches the credibility.
+    # Sum the probabilities in descending order. The set ends with the state at which the sum
+    # reaches the credibility; all states at least as probable as that one are in the set.
     descending = -np.sort(-probability, axis=1)
     is_reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
     least_probability = descending[np.arange(len(descending)), np.argmax(is_reached, axis=1)]
@@ -308,7 +322,7 @@ def check_installed(*packages: str) -> None:
 
 
 def open_group(folder: Path, group: str) -> "xr.Dataset":
-    """Return a group of the store, whose arrays are read when they are used.
+    """Open a group of the store as a Dataset whose arrays are read from disk at first use.
 
     Parameters
     ----------
@@ -344,7 +358,7 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
 
 
 def create_store(folder: Path, fleet: Fleet) -> None:
-    """Create the arrays of a fleet of which nothing has flown."""
+    """Create the arrays of a fleet's store, filled with the values of twins that have not flown."""
     import zarr
 
     with explained_write_errors(folder / STORE_NAME):

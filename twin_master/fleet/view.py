@@ -1,4 +1,4 @@
-"""The page of a fleet in the browser: while it flies, while it is watched, or afterwards."""
+"""The live report of a fleet in the browser: while it flies, while it is watched, or afterwards."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,7 +24,7 @@ def is_fleet(folder: Path) -> bool:
 
 
 def _always() -> bool:
-    """Return that a page is wanted for ever."""
+    """Return True, so that a page is served until the process ends."""
     return True
 
 
@@ -34,7 +34,7 @@ def serve_fleet(
     ready: Callable[[str], None],
     wanted: Callable[[], bool] = _always,
 ) -> None:
-    """Show a fleet to browsers of this machine.
+    """Serve the report of a fleet to browsers on this machine, and renew it when files change.
 
     Parameters
     ----------
@@ -43,9 +43,9 @@ def serve_fleet(
     port : int
         The port of the server; 0 takes a free one.
     ready : callable
-        Called with the address once the page can be seen.
+        Called with the address once the server answers.
     wanted : callable
-        Returns whether the page is still wanted.
+        Returns whether to go on serving; by default for ever.
     """
     page = _CurrentPage(folder)
     texts = {
@@ -57,7 +57,7 @@ def serve_fleet(
 
 
 class _CurrentPage:
-    """The page of a fleet, made again whenever the fleet has changed.
+    """The report of a fleet as HTML, which is rendered again when its files have changed.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ class _CurrentPage:
         self._version = 0
 
     def version(self) -> str:
-        """Return the number of the page, which grows when the fleet has changed.
+        """Render the page again if the fleet's files have changed, and return its version number.
 
-        Files that cannot be read are just being written; they are looked at again next time.
+        If a file cannot be read, because it is being written, the former page and version stay.
         """
         with suppress(TwinMasterError, ReportingError, OSError, ValueError):
             stamps = _file_stamps(self._folder)
@@ -85,13 +85,13 @@ class _CurrentPage:
         return str(self._version)
 
     def html(self) -> str:
-        """Return the page, with a script that looks for changes."""
+        """Return the current page, with a script that asks the server for newer versions."""
         script = f'<script src="/view.js" data-version="{self.version()}"></script>'
         return self._html.replace("</body>", f"{script}</body>")
 
 
 def _file_stamps(folder: Path) -> list[tuple[str, int, int]]:
-    """Return name, time of modification [ns] and size of the files on which the page rests."""
+    """Return name, time of modification [ns] and size of the files from which the page is made."""
     stamps = []
     for name in (JOURNAL_NAME, STATE_NAME, LESSONS_NAME):
         path = folder / name

@@ -18,11 +18,11 @@ from twin_master.watch.mqtt import Topic
 from twin_master.watch.mqtt_session import Session
 
 STEPS_AT_ONCE = 64
-"""Steps of one asset before the next asset is looked at."""
+"""Largest number of steps of one asset that are processed before the next asset has its turn."""
 BUSY_SECONDS = 2.0
-"""Time after which a broker with many messages lets the other sources have a turn [s]."""
+"""Longest time for which one source reads messages before the next source has its turn [s]."""
 LARGEST_FLEET = 100_000
-"""Largest number of assets; a broker could name more of them without end."""
+"""Largest number of assets, because a broker can send messages on any number of topics."""
 _LONGEST_HEADER = 100_000
 """Largest number of bytes of the header of a file."""
 
@@ -40,7 +40,7 @@ class BrokerMessage(Protocol):
 
 
 class Watcher(Protocol):
-    """What sources need of the watch of a fleet; `FleetWatch` has it.
+    """The part of the watch of a fleet that sources use; `FleetWatch` implements it.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Watcher(Protocol):
     assets : dict of str to WatchedAsset
         The assets under watch.
     is_end_requested : bool
-        Whether the watch is to end.
+        Whether the operator has asked for the end of the watch.
     final_actions : ExitStack
         The actions at the end of the watch, before the folders are released.
     """
@@ -69,10 +69,10 @@ class Watcher(Protocol):
         open_feed: Callable[[], Feed],
         most_steps: int | None = None,
     ) -> int:
-        """Take in what has come of an asset; return the number of steps."""
+        """Process the new observations of an asset; return the number of steps."""
 
     def has_all_steps(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset has the steps that were wanted."""
+        """Return whether an asset has reached the number of steps that was asked for."""
 
     def lose(self, key: str, error: Exception) -> None:
         """Stop watching an asset because of an error."""
@@ -83,10 +83,10 @@ class Source(Protocol):
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing more is to be read."""
+        """Whether all observations are read and no more can come."""
 
     def look(self, *, for_new_assets: bool) -> int:
-        """Take in what is new; return the number of steps."""
+        """Process the new observations of all assets of the group; return the number of steps."""
 
 
 class FileSource:
@@ -99,12 +99,12 @@ class FileSource:
     group : Group
         The group.
     follow : bool
-        Whether files grow and new ones come.
+        Whether to wait for new lines in the files and for new files.
 
     Raises
     ------
     FleetError
-        If there is no file, and none can come.
+        If there is no file and `follow` is false.
     """
 
     def __init__(self, watcher: Watcher, group: Group, *, follow: bool) -> None:
@@ -120,7 +120,7 @@ class FileSource:
 
     @property
     def has_ended(self) -> bool:
-        """Whether all files are read to their end, or as far as was wanted."""
+        """Whether all files are read to their end, or to the number of steps that was asked for."""
         if self._follow:
             return False
         for name in self._files:
@@ -130,21 +130,21 @@ class FileSource:
         return True
 
     def _is_read(self, asset: WatchedAsset) -> bool:
-        """Return whether the file of an asset is read to its end, or as far as was wanted."""
+        """Return whether the file of an asset is read to its end or has all steps asked for."""
         return asset.watch.intake.has_ended or self._watcher.has_all_steps(asset)
 
     def look(self, *, for_new_assets: bool) -> int:
-        """Take in what is new in the files; return the number of steps.
+        """Process the new lines of all files, each with its asset; return the number of steps.
 
         Parameters
         ----------
         for_new_assets : bool
-            Whether new files are searched for, too.
+            Whether to search first for files of assets that were not known before.
         """
         if for_new_assets:
             for path in recording_files(self._group.observations):
                 self._add_file(path)
-        scenario = self._group.scenarios[0]
+        scenario = self._group.scenarios[0]  # real assets of a group share one scenario
         steps = 0
         for name, path in self._files.items():
             open_feed = partial(file_feed, path, scenario, follow=self._follow)
@@ -162,7 +162,7 @@ class FileSource:
 
 
 def _has_whole_header(path: Path) -> bool:
-    """Return whether the first line of a file that grows is whole."""
+    """Return whether the first line of a file ends with a line break; false if it is unreadable."""
     try:
         with path.open("rb") as file:
             return file.readline(_LONGEST_HEADER).endswith(b"\n")
@@ -171,7 +171,7 @@ def _has_whole_header(path: Path) -> bool:
 
 
 class TopicSource:
-    """A topic of a broker for each asset of a group, which is named after its last level.
+    """A topic of a broker for each asset of a group; the last level of the topic names the asset.
 
     Parameters
     ----------
@@ -196,13 +196,15 @@ class TopicSource:
         self._topics: dict[str, Topic] = {}
 
     def look(self, *, for_new_assets: bool) -> int:
-        """Take in what the broker has sent; return the number of steps.
+        """Process the messages that the broker has sent; return the number of steps.
+
+        A message on a new topic begins the watch of a new asset.
 
         Parameters
         ----------
         for_new_assets : bool
-            Whether all known topics are looked at, too: what came while an asset was lost waits
-            there.
+            Whether to process first the messages that wait in the queues of all known topics. They
+            came while the watch of their asset was interrupted by an error.
         """
         begin = time.monotonic()
         steps = 0
@@ -213,7 +215,7 @@ class TopicSource:
                 steps += self._advance(name)
         while not self._watcher.is_end_requested:
             message = next(self._messages)
-            if message is None:
+            if message is None:  # none has come; the iterator itself never ends
                 break
             steps += self._take_in(message)
             if time.monotonic() - begin > BUSY_SECONDS:
@@ -223,14 +225,17 @@ class TopicSource:
     def _add_topics_of_folder(self) -> None:
         """Add the topics of assets that were watched before.
 
-        These may be silent, or have decisions that are still to be published.
+        They may send nothing for a long time, or have decisions that are not published yet.
         """
         group_folder = self._watcher.folder / self._group.name
         for path in sorted(group_folder.glob(f"*/{CONFIG_NAME}")):
             self._find_topic(path.parent.name)
 
     def _take_in(self, message: BrokerMessage) -> int:
-        """Take in a message of the broker; return the number of steps."""
+        """Queue a message at its topic and process the topic; return the number of steps.
+
+        It is ignored if its asset has all steps asked for, or if there are too many assets.
+        """
         name = message.topic.rpartition("/")[2]
         asset = self._watcher.assets.get(f"{self._group.name}/{name}")
         topic = self._find_topic(name)
@@ -240,7 +245,7 @@ class TopicSource:
         return self._advance(name)
 
     def _find_topic(self, name: str) -> Topic | None:
-        """Return the topic of an asset, a new one if need be; None if there are too many."""
+        """Return the topic of an asset, and create it if it is new; None if there are too many."""
         if name not in self._topics and len(self._topics) < LARGEST_FLEET:
             lose = partial(self._watcher.lose, f"{self._group.name}/{name}")
             self._topics[name] = Topic(
@@ -249,11 +254,11 @@ class TopicSource:
         return self._topics.get(name)
 
     def _advance(self, name: str) -> int:
-        """Take in all that has come on the topic of an asset; return the number of steps."""
+        """Process all messages in the queue of an asset's topic; return the number of steps."""
         return self._watcher.advance(self._group, name, lambda: self._topics[name])
 
     def _heartbeat(self) -> dict[str, Any]:
-        """Return what the watch tells the broker regularly."""
+        """Return the status of the watch, which the session publishes at regular intervals."""
         watches = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         return {
             "state": "watching",

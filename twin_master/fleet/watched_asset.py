@@ -1,4 +1,4 @@
-"""One asset of a fleet under watch, and how the assets of a watched fleet stand."""
+"""One asset of a fleet under watch, and the file with the last decisions of all assets."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ _KEPT_OF_DECISION = ("step", "control", "next_control", "probability", "health")
 
 
 def read_standing(folder: Path) -> dict[str, Any]:
-    """Return how the assets of a watched fleet stand.
+    """Read the last decisions and alarms of the assets of a watched fleet.
 
     Parameters
     ----------
@@ -33,9 +33,10 @@ def read_standing(folder: Path) -> dict[str, Any]:
     dict
         `assets` and `failures`, both empty if nothing was watched. For each asset, `last` is its
         last decision, None before the first one; `alarms` and `refused` are the numbers of alarms
-        and of refused messages; `leaving` is the probability that its control is left within the
-        predicted steps, and `severity` the severity of its damage. The last two are None if no
-        state is believed.
+        and of refused messages; `leaving` is the probability that its control changes within the
+        scenario's `prediction_steps`, and `severity` the severity of its damage. The last two are
+        None if no state of the model explains the observations. `failures` holds for each asset
+        that is not watched the reason.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
     Parameters
     ----------
     standing : mapping
-        The content of `read_standing`.
+        What `read_standing` returns.
     """
     assets = standing["assets"].values()
     decisions = [asset["last"] for asset in assets if asset["last"] is not None]
@@ -87,9 +88,10 @@ class WatchedAsset:
     decision : dict or None
         The last decision.
     alarms : set of str
-        The sentences of the alarms that the operator was given since the watch was taken up.
+        The sentences of the alarms that the operator was given since this process began or
+        resumed the watch.
     first_new_step : int
-        The first step of which the operator was told nothing before.
+        The first step whose decision no earlier process has recorded.
     close : callable
         Releases its folder.
     """
@@ -118,11 +120,13 @@ class WatchedAsset:
             for _step, notice in notices_since(watch, self.first_new_step):
                 if notice.kind == "alarm":
                     self.alarms.add(notice.sentence)
+            # A resumed watch has no filtered belief yet. The smoothed belief of its last step alone
+            # is the filtered one.
             last_carried = watch.twin.carried[-1:]
             watch.filtered = watch.twin.estimator.smoothed(last_carried)[0]
 
     def record(self) -> dict[str, Any]:
-        """Return how the asset stands; see `read_standing`."""
+        """Return the last decision and the alarms of the asset; see `read_standing`."""
         record: dict[str, Any] = {
             "last": None,
             "alarms": self._previous_alarms + len(self.alarms),

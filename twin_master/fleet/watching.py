@@ -1,4 +1,4 @@
-"""Many real assets under watch: each as `uav-twin watch` watches one, with the same folder."""
+"""The watch of many real assets by one process; each has the folder of a `uav-twin watch`."""
 
 import json
 import re
@@ -31,30 +31,33 @@ SEARCH_SECONDS = 2.0
 STATE_SECONDS = 2.0
 """Time between two writings of the state [s]."""
 AGAIN_SECONDS = 30.0
-"""Time after which a lost asset is taken up again [s]; it doubles while the reason is the same."""
+"""Time until the watch of an asset is resumed after an error [s].
+
+It doubles each time the same error comes again.
+"""
 LONGEST_AGAIN = 3600.0
-"""Largest such time [s]."""
+"""Largest time until the watch of an asset is resumed after an error [s]."""
 IDLE_SECONDS = 0.05
 """Shortest pause if nothing came [s]."""
 LONGEST_IDLE = 1.0
 """Longest pause if nothing came [s]."""
 BUSY_SHARE = 0.2
-"""Fraction of a processor's time that looking in vain may take."""
+"""Fraction of a processor's time that polling sources without new messages may take."""
 _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")
 
 
 @dataclass
 class _Loss:
-    """The loss of an asset.
+    """An error that has interrupted the watch of an asset.
 
     Attributes
     ----------
     sentence : str
-        Why the asset was lost.
+        The message of the error.
     wait : float
-        How long it is left alone [s].
+        The time from the error until the watch is resumed [s].
     again : float
-        When it is taken up again, on the monotonic clock [s].
+        The time on the monotonic clock at which the watch is resumed [s].
     """
 
     sentence: str
@@ -63,11 +66,11 @@ class _Loss:
 
 
 def _do_nothing() -> None:
-    """Do nothing after a look at all sources."""
+    """Do nothing after a poll of all sources."""
 
 
 class FleetWatch:
-    """A fleet under watch by this process.
+    """The watch of a fleet of real assets by this process.
 
     Parameters
     ----------
@@ -77,31 +80,33 @@ class FleetWatch:
         The folder of the fleet, with the folder of a watch for each asset; a fleet that was
         watched there before is continued.
     tell : callable
-        Called with the asset and each of its decisions, once the decision is written down.
+        Called with the asset and each of its decisions, once the decision is in the journal.
     note : callable
-        Called with sentences on assets that are lost, and on brokers.
+        Called with sentences for the operator: on errors that interrupt the watch of an asset, and
+        on brokers.
     follow : bool
-        Whether files grow and new ones come.
+        Whether to wait for new lines in the files and for new files.
     steps : int, optional
-        The number of steps of each asset after which it is left alone.
+        The number of steps after which no more observations of an asset are processed.
     authority : Path, optional
-        The certificate of the authority of a broker.
+        The certificate of the authority that has signed the broker's certificate.
 
     Raises
     ------
     FleetError, MissionInputError
-        If a group is flown and not watched, if it has no recording, or if an address is wrong.
+        If a group is of simulated assets, if it has no recording, or if an address is wrong.
     RunFolderError, NotResumableError
         If the folder holds something else, or was begun with another version.
 
     Attributes
     ----------
     assets : dict of str to WatchedAsset
-        The assets under watch, without those that are lost.
+        The assets under watch, by GROUP/NAME; an asset whose watch an error has interrupted is not
+        among them.
     standing : dict
-        How all assets stood at the last writing of the state; see `read_standing`.
+        The records of all assets as last written to the file; see `read_standing`.
     is_end_requested : bool
-        Whether the watch is to end between two steps.
+        Whether the watch is to end after the present step.
     """
 
     def __init__(
@@ -124,7 +129,7 @@ class FleetWatch:
         self._note = note
         self._wanted_steps = steps
         self._lost: dict[str, _Loss] = {}
-        # The first watch of each group: others share what its twin knows.
+        # The first watch of each group: the other watches share the knowledge of its twin.
         self._sibling: dict[str, Watch] = {}
         _check_observed(fleet)
         self._sources: list[Source] = []
@@ -144,12 +149,12 @@ class FleetWatch:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why assets are not watched, until they are taken up again; the others go on."""
+        """The errors of the assets whose watch is interrupted, by GROUP/NAME."""
         return {key: loss.sentence for key, loss in self._lost.items() if key not in self.assets}
 
     @property
     def complaints(self) -> dict[str, str]:
-        """Why messages of watched assets were of no use, by asset; see `Intake.complaint`."""
+        """Why messages of watched assets could not be used, by asset; see `Intake.complaint`."""
         complaints = {}
         for key, asset in sorted(self.assets.items()):
             complaint = asset.watch.intake.complaint()
@@ -163,15 +168,16 @@ class FleetWatch:
         Parameters
         ----------
         after_look : callable
-            Called after each look at all sources.
+            Called after each poll of all sources.
 
         Raises
         ------
         DiskFullError
-            If the disk is full; what was observed is kept.
+            If the disk is full; the journals keep all steps before that.
         MissionInputError
             If a broker does not answer, or refuses the twin.
         """
+        # Negative, so that the first poll searches for assets.
         last_state = -SEARCH_SECONDS
         last_search = -SEARCH_SECONDS
         # The final actions run before the folders are released, into which they may still write.
@@ -203,10 +209,10 @@ class FleetWatch:
         open_feed: Callable[[], Feed],
         most_steps: int | None = None,
     ) -> int:
-        """Take in what has come of an asset.
+        """Process the new observations of an asset.
 
-        If the asset is not watched, its watch is begun or continued, unless it was lost a short
-        time ago.
+        If the asset is not watched, its watch is begun or resumed first, unless an error has
+        interrupted it and the waiting time is not over.
 
         Parameters
         ----------
@@ -217,12 +223,12 @@ class FleetWatch:
         open_feed : callable
             Returns the feed of its observations.
         most_steps : int, optional
-            The largest number of steps.
+            The largest number of steps to process; by default all that have come.
 
         Returns
         -------
         int
-            The number of steps.
+            The number of processed steps.
         """
         key = f"{group.name}/{name}"
         is_waiting = key in self._lost and time.monotonic() < self._lost[key].again
@@ -250,7 +256,7 @@ class FleetWatch:
         return steps
 
     def _take_up(self, group: Group, name: str, feed: Feed) -> None:
-        """Begin the watch of an asset, or continue it.
+        """Begin or resume the watch of an asset, and hand on a decision that was not handed on.
 
         Raises
         ------
@@ -268,11 +274,12 @@ class FleetWatch:
         self.assets[key] = asset
         last_decision = asset.decision
         if last_decision is not None and last_decision["step"] >= asset.first_new_step:
-            # The process may have been killed before the decision was handed on.
+            # The former process may have been killed after it wrote the decision to the journal
+            # and before it handed the decision on.
             self._hand_on(asset, last_decision)
 
     def _open_asset(self, group: Group, name: str, feed: Feed) -> WatchedAsset:
-        """Return an asset whose watch has begun and whose folder is locked."""
+        """Begin or resume the watch of an asset in its locked folder, and return the asset."""
         key = f"{group.name}/{name}"
         folder = self.folder / group.name / name
         sibling = self._sibling.get(group.name)
@@ -294,7 +301,10 @@ class FleetWatch:
         return asset
 
     def _hand_on(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
-        """Hand a decision on to the operator and to the source of the observations."""
+        """Send a decision to the operator and to the feed of the asset, and record its alarms.
+
+        A notice before the first step has no control, and is not kept as the last decision.
+        """
         if "control" in decision:
             asset.decision = decision
         self._tell(asset, decision)
@@ -304,23 +314,23 @@ class FleetWatch:
                 asset.alarms.add(notice["sentence"])
 
     def ask(self) -> None:
-        """Ask for an end between two steps."""
+        """Ask the watch to end after the present step."""
         self.is_end_requested = True
 
     def has_all_steps(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset has the steps that were wanted."""
+        """Return whether an asset has reached the number of steps that was asked for."""
         return self._wanted_steps is not None and asset.watch.twin.steps >= self._wanted_steps
 
     def lose(self, key: str, error: Exception) -> None:
         """Stop watching an asset because of an error, and release its folder.
 
-        The operator is told once; if the same error comes again, the asset is left alone twice as
-        long.
+        The watch is resumed after a time. If the same error comes again, this time doubles and the
+        operator gets no second message.
 
         Raises
         ------
         DiskFullError
-            If that is the error, since it concerns all assets.
+            If the error is this one, because it concerns all assets.
         """
         if isinstance(error, DiskFullError):
             raise error
@@ -341,7 +351,7 @@ class FleetWatch:
             asset.close()
 
     def _write_state(self) -> None:
-        """Write how all assets stand."""
+        """Write the records of all assets to the file that `read_standing` reads."""
         records = {name: asset.record() for name, asset in sorted(self.assets.items())}
         self.standing = {
             "assets": {**self._records_of_lost, **records},
@@ -356,7 +366,7 @@ def _check_observed(fleet: Fleet) -> None:
     Raises
     ------
     FleetError
-        If any is not.
+        If a group has no `observations`.
     """
     unobserved = [group.name for group in fleet.groups if not group.observations]
     if unobserved:
@@ -366,7 +376,10 @@ def _check_observed(fleet: Fleet) -> None:
 
 
 def _record(fleet: Fleet) -> dict[str, Any]:
-    """Return a watched fleet for its configuration: without members, which come and go."""
+    """Return the record of a watched fleet for `config.json`.
+
+    It has no members, because assets are added and lost during the watch.
+    """
     groups = []
     for group in fleet.groups:
         scenario = group.scenarios[0].portable().to_dict()
@@ -375,7 +388,7 @@ def _record(fleet: Fleet) -> dict[str, Any]:
 
 
 def _allow_many_files() -> None:
-    """Let this process open as many files as the system allows: each asset needs three."""
+    """Raise this process's limit of open files to the largest allowed: each asset needs three."""
     import resource
 
     _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -383,5 +396,5 @@ def _allow_many_files() -> None:
 
 
 def _pause_after(look_seconds: float) -> None:
-    """Sleep after a look in vain, the longer the more time it took [s]."""
+    """Sleep after a poll without new messages, in proportion to the time of the poll [s]."""
     time.sleep(min(max(IDLE_SECONDS, look_seconds / BUSY_SHARE), LONGEST_IDLE))

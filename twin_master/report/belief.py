@@ -1,4 +1,7 @@
-"""Figures of the belief over the joint states step by step, and of the policy over the states."""
+"""Figures of the belief about the state over the steps, and of the policy over the states.
+
+The belief is a probability distribution over the joint states, the combinations of factor levels.
+"""
 
 from typing import Any
 
@@ -43,7 +46,7 @@ _DARK_CELL = 0.62
 
 
 def belief_steps(run: Run) -> list[int]:
-    """Return the rows of a few steps, spread evenly from the first to the last."""
+    """Return the rows of at most `_BELIEF_PANELS` evenly spaced steps, from first to last."""
     even_steps = np.linspace(0, run.step_count - 1, _BELIEF_PANELS).round().astype(int)
     return [int(step) for step in np.unique(even_steps)]
 
@@ -85,7 +88,10 @@ def _joint_figure(run: Run) -> Figure:
 
 
 def _draw_joint_belief(axes: Axes, run: Run, step: int) -> QuadMesh:
-    """Draw the joint belief of two factors in a step, its mean and the truth; return the map."""
+    """Draw the joint belief of two factors in the step of a row, its mean and the true state.
+
+    Return the map, for its colour bar.
+    """
     image = _draw_state_map(axes, run, run["filtered/probability"][step], **_PROBABILITY_COLORS)
     axes.set_title(f"{run.step_word} {run.first_step + step}", fontweight="normal", pad=3.0)
     x, y = run.factor_scales * run["filtered/mean"][step]
@@ -104,7 +110,7 @@ def _draw_joint_belief(axes: Axes, run: Run, step: int) -> QuadMesh:
 
 
 def draw_step_map(axes: Axes, run: Run, values: Float, first_number: int, **look: Any) -> QuadMesh:
-    """Draw values over the steps as a map, and return it.
+    """Draw n values over T steps as a map of coloured cells, and return the map.
 
     Parameters
     ----------
@@ -113,7 +119,7 @@ def draw_step_map(axes: Axes, run: Run, values: Float, first_number: int, **look
     run : Run
         The run.
     values : (T, n) array
-        The values; those of one step stand above each other.
+        The values; those of one step form a column of the map.
     first_number : int
         The vertical coordinate of the first of the n values.
     **look : object
@@ -137,6 +143,7 @@ def _marginal_figure(run: Run) -> Figure:
         image = draw_step_map(axes, run, marginal, 0, **_PROBABILITY_COLORS)
         if run.true_state is not None:
             true_level = factor.scale * run.true_state[:, index]
+            # The levels are drawn at equal distances: interpolate between their numbers.
             height = np.interp(true_level, factor.levels, level_numbers)
             axes.plot(run.step_numbers, height, color=style.TRUTH, linewidth=1.0, label="truth")
         axes.set_yticks(level_numbers, [short_number(level) for level in factor.levels])
@@ -148,8 +155,12 @@ def _marginal_figure(run: Run) -> Figure:
 
 
 def _cell_edges(levels: Float) -> Float:
-    """Return the edges of the cells of L levels, half-way between them, an (L + 1,) array."""
+    """Return the edges of the cells of L levels, an (L + 1,) array.
+
+    Inner edges are half-way between levels, and the outer cells extend as far to either side.
+    """
     if len(levels) == 1:
+        # No distance between levels is given: take the level itself, or 1 if it is 0.
         half_width = 0.5 * abs(float(levels[0])) or 0.5
         return np.array([levels[0] - half_width, levels[0] + half_width])
     middles = (levels[1:] + levels[:-1]) / 2
@@ -190,7 +201,10 @@ def _draw_state_map(axes: Axes, run: Run, values: NDArray[Any], **look: Any) -> 
 
 @style.publication_style()
 def policy_figure(run: Run) -> Figure:
-    """Draw the policy over the plane of two factors, and the margin by which its control wins."""
+    """Draw the policy over the plane of two factors, and the margin of its decision in each state.
+
+    The margin is the difference of the action values of two controls; see `_draw_margin`.
+    """
     figure, ((policy_axes, margin_axes),) = style.panels(
         1, 2, 3.2, 0.54, 0.45, left=0.075, right=0.91, wspace=0.22
     )
@@ -203,7 +217,7 @@ def policy_figure(run: Run) -> Figure:
 
 
 def _draw_policy(axes: Axes, run: Run) -> None:
-    """Draw the control of each state, and the path of the estimated mean through the states."""
+    """Draw the policy's control in each state, and the path of the estimated mean state."""
     count = len(run.controls)
     colors = [_CONTROL_COLORS[number % len(_CONTROL_COLORS)] for number in range(count)]
     _draw_state_map(
@@ -246,8 +260,9 @@ def _add_policy_legend(axes: Axes, run: Run, colors: list[str]) -> None:
 def _draw_margin(figure: Figure, axes: Axes, run: Run) -> None:
     """Draw the difference of action values in each state.
 
-    Of two controls, the value of the first is subtracted from that of the second; of several
-    controls, the value of the next best from that of the best.
+    An action value is the expected discounted reward of a control in a state. With two
+    controls, the value of the first is subtracted from that of the second; with more, the
+    second-largest value from the largest.
     """
     action_values = run["policy/action_value"]  # (S, U)
     if action_values.shape[1] == 2:
@@ -260,14 +275,16 @@ def _draw_margin(figure: Figure, axes: Axes, run: Run) -> None:
         subtrahend = increasing[:, -2]
         label = "value beyond the next best"
     margin = minuend - subtrahend
-    largest = float(np.abs(margin).max()) or 1.0
+    largest_margin = float(np.abs(margin).max()) or 1.0
     if len(run.controls) == 2:  # the margin has either sign
-        image = _draw_state_map(axes, run, margin, cmap="PuOr", vmin=-largest, vmax=largest)
+        image = _draw_state_map(
+            axes, run, margin, cmap="PuOr", vmin=-largest_margin, vmax=largest_margin
+        )
     else:
-        image = _draw_state_map(axes, run, margin, cmap="Purples", vmin=0.0, vmax=largest)
+        image = _draw_state_map(axes, run, margin, cmap="Purples", vmin=0.0, vmax=largest_margin)
     coordinates = run.factor_scales * run.model.states.coordinates
     for (x, y), value in zip(coordinates, margin, strict=True):
-        is_dark = abs(value) > _DARK_CELL * largest
+        is_dark = abs(value) > _DARK_CELL * largest_margin
         axes.text(
             x,
             y,

@@ -1,4 +1,4 @@
-"""The calibration of the twin's model in a report: its measurements and its uncertain parameter."""
+"""The figure of the calibration of the twin's model: measurements and uncertain parameter."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ class LoadTest(NamedTuple):
 
 
 def true_value(run: Run) -> float | None:
-    """Return the value that the calibrated parameter has in the asset; None if nobody knows it."""
+    """Return the true value of the calibrated parameter in the asset; None if it is not known."""
     name = run.scenario.calibration.parameter
     stated_value = run.scenario.asset.true_parameters.get(name)
     if stated_value is not None:
@@ -46,7 +46,7 @@ def true_value(run: Run) -> float | None:
 
 
 def _starts_at_calibrated_mean(run: Run) -> bool:
-    """Return whether what was flown has the mean of the calibration as its parameter.
+    """Return whether the simulated asset was given the calibrated mean as its parameter.
 
     This holds for an FMU that was packed from the calibration, and for the simulation of a model
     that a campaign calibrated.
@@ -58,7 +58,10 @@ def _starts_at_calibrated_mean(run: Run) -> bool:
 
 
 def calibrated_moments(run: Run) -> tuple[float, float]:
-    """Return the mean and the standard deviation of the calibrated parameter."""
+    """Return mean and standard deviation of the calibrated parameter.
+
+    They are those of the posterior or, if it is not recorded, of the draws.
+    """
     posterior = run.calibration.get("state", {}).get(run.scenario.calibration.parameter)
     if posterior:
         return posterior["mean"], posterior["standard_deviation"]
@@ -101,7 +104,10 @@ def calibration_figure(run: Run) -> Figure:
 
 
 def _draw_load_test(axes: Axes, test: LoadTest) -> None:
-    """Draw the measured pairs, and the line of the calibrated stiffness with its band."""
+    """Draw the measured loads and displacements, and the line of the calibrated stiffness.
+
+    Its band is that of two standard deviations of the stiffness. Displacements are drawn in mm.
+    """
     loads = np.linspace(0.0, 1.08 * float(test.load.max()), 2)
     two_deviations = 2.0 * test.stiffness_deviation
     low = 1.0e3 * loads / (test.stiffness + two_deviations)
@@ -124,10 +130,11 @@ def _draw_load_test(axes: Axes, test: LoadTest) -> None:
 
 
 def _draw_parameter(axes: Axes, run: Run, label: str) -> None:
-    """Draw the draws of the uncertain parameter, its prior and posterior, and the truth."""
+    """Plot histogram, prior, posterior and true value of the uncertain parameter."""
     draws = run["calibration/draw_value"]
     center = float(draws.mean())
     deviation = float(draws.std())
+    # 4.5 standard deviations show the tails; without any, a narrow range about the value is drawn.
     half_width = 4.5 * deviation if deviation > 0 else 1e-3 * max(abs(center), 1.0)
     low = center - half_width
     high = center + 1.5 * half_width  # leaves room for the legend
@@ -150,7 +157,7 @@ def _draw_parameter(axes: Axes, run: Run, label: str) -> None:
 
 
 def _draw_draws(axes: Axes, draws: Float) -> None:
-    """Draw the histogram of the parameter's draws, or a line if all draws are equal."""
+    """Plot the histogram of the parameter's draws, or a vertical line if all draws are equal."""
     if float(draws.std()) == 0.0:
         axes.axvline(float(draws.mean()), color=style.PRESENT, label="value used")
         return
@@ -166,7 +173,7 @@ def _draw_draws(axes: Axes, draws: Float) -> None:
 
 
 def _prior_range(record: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the bounds of the parameter's prior in the record of a calibration."""
+    """Return the bounds of the prior in a calibration's record; infinite if it has none."""
     prior = record.get("prior", {})
     if not prior.get("standard_deviation") or "range" not in prior:
         return -np.inf, np.inf
@@ -175,7 +182,10 @@ def _prior_range(record: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _draw_prior(axes: Axes, record: Mapping[str, Any], low: float, high: float) -> None:
-    """Draw the prior, a truncated normal distribution, between two values; without one nothing."""
+    """Plot the density of the prior, a truncated normal distribution, between two values.
+
+    Nothing is plotted if the record has no prior.
+    """
     prior = record.get("prior", {})
     if not prior.get("standard_deviation"):
         return
@@ -183,6 +193,7 @@ def _draw_prior(axes: Axes, record: Mapping[str, Any], low: float, high: float) 
     deviation = prior["standard_deviation"]
     lowest, highest = _prior_range(record)
     x = np.linspace(max(low, lowest), min(high, highest), 200)
+    # SciPy expects the bounds in standard deviations from the mean.
     density = truncnorm.pdf(
         x, (lowest - mean) / deviation, (highest - mean) / deviation, mean, deviation
     )
@@ -190,7 +201,7 @@ def _draw_prior(axes: Axes, record: Mapping[str, Any], low: float, high: float) 
 
 
 def _draw_posterior(axes: Axes, record: Mapping[str, Any], low: float, high: float) -> None:
-    """Draw the posterior density between two values; without one nothing."""
+    """Plot the posterior density between two values, if the record has a posterior."""
     posterior = record.get("posterior")
     if not posterior:
         return

@@ -1,4 +1,7 @@
-"""Titles and captions of the figures of a report: the fields of the texts in `words.toml`."""
+"""Titles and captions of the figures of a report.
+
+Their texts are templates in `words.toml`; the functions here fill in the fields of the templates.
+"""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,40 +18,43 @@ WORDS = Words("twin_master.report")
 """The texts of the report."""
 
 MISSION_NOW = "mission_now"
-"""The name of the figure of the mission as seen at the present step."""
+"""The name of the figure with past and prediction as they are known at a chosen present step."""
 MISSION_WHOLE = "mission_whole"
-"""The name of the figure of the mission as seen from its last step."""
+"""The name of the same figure at the last step, with all observations of the mission."""
 NETWORK = "network"
 """The name of the drawing of the decision network, which is the same for all runs."""
 
 
 def state_units(run: Run) -> str:
-    """Return the printed units of the factors of the state, each once."""
+    """Return the printed units of the factors of the state as one text, without repetitions."""
     units = ["percent" if factor.unit == "%" else factor.unit for factor in run.factors]
     return ", ".join(dict.fromkeys(units))
 
 
 def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigure:
-    """Return the figure of the mission as seen at a step, with its title and caption.
+    """Return a figure of `mission_figure` with its title and caption.
 
     Parameters
     ----------
     run : Run
-        The run.
+        The run of T steps.
     figure : Figure
-        The figure.
+        The figure, with the twin's estimates and predictions at the present step.
     now : int
-        The row of the present step, from 0 to T - 1.
+        The row of the present step in the run's arrays, from 0 to T - 1. Its printed number is
+        larger by the number of the run's first step.
     name : str
         The name of the figure: `MISSION_NOW` or `MISSION_WHOLE`.
     """
-    is_last = now == run.step_count - 1
+    is_last_step = now == run.step_count - 1
     step_number = run.first_step + now
-    present = f"{run.step_word} {step_number}"
+    present_step = f"{run.step_word} {step_number}"
     if name == MISSION_NOW:
-        title = f"The mission as the twin sees it at {present}"
+        title = f"The mission as the twin sees it at {present_step}"
     else:
         title = f"The whole mission, seen from its last {run.step_word}"
+    # The template `figures.mission` in `words.toml` joins these fields. At the last step there are
+    # no later observations and controls, and the past is smoothed instead of filtered.
     truth_sentence = "The black line is the truth, which the twin never sees."
     report_figure = WORDS.figure(
         "mission",
@@ -56,16 +62,16 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
         title=title,
         symbols=", ".join(factor.symbol for factor in run.factors),
         state_units=state_units(run),
-        evidence="all observations" if is_last else f"the observations up to {present}",
+        evidence="all observations" if is_last_step else f"the observations up to {present_step}",
         step=run.step_word,
         now=step_number,
         horizon=run.horizon,
         sensor_title=capital(run.sensors.word),
         quantity=run.sensors.quantity,
         unit=run.sensors.unit or "each in its unit",
-        past="in hindsight" if is_last else "as seen at the time",
-        later_observations="" if is_last else f"hollow: not yet made at {present}; ",
-        later_controls="" if is_last else "; triangles: flown later",
+        past="in hindsight" if is_last_step else "as seen at the time",
+        later_observations="" if is_last_step else f"hollow: not yet made at {present_step}; ",
+        later_controls="" if is_last_step else "; triangles: flown later",
         decision=_decision_sentence(run, now),
         truth="" if run.true_state is None else truth_sentence,
     )
@@ -73,17 +79,17 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
 
 
 def _decision_sentence(run: Run, now: int) -> str:
-    """Return the sentence on what the twin decided at the end of a step."""
+    """Return the sentence on the control chosen at the end of the step in row `now`."""
     probability = run["filtered/decision_probability"][now]
-    chosen = int(np.argmax(probability))
+    chosen_control = int(np.argmax(probability))
     if run.decides_on_prediction:
         state = f"predicted for that {run.step_word}"
     else:
         state = "as just observed"
     return (
         f"At the end of {run.step_word} {run.first_step + now} the twin decided on "
-        f"{run.controls[chosen]} for the next one: the policy asks for it with probability "
-        f"{probability[chosen]:.2f} in the state {state}."
+        f"{run.controls[chosen_control]} for the next one: the policy asks for it with probability "
+        f"{probability[chosen_control]:.2f} in the state {state}."
     )
 
 
@@ -169,7 +175,7 @@ def caption_check(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFig
 
 
 def _assumptions(run: Run) -> str:
-    """Return what the twin assumes of the noise of its sensors and of the error of its model."""
+    """Return the assumed noise of the sensors, and the model error if one is assumed, in words."""
     assumptions = f"a noise of {_assumed_noise(run)}"
     error = assumed_model_error(run)
     if error:
@@ -180,7 +186,10 @@ def _assumptions(run: Run) -> str:
 
 
 def _assumed_noise(run: Run) -> str:
-    """Return the assumed noise with its unit; of each sensor if they differ in noise or unit."""
+    """Return the assumed noise with its unit.
+
+    If the sensors differ in noise or unit, the noise of each sensor is listed.
+    """
     sensors = run.sensors
     noise = np.asarray(run.scenario.observation.standard_deviation)
     is_common = noise.ndim == 0 and bool(sensors.unit)
@@ -196,7 +205,7 @@ def _assumed_noise(run: Run) -> str:
 
 
 def assumed_model_error(run: Run) -> str:
-    """Return the assumed error of the model in percent, or its range; empty if it is zero."""
+    """Return the assumed relative error of the model in percent, or its range; empty if it is 0."""
     error = 100.0 * np.asarray(run.scenario.observation.model_error)
     low = float(error.min())
     high = float(error.max())
@@ -228,7 +237,7 @@ def caption_calibration(run: Run, figure: Figure) -> ReportFigure:
 
 
 def _load_test_sentence(run: Run) -> str:
-    """Return the caption of the measurements of a calibration; empty if it has none."""
+    """Return the caption of the static load test of a calibration; empty if it has none."""
     test = load_test(run)
     if test is None:
         return ""

@@ -51,7 +51,11 @@ class PredictiveCheck:
 
 
 def predictive_check(run: Run) -> PredictiveCheck:
-    """Compare the observations of a run with their posterior predictive distribution."""
+    """Compare the observations of a run with their posterior predictive distribution.
+
+    The distribution is normal. Its variance is that of the expected noise-free value plus that of
+    the noise.
+    """
     noise = run.get("filtered/noise_standard_deviation")
     if noise is None:  # the run was made by an earlier version
         noise = np.asarray(run.scenario.observation.standard_deviation)
@@ -77,7 +81,10 @@ def predictive_check(run: Run) -> PredictiveCheck:
 
 @style.publication_style()
 def check_figure(run: Run, check: PredictiveCheck) -> Figure:
-    """Draw the residuals of all sensors, the coverage of each, and the transform of all."""
+    """Draw residuals, coverage of each sensor, and the histogram of the transforms.
+
+    A transform is the probability integral transform of an observation.
+    """
     figure = style.new_figure(4.9)
     grid = figure.add_gridspec(
         2,
@@ -98,7 +105,7 @@ def check_figure(run: Run, check: PredictiveCheck) -> Figure:
 
 
 def _draw_residuals(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck) -> None:
-    """Draw a map of the residuals, steps to the right and sensors upwards; lost ones are grey."""
+    """Draw a map of the residuals over steps (x) and sensors (y); lost observations are grey."""
     axes.set_facecolor("#c8c8c8")
     sensor_count = len(run.sensors.titles)
     image = draw_step_map(
@@ -120,7 +127,11 @@ def _draw_residuals(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
 
 
 def _draw_coverage(axes: Axes, run: Run, check: PredictiveCheck) -> None:
-    """Draw the coverage of each sensor, and where 95 % of them lie if the model is right."""
+    """Draw the coverage of each sensor, and the range expected of 95 % of sensors.
+
+    If the model is right, the number of observations within their 95 % intervals is binomial. The
+    range is computed for the median number of observations of a sensor.
+    """
     sensor_numbers = np.arange(1, len(check.count) + 1)
     typical_count = int(np.median(check.count[check.count > 0])) if check.count.any() else 1
     low, high = binom.ppf([0.025, 0.975], typical_count, 0.95) / typical_count
@@ -143,7 +154,11 @@ def _draw_coverage(axes: Axes, run: Run, check: PredictiveCheck) -> None:
 
 
 def _draw_transform(axes: Axes, check: PredictiveCheck) -> None:
-    """Draw the histogram of the probability integral transform, and where its bars should lie."""
+    """Draw the histogram of the probability integral transform as a density.
+
+    If the model is right, the transform is uniform and the count of a bin is binomial: 95 % of the
+    bars end in the grey range.
+    """
     total = max(len(check.transform), 1)
     count, edges = np.histogram(check.transform, bins=_TRANSFORM_BINS, range=(0.0, 1.0))
     low, high = binom.ppf([0.025, 0.975], total, 1 / _TRANSFORM_BINS) * _TRANSFORM_BINS / total
@@ -162,6 +177,6 @@ def _draw_transform(axes: Axes, check: PredictiveCheck) -> None:
 
 
 def _draw_expected_range(axes: Axes, low: float, high: float, expected: float) -> None:
-    """Draw the range and the line where the values lie if the model is right."""
+    """Draw the expected value, and the range in which 95 % lie if the model is right."""
     axes.axhspan(low, high, color=style.REFERENCE, alpha=0.25, linewidth=0)
     axes.axhline(expected, color=style.TRUTH, linewidth=0.9, linestyle=(0, (4, 2)))

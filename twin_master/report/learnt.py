@@ -29,8 +29,9 @@ _PRIOR_COORDINATE = -1.0  # the prior is drawn where the step before the first w
 def learnt_figure(run: Run) -> Figure:
     """Draw each learnt quantity over the steps with its 90 % band.
 
-    For a quantity of each sensor, the sensor that departs most from its prior is drawn with its
-    band, and a panel on the right shows all sensors after the last step.
+    A quantity of the whole asset has one panel; a quantity of each sensor has two. The left one
+    shows the sensor that departs most from its prior with its band, and the means of the others;
+    the right one shows all sensors after the last step.
     """
     asset_quantities = quantities_of_asset(run)
     sensor_quantities = quantities_of_sensors(run)
@@ -58,14 +59,17 @@ def quantities_of_asset(run: Run) -> list[LearntQuantity]:
 
 
 def quantities_of_sensors(run: Run) -> list[LearntQuantity]:
-    """Return the learnt quantities of which each sensor has its own."""
+    """Return the learnt quantities that have a value for each sensor."""
     return [quantity for quantity in run.learnt_quantities if quantity.is_per_sensor]
 
 
 def _draw_asset_quantities(
     grid: list[list[Axes]], run: Run, quantities: Sequence[LearntQuantity], labels: Iterator[str]
 ) -> None:
-    """Draw quantities of the whole asset, two in a row; the last of an odd number fills its row."""
+    """Draw quantities of the whole asset, two in a row.
+
+    If their number is odd, the last panel is as wide as the row, and the unused panel is removed.
+    """
     panels = [axes for row in grid for axes in row]
     for axes, quantity in zip(panels, quantities, strict=False):
         course = moments_of(quantity.posterior)
@@ -81,7 +85,10 @@ def _draw_asset_quantities(
 
 
 def _most_departed_sensor(quantity: LearntQuantity) -> int:
-    """Return the sensor whose last mean departs most from its prior, in standard deviations."""
+    """Return the index of the sensor whose last mean is furthest from its prior mean.
+
+    The distance is measured in standard deviations of the last posterior.
+    """
     last = moments_of(quantity.posterior[-1])
     prior = moments_of(quantity.prior)
     return int(np.nanargmax(np.abs(last.mean - prior.mean) / last.standard_deviation))
@@ -116,7 +123,7 @@ def _draw_sensors_over_steps(axes: Axes, run: Run, quantity: LearntQuantity, sen
 def _draw_course(
     axes: Axes, run: Run, course: Moments, prior: Moments, truth: Float | None
 ) -> None:
-    """Draw a learnt quantity over the steps, with its prior before the first one.
+    """Draw posterior mean and 90 % band of a learnt quantity over the steps, and its prior.
 
     Parameters
     ----------
@@ -127,7 +134,8 @@ def _draw_course(
     course : Moments of (T,) arrays
         The posterior after each step.
     prior : Moments of numbers
-        The prior; it is drawn if the run begins with the first step of the mission.
+        The prior. It is drawn before the first step, but only if the run begins with the first
+        step of the mission.
     truth : number or None
         The true value, if known; NaN for a sensor of which it is not known.
     """
@@ -157,7 +165,7 @@ def _draw_course(
 def _draw_last_step(
     axes: Axes, run: Run, quantity: LearntQuantity, highlighted_sensor: int
 ) -> None:
-    """Draw the prior (a band), the last posterior and the truth of each of G sensors."""
+    """Draw prior 90 % range (bar), last posterior (point) and true value (line) of each sensor."""
     sensor_numbers = np.arange(1.0, len(quantity.prior) + 1.0)
     prior = moments_of(quantity.prior)
     axes.bar(
@@ -198,12 +206,12 @@ def _draw_last_step(
 
 
 def mean_and_interval(values: Float) -> str:
-    """Return the text of a mean with its interval, with the digits that the interval justifies.
+    """Return the text "MEAN (LOWER to UPPER)", with digits that suit the width of the interval.
 
     Parameters
     ----------
     values : (4,) array
-        The moments of a learnt quantity; NaN if it is not learnt.
+        The moments of a learnt quantity, see `Moments`; NaN if it is not learnt.
     """
     moments = moments_of(values)
     mean = float(moments.mean)
@@ -215,7 +223,7 @@ def mean_and_interval(values: Float) -> str:
 
 
 def sensor_rows(run: Run) -> list[list[str]]:
-    """Return a row for each sensor: its title, and the last value of each quantity learnt of it."""
+    """Return a table row for each sensor: title, and last value of each learnt quantity."""
     quantities = quantities_of_sensors(run)
     if not quantities:
         return []

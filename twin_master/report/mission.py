@@ -1,4 +1,4 @@
-"""The course of a mission as its twin sees it at one step: past, present and prediction.
+"""The figure of a mission at one step: estimates of the past and present, and predictions.
 
 Source: Kapteyn, Pretorius and Willcox (2021), Fig. 6.
 """
@@ -44,7 +44,7 @@ _PRESENT_MARK: dict[str, Any] = {
 }
 
 Panel = Callable[[Axes, Run, int], str]
-"""Draws a panel of a run as seen at the step of a row of the store; returns the panel's title."""
+"""Draws a panel of a run, given the axes and the row of the present step; returns its title."""
 
 
 class Course(NamedTuple):
@@ -55,27 +55,30 @@ class Course(NamedTuple):
     upper: Float
 
     def scaled(self, factor: float) -> "Course":
-        """Return the course in another unit."""
+        """Return the course in another unit, given the conversion factor."""
         return Course(factor * self.mean, factor * self.lower, factor * self.upper)
 
 
 def default_now(run: Run) -> int:
-    """Return the row of the step that shows most as the present of a figure.
+    """Return the row of the step that is the present of the mission's figure by default.
 
-    It lies a few steps before the flown control first changes. If the control never changes, or so
-    early that no past could be seen, it lies two thirds into the mission.
+    It lies `_STEPS_BEFORE_CHANGE` steps before the flown control first changes, so that this
+    change still lies ahead. If the control never changes, or if fewer than `_LEAST_PAST` steps
+    would lie before the present, it lies two thirds into the mission.
     """
-    changes = np.flatnonzero(np.diff(run.control_index)) + 1
-    if len(changes) and changes[0] >= _STEPS_BEFORE_CHANGE + _LEAST_PAST:
-        return int(changes[0] - _STEPS_BEFORE_CHANGE)
+    change_rows = np.flatnonzero(np.diff(run.control_index)) + 1
+    if len(change_rows) and change_rows[0] >= _STEPS_BEFORE_CHANGE + _LEAST_PAST:
+        return int(change_rows[0] - _STEPS_BEFORE_CHANGE)
     return round(2 * (run.step_count - 1) / 3)
 
 
 def choose_sensors(run: Run, count: int = 4) -> list[int]:
-    """Return the indices of the sensors that are worth a panel.
+    """Return the indices of the sensors that the mission's figure shows by default.
 
     These are the sensor with the largest expected value, the first sensor, and for each factor of
-    the state the sensor that responds most to it.
+    the state the sensor, not yet chosen, that responds most to it. The last ones need expected
+    values above 0, of which logarithms are taken. If the sensors have different units, the first
+    `count` sensors are returned.
 
     Parameters
     ----------
@@ -84,7 +87,7 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
     count : int
         The largest number of sensors.
     """
-    if not run.sensors.unit:  # values in different units cannot be compared
+    if not run.sensors.unit:  # the sensors have different units: values cannot be compared
         return list(range(min(count, len(run.sensors.titles))))
     expected = run["filtered/quantity_mean"]
     chosen = [int(np.argmax(np.abs(expected).max(axis=0)))]
@@ -93,6 +96,7 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
     if np.all(expected > 0.0):
         for sensitivity in _sensitivities(run, expected):
             order = np.argsort(-sensitivity, kind="stable")
+            # A sensor whose relative change is below 1e-3 hardly depends on the factor.
             other_sensors = [int(sensor) for sensor in order if int(sensor) not in chosen]
             if other_sensors and sensitivity[other_sensors[0]] > 1e-3:
                 chosen.append(other_sensors[0])
@@ -100,10 +104,11 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
 
 
 def _sensitivities(run: Run, expected: Float) -> Float:
-    """Return how strongly each sensor responds to each factor of the state, a (K, G) array.
+    """Return the relative change of each sensor's value with each factor, a (K, G) array.
 
-    The logarithms of the expected values (T, G) are fitted by least squares to the means of the
-    factors, with a constant for each control; the coefficients of the factors are returned.
+    K is the number of factors and G the number of sensors. The logarithms of the expected values
+    (T, G) are fitted by least squares as linear functions of the means of the factors, plus a
+    constant for each control; the coefficients of the factors are returned.
     """
     control_indicators = np.eye(len(run.controls))[run.control_index]
     regressors = np.concatenate([run["filtered/mean"], control_indicators], axis=1)
@@ -113,14 +118,16 @@ def _sensitivities(run: Run, expected: Float) -> Float:
 
 @style.publication_style()
 def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> Figure:
-    """Draw the mission as the twin sees it at one step.
+    """Draw states, control, sensors and rewards of a mission as the twin knows them at one step.
+
+    Each panel shows the estimates of the past, the present step, and the predicted steps.
 
     Parameters
     ----------
     run : Run
         The run.
     now : int
-        The row of the present step, from 0 to T - 1.
+        The row of the present step in the run's arrays, from 0 to T - 1.
     sensors : sequence of int, optional
         The indices of the sensors to draw, from 0; by default those of `choose_sensors`.
     """
@@ -159,7 +166,10 @@ def _panels_in_columns(run: Run, sensors: Sequence[int]) -> tuple[list[Panel], l
 
 
 def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
-    """Mark the present and the predicted steps, and set up the axes of a panel."""
+    """Set up the axes of a panel, and mark the present step and the zone of predicted steps.
+
+    With headings, the zones are named above the panel if they are wide enough.
+    """
     first = run.first_step
     present = first + now
     end = present + run.horizon
@@ -189,7 +199,7 @@ def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
 
 
 def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | None) -> None:
-    """Draw a course from the first to the last predicted step, and the true values if known.
+    """Draw a course from the first step to the last predicted one, and the true values if known.
 
     Parameters
     ----------
@@ -242,9 +252,10 @@ def _draw_part(
 
 
 def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
-    """Return a variable of the belief up to a step and as predicted there, an (n,) array in SI.
+    """Return estimates up to the step in row `now` and predictions after it, (n,) in SI units.
 
-    At the last step the past is seen in hindsight (smoothed); before it, as seen at the time.
+    If the step is the last one, past estimates are smoothed, given all observations; otherwise they
+    are filtered, each given the observations up to its own step.
     """
     past_group = "smoothed" if now == run.step_count - 1 else "filtered"
     past = run[f"{past_group}/{variable}"][: now + 1, ..., index]
@@ -253,7 +264,7 @@ def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
 
 
 def _quantity_course(run: Run, sensor: int, now: int) -> Course:
-    """Return what a sensor measures without noise, with 95 % intervals, in SI units."""
+    """Return the noise-free value at a sensor with its 95 % intervals, in SI units."""
     return Course(
         mean=_past_and_predicted(run, "quantity_mean", sensor, now),
         lower=_past_and_predicted(run, "quantity_lower", sensor, now),
@@ -262,7 +273,7 @@ def _quantity_course(run: Run, sensor: int, now: int) -> Course:
 
 
 def _reward_course(run: Run, reward: int, now: int) -> Course:
-    """Return a reward with 95 % intervals of a normal distribution."""
+    """Return a reward with 95 % intervals, as if it were normally distributed."""
     mean = _past_and_predicted(run, "reward_mean", reward, now)
     deviation = _past_and_predicted(run, "reward_standard_deviation", reward, now)
     half_width = NORMAL_95 * deviation
@@ -270,9 +281,10 @@ def _reward_course(run: Run, reward: int, now: int) -> Course:
 
 
 def _state_course(run: Run, index: int, now: int) -> Course:
-    """Return the mean of a factor with two standard deviations, within its levels, as printed.
+    """Return the mean of a factor and two standard deviations around it, in printed units.
 
-    The past is p(D_t | o_0..o_now), and the prediction p(D_{now+h} | o_0..o_now).
+    The band is clipped to the range of the levels. Past values are moments of the smoothed belief
+    p(D_t | o_0..o_now), predicted ones of p(D_{now+h} | o_0..o_now) for h steps ahead.
     """
     factor = run.factors[index]
     if now == run.step_count - 1:
@@ -318,7 +330,7 @@ def _draw_state(index: int, axes: Axes, run: Run, now: int) -> str:
 
 
 def _draw_sensor(sensor: int, axes: Axes, run: Run, now: int) -> str:
-    """Draw what a sensor measured and what the twin expects, and return the title of the panel."""
+    """Draw readings and expected values of a sensor, and return the title of the panel."""
     sensors = run.sensors
     readings = sensors.scale * run.observations[: now + 1 + run.horizon, sensor]
     steps = run.step_numbers[: len(readings)]
@@ -334,7 +346,10 @@ def _draw_sensor(sensor: int, axes: Axes, run: Run, now: int) -> str:
 
 
 def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
-    """Draw readings as dots, later ones hollow, and a cross at the bottom where one was lost."""
+    """Draw readings as dots and lost ones as crosses at the bottom.
+
+    Readings after the step in row `now`, which the twin did not have yet, are hollow dots.
+    """
     until_now = steps <= steps[now]
     later = steps > steps[now]
     is_rasterized = len(steps) > _MANY_DOTS
@@ -349,7 +364,10 @@ def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
 
 
 def _draw_control(axes: Axes, run: Run, now: int) -> str:
-    """Draw flown and predicted controls, one row for each, and return the title of the panel."""
+    """Draw flown and predicted controls, a row for each control, and return the panel's title.
+
+    Triangles mark the controls that were flown after the present step.
+    """
     for control in range(len(run.controls)):
         _draw_control_row(axes, run, control, now)
     later_rows = np.arange(now + 1, min(now + 1 + run.horizon, run.step_count))
@@ -372,7 +390,10 @@ def _draw_control(axes: Axes, run: Run, now: int) -> str:
 
 
 def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
-    """Draw when a control was flown, and how probable it is in the steps to come."""
+    """Draw the steps in which a control was flown, and its probability in the predicted steps.
+
+    In a short mission each step is a bar; in a long one, successive steps are one bar.
+    """
     present = run.step_numbers[now]
     row_span = (control, _BAR_HEIGHT)
     has_gaps = now + run.horizon < _MANY_STEPS

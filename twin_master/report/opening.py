@@ -1,4 +1,4 @@
-"""The opening sentences of a report: on the decisions, the belief, and the model."""
+"""The opening sentences of a report: on the decisions, on the estimates, and on the model."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from twin_master.store.summary import Fallback, control_changes, find_fallback
 _MOST_FACTORS = 4
 """Largest number of factors of the state whose estimates are named."""
 _LEAST_DEPARTURE = 0.05
-"""Relative departure of the residuals' deviation from 1 below which it is not mentioned."""
+"""Difference of the residuals' standard deviation from 1 below which it is not mentioned."""
 _DEVIATIONS_OF_CHANCE = 3.3
 """Standard deviations that chance exceeds once in 1,000 times."""
 _FALSE_ALARM = 1e-3
@@ -23,7 +23,10 @@ _FALSE_ALARM = 1e-3
 
 
 def opening_sentences(run: Run) -> tuple[str, ...]:
-    """Return at most three sentences that sum up a run; a subject without data has none."""
+    """Return the sentences that sum up a run: on decisions, estimates and agreement with the data.
+
+    A subject without data has no sentence.
+    """
     sentences = (
         _decision_sentence(run),
         _belief_sentence(run),
@@ -34,12 +37,12 @@ def opening_sentences(run: Run) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Switch:
-    """The level of damage from which on a policy leaves the first control.
+    """The level of a state factor from which on the policy chooses another control than the first.
 
     Attributes
     ----------
     factor : str
-        The factor of the state on which the policy depends, with its article.
+        The title of the factor, with its article.
     level : str
         The level with its unit.
     is_always_reached : bool
@@ -52,7 +55,11 @@ class _Switch:
 
 
 def _decision_sentence(run: Run) -> str:
-    """Return how the control went, and how long after the damage that calls for another one."""
+    """Return the sentence on the flown controls, and on the delay of a fallback behind the damage.
+
+    A fallback is the change from the first control after the true state has reached the level at
+    which the policy leaves it.
+    """
     first_control = run.controls[int(run.control_index[0])]
     if len(run.controls) == 1:
         return f"There was one control, {first_control}, and nothing to decide."
@@ -71,7 +78,7 @@ def _decision_sentence(run: Run) -> str:
 
 
 def _fallback(run: Run) -> Fallback:
-    """Return how the control fell back to a gentler one; empty if the true state is not known."""
+    """Find the fallback to a gentler control; empty if the true state is not known."""
     if run.true_state is None:
         return Fallback()
     return find_fallback(
@@ -84,7 +91,7 @@ def _fallback(run: Run) -> Fallback:
 
 
 def _switch(run: Run, fallback: Fallback) -> _Switch | None:
-    """Return the level at which the policy leaves the first control; None if there is no such."""
+    """Return the level at which the policy leaves the first control; None if there is none."""
     if fallback.switch_state is None or fallback.switch_level is None:
         return None
     factor = run.factors[run.scenario.state_names.index(fallback.switch_state)]
@@ -97,17 +104,17 @@ def _switch(run: Run, fallback: Fallback) -> _Switch | None:
 
 
 def _subject(run: Run) -> str:
-    """Return who decides on the control: the operator of a real asset, or the twin."""
+    """Return the subject of sentences on controls; the operator of a real asset decides on them."""
     return "The asset" if run.is_watched else "The twin"
 
 
 def _changes_of_control(run: Run) -> str:
-    """Return in words when which control was left for which."""
+    """Return the changes of control in words, with their steps."""
     return control_changes(run.controls, run.control_index, run.step_word, run.first_step)
 
 
 def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
-    """Return when the control fell back, and how long after the damage that calls for it."""
+    """Return the clause on the step of the fallback and its delay behind the damage."""
     row = fallback.fallback_step
     assert row is not None
     if np.count_nonzero(np.diff(run.control_index)) == 1:
@@ -125,7 +132,7 @@ def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
 
 
 def _control_clause(run: Run) -> str:
-    """Return which controls were flown."""
+    """Return the clause on the flown controls and their changes."""
     if np.any(np.diff(run.control_index)):
         return f"{_subject(run)} {_changes_of_control(run)}"
     control = run.controls[int(run.control_index[0])]
@@ -133,7 +140,10 @@ def _control_clause(run: Run) -> str:
 
 
 def _switch_clause(run: Run, fallback: Fallback, switch: _Switch | None) -> str:
-    """Return whether the damage called for another control; empty if no level of it does."""
+    """Return the clause on the step in which the damage called for another control.
+
+    It is empty if the policy has no level at which it leaves the first control.
+    """
     if switch is None:
         return ""
     first_control = run.controls[int(run.control_index[0])]
@@ -147,7 +157,7 @@ def _switch_clause(run: Run, fallback: Fallback, switch: _Switch | None) -> str:
 
 
 def _unheeded_requests(run: Run) -> int:
-    """Return in how many steps a real asset was not under the control that its twin asked for."""
+    """Count the steps in which a real asset had another control than its twin had asked for."""
     if not run.is_watched:
         return 0
     requested_control = np.argmax(run["filtered/decision_probability"][:-1], axis=1)
@@ -155,9 +165,9 @@ def _unheeded_requests(run: Run) -> int:
 
 
 def _belief_sentence(run: Run) -> str:
-    """Return the last estimate of the state, and of the calibrated parameter if it was learnt.
+    """Return the sentence on the last estimate of the state, and of a learnt calibrated parameter.
 
-    If no state explains what the sensors measured, the sentence says that instead.
+    If no state of the model explains the observations, the sentence says so instead.
     """
     unexplained = run.get("notice/none_of_these")
     if unexplained is not None and not is_state_believed(unexplained[-1]):
@@ -184,7 +194,10 @@ def _belief_sentence(run: Run) -> str:
 
 
 def _decided_by(run: Run) -> str:
-    """Return what decided the last control, by the summary: "model" unless an alarm intervenes."""
+    """Return what decided on the last control according to the run's summary.
+
+    This is "model" unless an alarm overrides the model.
+    """
     for figure in run.summary.get("figures", ()):
         if figure["key"] == "decided_by":
             return figure["value"] or "model"
@@ -210,7 +223,7 @@ def _state_estimate(run: Run, index: int) -> str:
 
 
 def _parameter_clause(quantity: LearntQuantity) -> str:
-    """Return what was learnt of the calibrated parameter: mean, two deviations, and the truth."""
+    """Return the clause on the learnt parameter: mean, two standard deviations, and true value."""
     last = moments_of(quantity.posterior[-1])
     mean = float(last.mean)
     two_deviations = 2 * float(last.standard_deviation)
@@ -221,15 +234,17 @@ def _parameter_clause(quantity: LearntQuantity) -> str:
 
 
 def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
-    """Return whether the observations scatter about the model as the twin assumes.
+    """Return the sentence on the residuals: whether they are as large as the twin assumes.
 
-    Empty if nothing was observed.
+    If they are, it names a sensor with too few observations within their intervals, if there is
+    one. It is empty if nothing was observed.
     """
     count = int(check.count.sum())
     if count == 0:
         return ""
     deviation = check.standard_deviation
-    # The deviation of n residuals has a standard error of 1 / sqrt(2 n).
+    # The sample standard deviation of n standard normal residuals has a standard error of about
+    # 1 / sqrt(2 n).
     threshold = max(_LEAST_DEPARTURE, _DEVIATIONS_OF_CHANCE / np.sqrt(2.0 * count))
     coverage = f"{100.0 * check.overall_coverage:.0f} %"
     scatter = "The observations scatter about the twin's model"
@@ -254,10 +269,11 @@ def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
 
 
 def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
-    """Return the sensor whose coverage is lower than chance explains; None if there is none.
+    """Return the index of the sensor whose coverage is too low to be chance; None if there is none.
 
     If the model is right, the number of a sensor's observations within their 95 % intervals is
-    binomial. The limit of its probability is divided by the number of sensors (Bonferroni).
+    binomial. The limit `_FALSE_ALARM` of its probability is divided by the number of
+    sensors, because all sensors are tested (Bonferroni correction).
     """
     within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
     p_value = binom.cdf(within, np.maximum(check.count, 1), 0.95)

@@ -1,4 +1,4 @@
-"""The report of a run: one self-contained page and its figures, from nothing but the run folder."""
+"""The report of a run: one self-contained page and its figures, made from the run folder alone."""
 
 from collections.abc import Iterator, Mapping
 from importlib import resources
@@ -34,7 +34,8 @@ FIGURE_FOLDER = "figures"
 def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     """Write ``report.html`` and ``figures/`` of a run.
 
-    Equal runs give equal bytes: wall-clock times stay in ``timing.json``.
+    Equal runs give equal bytes, because the report contains no wall-clock times; these are in
+    ``timing.json``.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     run = read_run(folder)
     drawings = {}
     figures = {}
-    # One figure after the other is drawn and forgotten: those of a long mission are large.
+    # Only the drawing of each figure is kept, because figures of a long mission need much memory.
     for report_figure in _figures(run, now, folder):
         name = report_figure.name
         drawings[name] = to_svg(report_figure.figure)
@@ -101,7 +102,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
-    """Yield the figures of a run that depend on its data, in the order of the page."""
+    """Yield the figures that are drawn from the data of a run, in the order of the page."""
     present = _present_row(run, now)
     last = run.step_count - 1
     figure = mission_figure(run, present)
@@ -121,7 +122,7 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
 
 
 def _present_row(run: Run, now: int | None) -> int:
-    """Return the row of the present step, by its number or by default.
+    """Return the row of the step with the number `now`; by default that of `default_now`.
 
     Raises
     ------
@@ -140,7 +141,10 @@ def _present_row(run: Run, now: int | None) -> int:
 
 
 def _structure_figure(run: Run, folder: Path, check: PredictiveCheck) -> Iterator[ReportFigure]:
-    """Yield the picture of the structure after the last step, if the run has a mesh or a wing."""
+    """Yield the picture of the structure after the last step, if the run has a mesh or a wing.
+
+    The iterator has one figure or none.
+    """
     last_residual = check.residual[-1]
     planform = planform_of(design_of(folder), run.scenario)
     if (folder / FIELD_NAME).is_file():
@@ -227,7 +231,7 @@ class _Pictures:
         self._figures = figures
 
     def add(self, *names: str) -> None:
-        """Add figures by their names; those that the report does not have are left out."""
+        """Add the figures with the given names to the page, except those that the report lacks."""
         for name in names:
             if name in self._figures:
                 figure = self._figures[name]
@@ -235,7 +239,7 @@ class _Pictures:
 
 
 def _add_outcome(page: Page, run: Run) -> None:
-    """Add the first section of the page: the opening, notices, and the figures of the run."""
+    """Add the section "Outcome": opening sentences, notices, and the table of figures."""
     page.add_section("Outcome")
     page.add_paragraph(in_one_line(" ".join(opening_sentences(run))))
     if run.summary.get("asset_and_model_differ"):
@@ -251,11 +255,11 @@ def _add_outcome(page: Page, run: Run) -> None:
     if any(" DIR" in notice for notice in notices):
         page.add_paragraph("DIR is the folder of this page.")
     _add_notice(page, _true_parameter_sentence(run))
-    lost = np.isnan(run.observations)
-    if lost.any():
-        percentage = 100.0 * lost.mean()
+    is_lost = np.isnan(run.observations)
+    if is_lost.any():
+        percentage = 100.0 * is_lost.mean()
         _add_notice(page, f"Observations lost ({percentage:.1f} %): {lost_ranges(run)}.")
-    steps_without_observation = run.first_step + np.flatnonzero(lost.all(axis=1))
+    steps_without_observation = run.first_step + np.flatnonzero(is_lost.all(axis=1))
     if len(steps_without_observation):
         steps = step_ranges(steps_without_observation, run.step_word)
         _add_notice(
@@ -267,16 +271,17 @@ def _add_outcome(page: Page, run: Run) -> None:
 
 
 def _add_notice(page: Page, sentence: str) -> None:
-    """Add a sentence that the reader must not overlook, unless it is empty."""
+    """Add a sentence to the page as a highlighted notice, unless it is empty."""
     text = in_one_line(sentence)
     if text:
         page.add_notice(text)
 
 
 def _true_parameter_sentence(run: Run) -> str:
-    """Return that the asset's parameter is not the one that was calibrated; empty if it is.
+    """Return the notice that the asset's true parameter differs from the calibrated one.
 
-    If the twin learns the parameter, nothing is said of it here.
+    It is empty if they agree, if the true one is not known, or if the twin learns the parameter
+    during the mission.
     """
     parameter = run.scenario.calibration.parameter
     truth = true_value(run)
@@ -288,7 +293,7 @@ def _true_parameter_sentence(run: Run) -> str:
 
 
 def _add_calibration(page: Page, run: Run) -> None:
-    """Add the figures and the findings of the calibration file, and which model it calibrated."""
+    """Add the calibrated figures, the findings, and which model was calibrated."""
     tables.add_calibrated_table(page, run)
     sentences: list[str] = []
     if tables.calibrated_figures(run.calibration):
@@ -305,7 +310,7 @@ def _add_calibration(page: Page, run: Run) -> None:
 
 
 def step_ranges(steps: ArrayLike, step_word: str = "step") -> str:
-    """Return increasing steps in words, such as ``steps 3–4, 12–18``.
+    """Return the ranges of successive numbers in increasing steps, as in ``steps 3–4, 12–18``.
 
     Parameters
     ----------
@@ -323,12 +328,16 @@ def step_ranges(steps: ArrayLike, step_word: str = "step") -> str:
 
 
 def lost_ranges(run: Run) -> str:
-    """Return which sensors were lost in which steps; those lost together are named together."""
-    lost = np.isnan(run.observations)
-    all_lost = lost.all(axis=1)
+    """Return in words which sensors have no reading in which steps.
+
+    Sensors without a reading in the same steps are listed together. Steps without any reading are
+    listed at the end.
+    """
+    is_lost = np.isnan(run.observations)
+    are_all_lost = is_lost.all(axis=1)
     sensors_of_steps: dict[tuple[int, ...], list[str]] = {}
-    for sensor in range(lost.shape[1]):
-        rows = np.flatnonzero(lost[:, sensor] & ~all_lost)
+    for sensor in range(is_lost.shape[1]):
+        rows = np.flatnonzero(is_lost[:, sensor] & ~are_all_lost)
         if len(rows):
             steps = tuple((run.first_step + rows).tolist())
             sensors_of_steps.setdefault(steps, []).append(str(sensor + 1))
@@ -337,7 +346,7 @@ def lost_ranges(run: Run) -> str:
     for steps, sensors in sensors_of_steps.items():
         noun = f"{word}s" if len(sensors) > 1 else word
         phrases.append(f"{noun} {', '.join(sensors)} at {step_ranges(steps, run.step_word)}")
-    if all_lost.any():
-        steps_of_all = run.first_step + np.flatnonzero(all_lost)
+    if are_all_lost.any():
+        steps_of_all = run.first_step + np.flatnonzero(are_all_lost)
         phrases.append(f"all {word}s at {step_ranges(steps_of_all, run.step_word)}")
     return "; ".join(phrases)

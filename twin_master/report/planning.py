@@ -1,4 +1,4 @@
-"""Figures of plans: the decisions of a policy on beliefs, and a design of sensors."""
+"""Figures of plans: the controls that a policy chooses for beliefs, and a choice of sensors."""
 
 from collections.abc import Sequence
 
@@ -23,18 +23,18 @@ _CONTROL_COLORS = (
     style.PAST,
 )
 _POINT_ROWS = 60
-"""Rows of points in a triangle of beliefs."""
+"""Number of intervals into which each side of a triangle of beliefs is divided."""
 _MOST_FACTORS = 3
 """Largest number of factors that are drawn, each in its own triangle."""
 _TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])
-"""The corners of a triangle in the picture: lowest level, highest level, level not known."""
+"""Plane coordinates of the corners of a triangle: lowest level, highest level, level not known."""
 
 
 def corner_beliefs(model: GraphicalModel, factor: int) -> Float:
-    """Return the beliefs at the corners of a factor's triangle, a (3, S) array.
+    """Return the beliefs at the three corners of the triangle that is drawn for a factor, (3, S).
 
-    The factor is at its lowest level, at its highest, or equally probable at all of its levels;
-    the other factors are at their lowest levels.
+    In the first the factor is at its lowest level, in the second at its highest, and in the third
+    all of its levels are equally probable. The other factors are at their lowest levels.
 
     Parameters
     ----------
@@ -56,9 +56,10 @@ def corner_beliefs(model: GraphicalModel, factor: int) -> Float:
 
 @style.publication_style()
 def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
-    """Draw the control that a policy chooses for beliefs between three corners.
+    """Draw the control that a policy chooses for each belief in a triangle of beliefs.
 
-    There is one triangle for each of the first factors of the state; see `corner_beliefs`.
+    A point of the triangle is a mixture of the beliefs at its corners; see `corner_beliefs`. Each
+    of the first `_MOST_FACTORS` factors of the state has a triangle.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
 
 
 def _triangle_weights() -> Float:
-    """Return the weights of the three corners at points that fill a triangle, an (N, 3) array."""
+    """Return the weights of the three corners at N points of a regular grid, an (N, 3) array."""
     fractions = []
     for i in range(_POINT_ROWS + 1):
         fractions += [(i, j) for j in range(_POINT_ROWS + 1 - i)]
@@ -102,7 +103,7 @@ def _triangle_weights() -> Float:
 
 
 def _name_corners(axes: Axes) -> None:
-    """Write below and above a triangle which beliefs its corners are."""
+    """Label the corners of a triangle with the level of the factor."""
     axes.text(0.0, -0.06, "lowest", ha="center", va="top")
     axes.text(1.0, -0.06, "highest", ha="center", va="top")
     axes.text(0.5, 0.9, "not known", ha="center", va="bottom")
@@ -149,7 +150,7 @@ def design_figure(
 def _draw_information(
     axes: Axes, information: Sequence[float], of_all: float, names: Sequence[str]
 ) -> None:
-    """Draw the information of the chosen sensors one after the other, beside that of all."""
+    """Draw the information [bit] of the first n chosen sensors over n, and of all candidates."""
     number = np.arange(1, len(information) + 1)
     axes.plot(number, information, "o-", color=style.PRESENT)
     axes.axhline(of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
@@ -161,7 +162,7 @@ def _draw_information(
 def _draw_chosen_sensors(
     axes: Axes, positions: Float, chosen: Sequence[int], outlines: Sequence[Float]
 ) -> None:
-    """Draw sensors at positions (G, 2) over outlines, the chosen ones with their ranks."""
+    """Draw sensors at positions (G, 2) [m] and outlines; chosen sensors have their ranks."""
     for outline in outlines:
         x, y = outline.T
         axes.fill(x, y, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)

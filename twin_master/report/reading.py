@@ -1,4 +1,4 @@
-"""A run as its report reads it: stored arrays by name, and how states and sensors are printed."""
+"""Reading a run folder for a report: stored arrays, and printed names and units."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ class PrintedSensors:
     scale : float
         The factor from the stored unit to the printed one.
     named : bool
-        Whether the scenario gives the titles; otherwise the sensors are numbered.
+        Whether the titles come from the scenario; otherwise they are numbers such as "gauge 1".
     """
 
     word: str
@@ -134,7 +134,7 @@ def printed_sensors(scenario: Scenario) -> PrintedSensors:
 
 
 def _short_unit(unit: str) -> str:
-    """Return the unit as reports print it."""
+    """Return a unit as reports print it: "µε" for "microstrain", others as they are."""
     return "µε" if unit == "microstrain" else unit
 
 
@@ -174,7 +174,7 @@ class Moments(NamedTuple):
 
 
 def moments_of(values: Float) -> Moments:
-    """Return the moments of a (..., 4) array as four arrays without its last axis."""
+    """Split a (..., 4) array of moments along its last axis into four (...) arrays."""
     return Moments(*np.moveaxis(values, -1, 0))
 
 
@@ -208,7 +208,7 @@ class Run:
         return np.asarray(self.tree[path].values)
 
     def get(self, path: str) -> Float | None:
-        """Return the variable at a path; None if the run does not have it."""
+        """Return the variable at a path "GROUP/NAME"; None if the run does not have it."""
         group, _, name = path.partition("/")
         if group in self.tree.children and name in self.tree[group]:
             return self[path]
@@ -236,10 +236,10 @@ class Run:
 
     @property
     def decides_on_prediction(self) -> bool:
-        """Whether the belief predicted for the next step decides its control.
+        """Whether the control of a step is chosen by the belief that was predicted for this step.
 
-        The stored description is read, not the scenario: a given policy decides as it was planned,
-        whatever the scenario says.
+        Otherwise it is chosen by the last filtered belief. The answer comes from the description of
+        a stored variable, because a policy from a file may differ in this from the scenario.
         """
         description = self.tree["filtered/decision_probability"].attrs["long_name"]
         return "predicted" in description
@@ -256,7 +256,7 @@ class Run:
 
     @property
     def true_state(self) -> Float | None:
-        """The true state as a (T, K) array in SI units; None if nobody knows it."""
+        """The true state as a (T, K) array in SI units; None if it is not known."""
         return self.get("truth/state")
 
     @cached_property
@@ -323,14 +323,17 @@ class Run:
         )
 
     def smoothed_until(self, now: int) -> Float:
-        """Return p(D_t | o_0..o_now) of the joint states for t = 0..now, a (now + 1, S) array."""
+        """Return the smoothed beliefs p(D_t | o_0..o_now) for t = 0..now, a (now + 1, S) array.
+
+        They use the observations up to the step in row `now` alone.
+        """
         with np.errstate(divide="ignore"):  # impossible states have the logarithm -inf
             log_belief = np.log(self["filtered/probability"][: now + 1])
         return smooth(self.model, self.control_index[: now + 1], log_belief)
 
 
 def read_run(folder: Path) -> Run:
-    """Read a run folder.
+    """Read the run in a folder for its report, and check that no variable is missing.
 
     Parameters
     ----------
@@ -340,12 +343,13 @@ def read_run(folder: Path) -> Run:
     Returns
     -------
     Run
-        The run.
+        The scenario, the stored arrays, and the JSON files of the folder.
 
     Raises
     ------
     RunFolderError
-        If `run.nc` is missing, damaged, or of another version.
+        If `run.nc` is missing, damaged, or lacks a variable of this version; if a JSON file is
+        damaged; or if the scenario in `config.json` is not valid.
     """
     tree = open_run(folder)
     config = _read_object(folder / CONFIG_NAME)
@@ -366,7 +370,13 @@ def read_run(folder: Path) -> Run:
 
 
 def _read_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; empty if there is no such file."""
+    """Return the object in a JSON file; empty if the file is missing.
+
+    Raises
+    ------
+    RunFolderError
+        If the file is damaged, or holds something else than an object.
+    """
     content = read_json(path, RunFolderError) if path.is_file() else {}
     if not isinstance(content, dict):
         raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")

@@ -1,4 +1,4 @@
-"""The structure after the last step: a wing from above, or the surface of a mesh."""
+"""Pictures of the structure after the last step: a wing seen from above, or a mesh's surface."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,27 +51,30 @@ class Planform(NamedTuple):
 
 
 def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | None:
-    """Return a wing seen from above.
+    """Return outline, damage regions and gauges of a wing as seen from above.
 
     Parameters
     ----------
     design : WingDesign or None
         The design of the wing.
     scenario : Scenario
-        The scenario, which knows the sensors and the factors of the state.
+        The scenario, which defines the sensors and the factors of the state.
 
     Returns
     -------
     Planform or None
-        The wing; None if there is no design, or if its gauges are not the sensors of the scenario.
+        The wing; None if there is no design, or if the number of its gauges is not that of the
+        scenario's sensors.
     """
     if design is None or len(design.gauges.positions) != scenario.observation.count:
         return None
+    # The factors z1, z2, ... of a state are the stiffness losses of the defects in their order.
     regions = {}
     for number, defect in enumerate(design.defects, start=1):
         span = (defect.span_start, defect.span_end)
         regions[f"z{number}"] = _wing_panel(design, span, (defect.chord_start, defect.chord_end))
     names = scenario.state_names
+    # A scenario with any other factor gets no regions.
     has_regions_as_states = {*names} <= {*regions}
     return Planform(
         outline=_wing_panel(design, (0.0, design.planform.semi_span), (0.0, 1.0)),
@@ -81,7 +84,7 @@ def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | Non
 
 
 def _wing_point(design: WingDesign, span: float, chord_fraction: float) -> tuple[float, float]:
-    """Return the coordinates [m] of a point of a wing from above.
+    """Return the coordinates x, y [m] of a point of a wing as seen from above.
 
     Parameters
     ----------
@@ -114,9 +117,9 @@ def _wing_panel(design: WingDesign, span: tuple[float, float], chord: tuple[floa
 
 
 def design_of(folder: Path) -> WingDesign | None:
-    """Return the wing of a run folder; None if the run has none.
+    """Return the wing design in a run folder; None if the folder has none.
 
-    The design that the twin believes comes first, then that of what is flown, then that of the
+    The design of the twin's model is preferred, then that of the asset, then that of the
     calibration.
     """
     for name in (DESIGN_COPY, FLOWN_DESIGN_COPY):
@@ -131,7 +134,9 @@ def design_of(folder: Path) -> WingDesign | None:
 
 @style.publication_style()
 def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
-    """Draw a wing after its last step, seen from above.
+    """Draw a wing from above after the last step, with the readings (a) and the residuals (b).
+
+    The colour of a region is its expected stiffness loss.
 
     Parameters
     ----------
@@ -179,7 +184,7 @@ def _draw_wing(
     value_label: str,
     look: dict[str, Any],
 ) -> None:
-    """Draw a wing from above, its regions by the expected loss and its gauges by values (G,)."""
+    """Draw a wing from above: its regions coloured by expected loss, its gauges by values (G,)."""
     x, y = planform.outline.T
     axes.fill(x, y, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
     expected_loss = run.factor_scales * run["filtered/mean"][-1]
@@ -210,7 +215,9 @@ def _draw_gauges(
     value_label: str,
     look: dict[str, Any],
 ) -> None:
-    """Draw gauges at positions (G, 2) as dots coloured by values (G,), and a cross if one is lost.
+    """Draw gauges at positions (G, 2) as dots coloured by values (G,).
+
+    A gauge whose value is NaN, because its reading was lost, is a cross.
 
     `look` holds the colours of the values, as arguments of `Axes.scatter`.
     """
@@ -276,7 +283,7 @@ def read_field(path: Path) -> StructureField:
 
 
 class Camera(NamedTuple):
-    """A view of a structure from above, in front and the right.
+    """The direction and the picture plane of a parallel projection.
 
     Attributes
     ----------
@@ -291,7 +298,7 @@ class Camera(NamedTuple):
 
 
 def _camera() -> Camera:
-    """Return the camera of all pictures of structures."""
+    """Return the camera of all pictures of structures: azimuth -60°, elevation 28°."""
     azimuth = np.radians(-60.0)
     elevation = np.radians(28.0)
     towards = np.array(
@@ -308,7 +315,9 @@ def _camera() -> Camera:
 
 @style.publication_style()
 def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
-    """Draw the surface of a structure after its last step.
+    """Draw the displaced surface of a structure after the last step, with the residuals of gauges.
+
+    Displacements are enlarged so that the largest is `_DRAWN_DISPLACEMENT` of the diagonal.
 
     Parameters
     ----------
@@ -332,6 +341,7 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
     if gauges is not None and len(gauges) == len(residual):
         distance = np.linalg.norm(points[:, None] - gauges, axis=2)  # (nodes, gauges)
         nearest_node = np.argmin(distance, axis=0)
+        # A gauge is drawn with the displacement of the node nearest to it.
         displaced_gauges = gauges + scale * field.displacement[nearest_node]
         in_picture = displaced_gauges @ camera.plane
         label = "gauges: standard deviations"
@@ -349,8 +359,8 @@ def _draw_surface(
 ) -> PolyCollection:
     """Draw the outer faces of a structure with nodes at points (n, 3), and return them.
 
-    Faces are coloured by the stiffness that their cells have lost; those of damage regions have
-    black edges. The farthest face is drawn first.
+    A face has the colour of the stiffness loss of its cell [%]; faces of damage regions have black
+    edges. Faces are drawn from the farthest to the nearest, so that near ones hide those behind.
     """
     body = field.body
     outer = body.outer_faces
@@ -373,9 +383,10 @@ def _draw_surface(
 
 
 def _run_gauge_places(run_folder: Path) -> Float | None:
-    """Return the positions of the gauges (G, 3) [m] of a run's structure, if a copy has them.
+    """Return the positions (G, 3) [m] of the gauges in the structure file of a run folder.
 
-    The model that the twin believes comes first, then that of what is flown.
+    The structure of the twin's model is preferred to that of the asset. Return None if the folder
+    has no structure file, or if the file describes no mesh.
     """
     for name in (MODEL_COPY, FLOWN_COPY):
         if (run_folder / name).is_file():

@@ -1,4 +1,4 @@
-"""The tables of a report: their columns and cells; titles and captions are filled in here, too."""
+"""The tables of a report: columns, cells, and the fields of titles and captions in `words.toml`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -52,7 +52,7 @@ def _add_table(
 
 
 def add_figures_table(page: Page, run: Run) -> None:
-    """Add the figures of the run's summary, beside their references if the scenario has any."""
+    """Add the table of the summary's figures, with reference values if the scenario has any."""
     figures = run.summary.get("figures", [])
     has_references = any(figure["reference"] is not None for figure in figures)
     columns = [PageColumn("figure"), number_column("this run"), PageColumn("unit")]
@@ -73,7 +73,7 @@ def add_figures_table(page: Page, run: Run) -> None:
 
 
 def add_learnt_asset_table(page: Page, run: Run) -> None:
-    """Add prior, posterior and truth of the learnt quantities of the whole asset."""
+    """Add the table of the whole asset's learnt quantities: prior, last posterior, true value."""
     quantities = quantities_of_asset(run)
     has_truth = any(quantity.truth is not None for quantity in quantities)
     columns = [
@@ -104,7 +104,7 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
 
 
 def _learnt_row(quantity: LearntQuantity) -> list[str]:
-    """Return title, prior and last posterior of a learnt quantity as cells."""
+    """Return the cells of a learnt quantity: title, prior, and posterior after the last step."""
     prior = moments_of(quantity.prior)
     last = moments_of(quantity.posterior[-1])
     return [
@@ -118,13 +118,13 @@ def _learnt_row(quantity: LearntQuantity) -> list[str]:
 
 
 def _transition_factor_sentence(run: Run, quantities: Sequence[LearntQuantity]) -> str:
-    """Return what a learnt factor on the transitions means; empty if there is none."""
+    """Return the sentence that explains the learnt factor on transitions; empty without one."""
     if not any(quantity.name == "transition_factor" for quantity in quantities):
         return ""
     sentence = "The factor multiplies the assumed probabilities to leave a state"
     probabilities = []
     for control, probability in run.scenario.transition.probability.items():
-        if isinstance(probability, int | float):  # and not a table with one for each factor
+        if isinstance(probability, int | float):  # not a table with a value for each factor
             probabilities.append(f"{probability:g} in {control}")
     if probabilities:
         sentence += f", in a {run.step_word} {listing(probabilities)}"
@@ -132,7 +132,7 @@ def _transition_factor_sentence(run: Run, quantities: Sequence[LearntQuantity]) 
 
 
 def add_learnt_sensors_table(page: Page, run: Run) -> None:
-    """Add what was learnt of each sensor after the last step."""
+    """Add the table of the quantities that were learnt of each sensor, after the last step."""
     quantities = quantities_of_sensors(run)
     columns = [PageColumn(run.sensors.word)]
     columns += [number_column(quantity.label) for quantity in quantities]
@@ -153,7 +153,7 @@ def add_learnt_sensors_table(page: Page, run: Run) -> None:
 
 
 def add_calibrated_table(page: Page, run: Run) -> None:
-    """Add the figures that the calibration file has of the wing or the model."""
+    """Add the table of calibrated figures: parameters of a model, or figures of a healthy wing."""
     record = run.calibration
     columns = [
         PageColumn("figure"),
@@ -196,7 +196,7 @@ def calibrated_figures(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def add_run_table(page: Page, run: Run, seed: object) -> None:
-    """Add what was flown: numbers of steps and states, controls, sensors, seed and models."""
+    """Add the table of the run: numbers of steps and states, controls, sensors, seed and models."""
     sensors = f"{len(run.sensors.titles)}"
     if run.sensors.named:
         sensors += f": {', '.join(run.sensors.titles)}"
@@ -217,12 +217,12 @@ def add_run_table(page: Page, run: Run, seed: object) -> None:
 
 
 def _with_value(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return the rows of a table of items whose value is not empty."""
+    """Return the (item, value) rows whose value is not empty."""
     return [(item, value) for item, value in rows if value.strip()]
 
 
 class _Monitor(NamedTuple):
-    """A figure that the asset reports of itself in each step.
+    """A quantity that a simulated asset reports in each step, beside its state and readings.
 
     Attributes
     ----------
@@ -240,7 +240,10 @@ class _Monitor(NamedTuple):
 
 
 def _monitors(run: Run) -> list[_Monitor]:
-    """Return the figures with a unit that the asset reported of itself."""
+    """Return the quantities with a unit that a simulated asset reported, one value for each step.
+
+    The bound of the strain error is dimensionless in the store and is printed in microstrain.
+    """
     if run.true_state is None:
         return []
     monitors = []
@@ -258,7 +261,7 @@ def _monitors(run: Run) -> list[_Monitor]:
 
 
 def _monitor_rows(run: Run) -> list[tuple[str, str]]:
-    """Return the largest value of each figure that the asset reported of itself."""
+    """Return a row with the largest value of each quantity that the asset reported."""
     rows = []
     for monitor in _monitors(run):
         if np.isfinite(monitor.values).any():
@@ -268,7 +271,7 @@ def _monitor_rows(run: Run) -> list[tuple[str, str]]:
 
 
 def add_provenance_table(page: Page, run: Run) -> None:
-    """Add the versions of the software, and the hashes of sources and inputs."""
+    """Add the table of software versions and of hashes of sources and inputs."""
     provenance = run.config.get("provenance", {})
     rows = [
         ("software", _sorted_pairs(provenance.get("versions", {}))),
