@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +18,6 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
-from twin_master import parts
 from twin_master.command_options import (
     CertificateOption,
     ClusterOption,
@@ -28,6 +27,16 @@ from twin_master.command_options import (
     WorkersOption,
 )
 from twin_master.errors import TwinMasterError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from twin_master.fleet.engine import Engine
+    from twin_master.fleet.flight import FleetOutcome
+    from twin_master.fleet.plan import Fleet
+    from twin_master.fleet.reading import Estimated
+    from twin_master.fleet.watched_asset import WatchedAsset
+
 
 WORDS = "twin_master.fleet"
 """The package whose words are printed."""
@@ -77,10 +86,15 @@ def watch(
 
     Example: `uav-twin fleet watch fleet.toml --follow`
     """
-    fleet = parts.load_fleet(file, seed)
+    from twin_master.fleet.plan import load_fleet
+    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.fleet.watching import FleetWatch
+    from twin_master.watch.signals import call_on_end_signal
+
+    fleet = load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
-    watched = parts.FleetWatch(
+    watched = FleetWatch(
         fleet,
         folder,
         console.tell,
@@ -89,10 +103,10 @@ def watch(
         steps=steps,
         authority=ca_file,
     )
-    server = ViewServer(parts.is_fleet, parts.serve_fleet)
+    server = ViewServer(is_fleet, serve_fleet)
     try:
         with (
-            parts.call_on_end_signal(watched.ask),
+            call_on_end_signal(watched.ask),
             view_beside(view, server) as begun,
             console.live_display,
         ):
@@ -121,14 +135,17 @@ class _Console:
     """
 
     def __init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
         self._is_for_people = sys.stdout.isatty()
-        self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
+        self._live = Live(console=Console(), auto_refresh=False, transient=False)
         self._last_standing: Standing = {}
         self.live_display: AbstractContextManager[object] = nullcontext()
         if self._is_for_people and not terminal.loudness.quiet:
             self.live_display = self._live
 
-    def tell(self, asset: "parts.WatchedAsset", decision: Mapping[str, Any]) -> None:
+    def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Print the new notices of a decision and, for a program, the decision."""
         for notice in decision["notices"]:
             was_told = notice["sentence"] in asset.alarms
@@ -160,11 +177,16 @@ class _Console:
 
 def _heading(standing: Standing) -> str:
     """Return how many assets are watched, with their steps and alarms, in words."""
-    return parts.Words(WORDS).say("heading", counts=parts.counts_of(standing))
+    from reporting.page import Words
+    from twin_master.fleet.watched_asset import counts_of
+
+    return Words(WORDS).say("heading", counts=counts_of(standing))
 
 
-def _table_of_worst_assets(standing: Standing) -> "parts.Table":
+def _table_of_worst_assets(standing: Standing) -> "Table":
     """Return the table of the assets with the most alarms and the most severe damage."""
+    from twin_master.mission.decision_record import health_in_words
+
     assets = {}
     for name, asset in standing["assets"].items():
         if asset["last"] is not None:  # it has had a step
@@ -182,7 +204,7 @@ def _table_of_worst_assets(standing: Standing) -> "parts.Table":
     rows = []
     for name in worst:
         last = assets[name]["last"]
-        health = parts.health_in_words(last)
+        health = health_in_words(last)
         cells = [health.get(state, "") for state in states]
         alarms = str(assets[name]["alarms"] or "")
         row = [name, str(last["step"]), last["control"], *cells, last["next_control"], alarms]
@@ -220,7 +242,9 @@ def run(
 
     Example: `uav-twin fleet run fleet.toml --workers 2`
     """
-    fleet = parts.load_fleet(file, seed)
+    from twin_master.fleet.plan import load_fleet
+
+    fleet = load_fleet(file, seed)
     engine = choose_engine(workers, cluster)
     fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
 
@@ -248,15 +272,18 @@ def learn(
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
-    lessons = parts.learn_from_fleet(folder, out, progress=terminal.progress())
+    from twin_master.fleet.learn import learn_from_fleet
+    from twin_master.fleet.lessons import lesson_rows
+
+    lessons = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _write_report(folder)
     record = {"file": str(out), **lessons}
-    rows = parts.lesson_rows(lessons)
+    rows = lesson_rows(lessons)
     terminal.answer("learn", WORDS, record, json=json, rows=rows, out=out)
 
 
-def choose_engine(workers: int | None, cluster: str | None) -> "parts.Engine":
+def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
     """Return the processes that fly a fleet.
 
     Parameters
@@ -266,24 +293,26 @@ def choose_engine(workers: int | None, cluster: str | None) -> "parts.Engine":
     cluster : str or None
         The address of the scheduler of a Dask cluster.
     """
+    from twin_master.fleet.engine import Engine
+
     if cluster is not None:
         if workers is not None:
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
-        return parts.Engine(cluster=cluster)
+        return Engine(cluster=cluster)
     if workers is None:
         workers = len(os.sched_getaffinity(0))
-    return parts.Engine(workers)
+    return Engine(workers)
 
 
 def fly_and_print_fleet(
-    fleet: "parts.Fleet",
+    fleet: "Fleet",
     out: Path | None,
-    engine: "parts.Engine",
+    engine: "Engine",
     *,
     replace: bool,
     report: bool,
     json: bool,
-) -> "parts.FleetOutcome":
+) -> "FleetOutcome":
     """Fly a fleet, and print its figures.
 
     Parameters
@@ -301,10 +330,13 @@ def fly_and_print_fleet(
     json : bool
         Whether to print JSON.
     """
+    from twin_master.fleet.flight import fly_fleet
+    from twin_master.fleet.reading import figure_rows
+
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
     with terminal.interruptible(lambda: hint):
-        outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
+        outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     if report:
         _write_report(outcome.folder)
     figures = _figures_by_group([outcome.folder])
@@ -322,7 +354,7 @@ def fly_and_print_fleet(
         record,
         json=json,
         outcome=outcome,
-        rows=parts.figure_rows(figures),
+        rows=figure_rows(figures),
         groups=list(figures),
         told=[*outcome.failures.items(), *outcome.ended.items()],
         page=outcome.folder / "report.html",
@@ -331,8 +363,10 @@ def fly_and_print_fleet(
 
 
 def _write_report(folder: Path) -> None:
+    from twin_master.fleet.report import write_fleet_report
+
     with terminal.progress().stage("Writing the report"):
-        parts.write_fleet_report(folder)
+        write_fleet_report(folder)
 
 
 def compare(
@@ -350,22 +384,26 @@ def compare(
 
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
+    from twin_master.fleet.reading import figure_rows
+
     figures = _figures_by_group(folders)
-    rows = parts.figure_rows(figures)
+    rows = figure_rows(figures)
     terminal.answer("compare", WORDS, figures, json=json, rows=rows, groups=list(figures))
 
 
-Figures = dict[str, dict[str, "parts.Estimated | int"]]
+Figures = dict[str, dict[str, "Estimated | int"]]
 """The figures of each group, by the name of the group and of the figure."""
 
 
 def _figures_by_group(folders: list[Path]) -> Figures:
     """Return the figures of each group; if there are several folders, its name has the folder."""
+    from twin_master.fleet.reading import group_figures, open_fleet
+
     figures = {}
     for folder in folders:
-        for name, group in parts.open_fleet(folder).items():
+        for name, group in open_fleet(folder).items():
             full_name = name if len(folders) == 1 else f"{folder}: {name}"
-            figures[full_name] = parts.group_figures(group)
+            figures[full_name] = group_figures(group)
     return figures
 
 
@@ -439,7 +477,10 @@ def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Call
 def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None) -> None:
     """Show a mission once it is prepared, until the process that flies it ends."""
     if server is None:
-        server = ViewServer(parts.is_prepared, parts.serve)
+        from twin_master.viewer.flight import is_prepared
+        from twin_master.viewer.server import serve
+
+        server = ViewServer(is_prepared, serve)
     # Ctrl-C is for the mission, which then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICENESS_OF_VIEW)
