@@ -52,14 +52,14 @@ class Counts:
 
 
 CEILINGS = {
-    "reporting": Counts(packed=0, bundles=1.5, walrus=0, columns=0.7, untyped=21.3, vague=0.5),
+    "reporting": Counts(packed=0, bundles=1.4, walrus=0, columns=0.7, untyped=19.8, vague=0.4),
     "fe": Counts(packed=0.3, bundles=1.7, walrus=0, columns=1.5, untyped=2.3, vague=0.6),
     "fmu_asset": Counts(packed=0.3, bundles=1.3, walrus=0, columns=0.3, untyped=2.0, vague=0.8),
     "calibration": Counts(packed=0, bundles=2.4, walrus=0, columns=3.7, untyped=1.3, vague=0.3),
-    "discrepancy": Counts(packed=0.5, bundles=1.6, walrus=0, columns=1.1, untyped=1.7, vague=1.1),
+    "discrepancy": Counts(packed=0.4, bundles=1.4, walrus=0, columns=1.0, untyped=1.5, vague=0.5),
     "scenarios": Counts(packed=0, bundles=0, walrus=0, columns=0, untyped=0, vague=0),
-    "twin_master": Counts(packed=14.2, bundles=5.0, walrus=1.9, columns=4.1, untyped=13.5, vague=9.7),
-    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=5.0, vague=1.5),
+    "twin_master": Counts(packed=0.2, bundles=1.3, walrus=0, columns=1.0, untyped=4.7, vague=0.5),
+    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=4.4, vague=0.8),
     "benchmarks": Counts(packed=0, bundles=2.9, walrus=0.3, columns=2.4, untyped=3.6, vague=0.6),
     "evidence": Counts(packed=8.1, bundles=6.6, walrus=0, columns=32.6, untyped=4.0, vague=5.6),
 }
