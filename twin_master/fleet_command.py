@@ -18,6 +18,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
+from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
     ClusterOption,
@@ -38,12 +39,12 @@ if TYPE_CHECKING:
     from twin_master.fleet.watched_asset import WatchedAsset
 
 
-WORDS = "twin_master.fleet"
-"""The package whose words are printed."""
 Standing = Mapping[str, Any]
 """How each asset of a watched fleet stands, as `FleetWatch.standing` tells it."""
 ROWS = 20
 """The number of assets in the table on the console, the worst first."""
+MOST_ENDINGS = 10
+"""The number of failed or ended flights whose reasons are printed."""
 
 
 @accepts_former_options(steps="--turns")
@@ -177,10 +178,19 @@ class _Console:
 
 def _heading(standing: Standing) -> str:
     """Return how many assets are watched, with their steps and alarms, in words."""
-    from reporting.page import Words
     from twin_master.fleet.watched_asset import counts_of
 
-    return Words(WORDS).say("heading", counts=counts_of(standing))
+    counts = counts_of(standing)
+    words = [
+        counted(counts["assets"], "asset"),
+        counted(counts["steps"], "step"),
+        counted(counts["alarms"], "alarm"),
+    ]
+    if counts["messages refused"]:
+        words.append(f"{counted(counts['messages refused'], 'message')} refused")
+    if counts["not watched"]:
+        words.append(f"{counts['not watched']} not watched")
+    return ", ".join(words)
 
 
 def _table_of_worst_assets(standing: Standing) -> "Table":
@@ -278,9 +288,14 @@ def learn(
     lessons = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _write_report(folder)
-    record = {"file": str(out), **lessons}
+    if json:
+        terminal.print_json({"file": str(out), **lessons})
+        return
     rows = lesson_rows(lessons)
-    terminal.answer("learn", WORDS, record, json=json, rows=rows, out=out)
+    if rows:
+        headings = ["group", "learnt", "assumed", "mean", "95 % interval"]
+        terminal.print_table(headings, rows)
+    terminal.say(f"Learnt: {out}")
 
 
 def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
@@ -331,7 +346,6 @@ def fly_and_print_fleet(
         Whether to print JSON.
     """
     from twin_master.fleet.flight import fly_fleet
-    from twin_master.fleet.reading import figure_rows
 
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
@@ -340,26 +354,45 @@ def fly_and_print_fleet(
     if report:
         _write_report(outcome.folder)
     figures = _figures_by_group([outcome.folder])
-    record = {
-        "folder": str(outcome.folder),
-        "twins": outcome.twins,
-        "failed": len(outcome.failures),
-        "failures": outcome.failures,
-        "ended": outcome.ended,
-        "groups": figures,
-    }
-    terminal.answer(
-        "run",
-        WORDS,
-        record,
-        json=json,
-        outcome=outcome,
-        rows=figure_rows(figures),
-        groups=list(figures),
-        told=[*outcome.failures.items(), *outcome.ended.items()],
-        page=outcome.folder / "report.html",
-    )
+    if json:
+        terminal.print_json(
+            {
+                "folder": str(outcome.folder),
+                "twins": outcome.twins,
+                "failed": len(outcome.failures),
+                "failures": outcome.failures,
+                "ended": outcome.ended,
+                "groups": figures,
+            }
+        )
+    else:
+        _print_figures(figures)
+        _print_outcome(outcome)
     return outcome
+
+
+def _print_outcome(outcome: "FleetOutcome") -> None:
+    """Print how many twins flew, why flights failed or ended early, and where the report is."""
+    from twin_master.fleet.configuration import REPORT_NAME
+
+    flown = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
+    if outcome.shards_kept:
+        flown += f", {counted(outcome.shards_kept, 'shard')} there before"
+    endings = f"{len(outcome.failures)} failed in flight"
+    if outcome.ended:
+        endings += f", {len(outcome.ended)} ended early"
+    terminal.say(f"{flown}; {endings}.")
+    reasons = [*outcome.failures.items(), *outcome.ended.items()]
+    for name, reason in reasons[:MOST_ENDINGS]:
+        terminal.say(f"  {name}: {reason}", fg="yellow")
+    if len(reasons) > MOST_ENDINGS:
+        further = len(reasons) - MOST_ENDINGS
+        terminal.say(f"  and {further} more, in {outcome.folder / 'fleet.json'}")
+    report = outcome.folder / REPORT_NAME
+    if report.is_file():
+        terminal.say(f"Report: {report}")
+    else:
+        terminal.say(f"Fleet: {outcome.folder}")
 
 
 def _write_report(folder: Path) -> None:
@@ -384,11 +417,11 @@ def compare(
 
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
-    from twin_master.fleet.reading import figure_rows
-
     figures = _figures_by_group(folders)
-    rows = figure_rows(figures)
-    terminal.answer("compare", WORDS, figures, json=json, rows=rows, groups=list(figures))
+    if json:
+        terminal.print_json(figures)
+    else:
+        _print_figures(figures)
 
 
 Figures = dict[str, dict[str, "Estimated | int"]]
@@ -405,6 +438,15 @@ def _figures_by_group(folders: list[Path]) -> Figures:
             full_name = name if len(folders) == 1 else f"{folder}: {name}"
             figures[full_name] = group_figures(group)
     return figures
+
+
+def _print_figures(figures: Figures) -> None:
+    """Print the figures as a table with a column for each group."""
+    from twin_master.fleet.reading import figure_rows
+
+    rows = figure_rows(figures)
+    if rows:
+        terminal.print_table(["figure (SI)", *figures], rows)
 
 
 _POLLING_INTERVAL = 0.05

@@ -20,6 +20,8 @@ WATCHED_KIND = "uav-twin fleet watch"
 """The kind in the configuration of a fleet that is watched."""
 GROUPS = "groups"
 """The folder of what the twins of each group know."""
+REPORT_NAME = "report.html"
+"""The page of a fleet in its folder."""
 
 _SCENARIOS = "fleet.groups.scenarios"
 PRESENT_NAMES = {
