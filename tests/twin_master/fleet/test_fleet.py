@@ -383,5 +383,5 @@ def test_damage_grows_as_the_model_says(library_file):
     growth, uniform = DamageGrowth(model), (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
         row = model.transition.row(control, 6)
-        found = growth.following(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
+        found = growth.next_states(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
         np.testing.assert_allclose(np.bincount(found, minlength=25) / 2000, row, atol=1.5 / 2000)

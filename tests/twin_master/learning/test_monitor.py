@@ -363,10 +363,10 @@ def test_belief_and_decision_follow_what_holds_now(between):
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
     wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
-    assert wing.scenario.control_names[wing.safest] == "2g"
+    assert wing.scenario.control_names[wing.safest_control] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
-    assert named.scenario.control_names[named.safest] == "3g"
+    assert named.scenario.control_names[named.safest_control] == "3g"
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
     steps = [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
