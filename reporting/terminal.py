@@ -74,59 +74,24 @@ def say(text: str, **style: Any) -> None:
         typer.secho(text, **style)
 
 
-def show(command: str, words: "Words | str", **values: Any) -> None:
+def show(command: str, words: "Words", **values: Any) -> None:
     """Print the result of a command.
 
     Parameters
     ----------
     command : str
-        The key of ``[printed]`` that holds the blocks to print, see `Words.rendered_blocks`. In a
-        table with `colours`, a row has the colour of its first cell that is named there.
-    words : Words or str
-        The file of words, or the name of its package.
+        The key of ``[printed]`` that holds the blocks to print, see `Words.rendered_blocks`.
+    words : Words
+        The file of words.
     **values : object
         The values of the templates.
     """
-    from reporting.page import Words
-
-    if isinstance(words, str):
-        words = Words(words)
     for kind, content in words.rendered_blocks(words.content["printed"][command], **values):
         if kind == "table":
-            name, table = content
-            colours = words.content["tables"][name].get("colours", {})
-            headings = [column.name for column in table.columns]
-            print_table(headings, table.rows, [_row_colour(row, colours) for row in table.rows])
+            _name, table = content
+            print_table([column.name for column in table.columns], table.rows)
         else:
             say(content, fg="yellow" if kind == "notice" else None)
-
-
-def _row_colour(row: Sequence[str], colours: Mapping[str, str]) -> str:
-    """Return the colour of the first cell in a row that has one, or "" if there is none."""
-    for cell in row:
-        if cell in colours:
-            return colours[cell]
-    return ""
-
-
-def answer(
-    command: str, words: "Words | str", record: Mapping[str, Any], *, json: bool, **values: Any
-) -> None:
-    """Print the result of a command, as JSON or as text.
-
-    Parameters
-    ----------
-    command, words, **values
-        As `show` takes them; the record is a further value.
-    record : mapping of str to object
-        The result.
-    json : bool
-        Whether to print JSON.
-    """
-    if json:
-        print_json(record)
-    else:
-        show(command, words, record=record, **values)
 
 
 def print_table(

@@ -74,11 +74,10 @@ def modules() -> dict[str, Path]:
 
 @cache
 def nodes(path: Path) -> tuple[ast.Import | ast.ImportFrom | ast.FunctionDef | ast.AsyncFunctionDef, ...]:
-    """Return imports and functions of a module, wherever they stand, and what a `.pyi` beside it imports."""
-    files = [item for item in (path, path.with_suffix(".pyi")) if item.exists()]
-    trees = [ast.parse(item.read_text(encoding="utf-8")) for item in files]
+    """Return imports and functions of a module, wherever they stand."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     wanted = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.AsyncFunctionDef)
-    return tuple(node for tree in trees for node in ast.walk(tree) if isinstance(node, wanted))
+    return tuple(node for node in ast.walk(tree) if isinstance(node, wanted))
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Commands of one asset: `run`, also as `python -m twin_master`, `watch`, `view`, `scenario check`."""
+"""Commands of one asset: `run`, also as `python -m twin_master`, `watch` and `view`."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import webbrowser
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,8 +20,6 @@ from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options, former_names_as_lines
 from reporting.words import counted, number
-from scenarios import scenario_files
-from twin_master import parts
 from twin_master.command_options import (
     CalibrationOption,
     CertificateOption,
@@ -35,6 +33,12 @@ from twin_master.command_options import (
 from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
 from twin_master.watch.cause_search import CauseSearch
+
+if TYPE_CHECKING:
+    from twin_master.assets.resolution import Overrides
+    from twin_master.store.writing import RunOutcome
+    from twin_master.watch.folder import Watch
+
 
 Decision = Mapping[str, Any]
 """The decision of a twin in a step, as `decision_from_line` returns it."""
@@ -146,8 +150,11 @@ def run(
 
     Example: `uav-twin run level_turns --seed 3 --out runs/first`
     """
+    from twin_master.assets.resolution import Overrides
+    from twin_master.fleet.plan import ensemble, seed_range
+
     scenario, ssp = _scenario_and_ssp(scenario, with_scenario)
-    overrides = parts.Overrides(
+    overrides = Overrides(
         seed=seed,
         fmu=fmu,
         binding=binding,
@@ -162,7 +169,7 @@ def run(
         has_other_options = resume is not None or seed is not None or policy is not None or view
         if scenario is None or has_other_options:
             raise _wrong_use_of_seeds()
-        fleet = parts.ensemble(scenario, parts.seed_range(seeds), overrides)
+        fleet = ensemble(scenario, seed_range(seeds), overrides)
         engine = choose_engine(workers, cluster)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
@@ -171,18 +178,12 @@ def run(
             "belongs to --seeds: one mission flies alone.",
             param_hint="--workers" if cluster is None else "--cluster",
         )
-    loaded = None if scenario is None else parts.load_scenario(scenario)
-    has_changes = out is not None or policy is not None or overrides != parts.Overrides()
-    if resume is not None and (replace or has_changes):
-        raise _wrong_use_of_resume()
-    if resume is not None:
-        fly_mission = partial(parts.resume, resume, loaded)
-        folder = resume
-    elif loaded is not None:
-        folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-        fly_mission = partial(parts.fly, loaded, folder, overrides, policy=policy, replace=replace)
+    has_changes = out is not None or policy is not None or overrides != Overrides()
+    if resume is None:
+        folder, fly_mission = _new_mission(scenario, out, overrides, policy, replace=replace)
     else:
-        raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+        folder = resume
+        fly_mission = _resumed_mission(scenario, folder, has_changes=replace or has_changes)
     _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
 
 
@@ -194,16 +195,43 @@ def _wrong_use_of_seeds() -> typer.BadParameter:
     )
 
 
-def _wrong_use_of_resume() -> typer.BadParameter:
-    """Return the error that options do not go together with --resume."""
-    return typer.BadParameter(
-        "a run is continued with what its folder holds: give nothing beside it that would change it.",
-        param_hint="--resume",
-    )
+def _new_mission(
+    scenario_name: str | None,
+    out: Path | None,
+    overrides: "Overrides",
+    policy: Path | None,
+    *,
+    replace: bool,
+) -> "tuple[Path, Callable[..., RunOutcome]]":
+    """Return the run folder of a new mission, and the function that flies it."""
+    from twin_master.scenario.reading import load_scenario
+    from twin_master.workflow import fly
+
+    if scenario_name is None:
+        raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+    loaded = load_scenario(scenario_name)
+    folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
+    return folder, partial(fly, loaded, folder, overrides, policy=policy, replace=replace)
+
+
+def _resumed_mission(
+    scenario_name: str | None, folder: Path, *, has_changes: bool
+) -> "Callable[..., RunOutcome]":
+    """Return the function that continues an interrupted run."""
+    from twin_master.scenario.reading import load_scenario
+    from twin_master.workflow import resume
+
+    loaded = None if scenario_name is None else load_scenario(scenario_name)
+    if has_changes:
+        raise typer.BadParameter(
+            "a run is continued with what its folder holds: give nothing beside it that would change it.",
+            param_hint="--resume",
+        )
+    return partial(resume, folder, loaded)
 
 
 def _fly_and_print_mission(
-    fly_mission: "Callable[..., parts.RunOutcome]",
+    fly_mission: "Callable[..., RunOutcome]",
     folder: Path,
     *,
     report: bool,
@@ -258,16 +286,18 @@ def _scenario_and_ssp(scenario: str | None, with_scenario: str | None) -> tuple[
     return scenario, None
 
 
-def _outcome_record(outcome: "parts.RunOutcome") -> dict[str, Any]:
+def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
     """Return the content of `summary.json` with the paths of run and report."""
-    summary = (outcome.folder / parts.SUMMARY_NAME).read_text(encoding="utf-8")
+    from twin_master.store.writing import SUMMARY_NAME
+
+    summary = (outcome.folder / SUMMARY_NAME).read_text(encoding="utf-8")
     report = None if outcome.report is None else str(outcome.report)
     record: dict[str, Any] = {"folder": str(outcome.folder), "report": report}
     record |= json.loads(summary)
     return record
 
 
-def print_outcome(outcome: "parts.RunOutcome") -> None:
+def print_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
@@ -294,7 +324,7 @@ def print_outcome(outcome: "parts.RunOutcome") -> None:
         terminal.say(f"Run: {outcome.folder}")
 
 
-def _numbers_of_sources(outcome: "parts.RunOutcome") -> dict[str, int]:
+def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
     """Return a number from 1 for each source of a reference."""
     numbers: dict[str, int] = {}
     for figure in outcome.figures:
@@ -303,7 +333,7 @@ def _numbers_of_sources(outcome: "parts.RunOutcome") -> dict[str, int]:
     return numbers
 
 
-def _timing_rows(outcome: "parts.RunOutcome") -> list[list[str]]:
+def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
     """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
     rows = []
     for part in ("asset", "twin", "checkpoint"):
@@ -338,8 +368,12 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
-        lower_layers = (parts.FmuError, parts.FiniteElementError, parts.CalibrationError)
-        our_errors = (TwinMasterError, ReportingError, *lower_layers, *further_errors)
+        our_errors: tuple[type[Exception], ...] = (
+            TwinMasterError,
+            ReportingError,
+            *_errors_of_lower_layers(),
+            *further_errors,
+        )
         # The system's refusals, such as a full disk, are no defects of the program either.
         if not isinstance(error, (OSError, *our_errors)):
             raise
@@ -349,6 +383,15 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
         for line in (sentence, *getattr(error, "__notes__", ())):
             typer.secho(line, fg="red", err=True)
         raise SystemExit(1) from None
+
+
+def _errors_of_lower_layers() -> tuple[type[Exception], ...]:
+    """Return the base classes of the errors of models, FMUs and calibrations."""
+    from calibration.errors import CalibrationError
+    from fe.runtime.errors import FiniteElementError
+    from fmu_asset.errors import FmuError
+
+    return FmuError, FiniteElementError, CalibrationError
 
 
 def main() -> None:
@@ -481,8 +524,10 @@ def watch(
 
     Example: `uav-twin watch watched_wing --out runs/watched`
     """
-    watches: list[parts.Watch] = []
-    comes_from_broker = parts.is_broker(observations or "")
+    from twin_master.watch import broker_address, opening
+
+    watches: list[Watch] = []
+    comes_from_broker = broker_address.is_broker(observations or "")
     is_live = follow or observations is None or observations == "-" or comes_from_broker
 
     def print_decision(decision: Decision) -> None:
@@ -493,11 +538,11 @@ def watch(
 
     with view_beside(view) as begun:
 
-        def begin_watch(watched: parts.Watch) -> None:
+        def begin_watch(watched: "Watch") -> None:
             watches.append(watched)
             begun(watched.folder)
 
-        folder = parts.watch(
+        folder = opening.watch(
             scenario,
             observations,
             out,
@@ -519,20 +564,22 @@ def watch(
             cause_search=cause_search,
             progress=terminal.progress(),
         )
-        _write_to_output("", flush=True)
         _print_end_of_watch(folder, watches[0], report=not no_report)
     _exit_on_complaint(watches[0])
 
 
-def _exit_on_complaint(watched: "parts.Watch") -> None:
+def _exit_on_complaint(watched: "Watch") -> None:
     """End the command with exit code 1 if the observations of a watch were not in order."""
     complaint = watched.intake.complaint()
     if complaint:
         raise terminal.error_exit(complaint)
 
 
-def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -> None:
-    """Print how many messages a watch has received, and where its folder and its report are."""
+def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None:
+    """Flush the decisions; print how many messages came, and where folder and report are."""
+    from twin_master.store.writing import REPORT_NAME
+
+    _write_to_output("", flush=True)
     if terminal.loudness.quiet:
         return
     counts = watched.intake.counts
@@ -541,12 +588,14 @@ def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -
         refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
     received = counted(counts.received, "message")
     typer.echo(f"Watch: {folder}, {received}{refused}.", err=True)
-    if report and (folder / parts.REPORT_NAME).is_file():
-        typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
+    if report and (folder / REPORT_NAME).is_file():
+        typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
 
 
-def _print_decision(watched: "parts.Watch", decision: Decision, *, flush: bool) -> bool:
+def _print_decision(watched: "Watch", decision: Decision, *, flush: bool) -> bool:
     """Print a decision and its notices; return whether the output still has a reader."""
+    from twin_master.mission.decision_record import decision_line
+
     # Notices go to the error stream, so that people see them also if a program reads the decisions.
     for notice in decision["notices"]:
         sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
@@ -558,7 +607,7 @@ def _print_decision(watched: "parts.Watch", decision: Decision, *, flush: bool) 
         return _write_to_output(json.dumps(decision) + "\n", flush=flush)
     if "control" not in decision:  # before the first observation nothing is decided
         return True
-    return _write_to_output(parts.decision_line(watched.scenario, decision) + "\n", flush=True)
+    return _write_to_output(decision_line(watched.scenario, decision) + "\n", flush=True)
 
 
 def _write_to_output(text: str, *, flush: bool) -> bool:
@@ -607,67 +656,13 @@ def view(
 
     Example: `uav-twin view runs/first --browser`
     """
+    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.viewer.server import serve as serve_flight
 
     def print_address(address: str) -> None:
         typer.echo(f"{folder}: {address} (Ctrl-C ends it)")
         if browser:
             webbrowser.open(address)
 
-    serve = parts.serve_fleet if parts.is_fleet(folder) else parts.serve
+    serve = serve_fleet if is_fleet(folder) else serve_flight
     serve(folder, port, print_address)
-
-
-def list_scenarios() -> None:
-    """List the scenarios that are shipped.
-
-    Example: `uav-twin scenarios`
-    """
-    files = scenario_files()
-    rows = []
-    for name, path in files.items():
-        scenario = parts.load_scenario(path).scenario
-        levels = {factor.name: len(factor.levels) for factor in scenario.state}
-        controls = ", ".join(scenario.control_names)
-        steps = str(scenario.mission.steps)
-        rows.append([name, scenario.mission.title, steps, _levels_in_words(levels), controls])
-    terminal.print_table(["scenario", "title", "steps", "states", "controls"], rows)
-    folder = next(iter(files.values())).parent
-    terminal.say(f"The files, to copy and change: {folder}")
-
-
-def _levels_in_words(levels: Mapping[str, int]) -> str:
-    """Return the state factors with the number of their levels."""
-    return ", ".join(f"{factor} ({count} levels)" for factor, count in levels.items())
-
-
-def check_scenario(
-    file: Annotated[
-        str,
-        typer.Argument(
-            show_default=False,
-            metavar="FILE",
-            autocompletion=complete_scenario,
-            help="A scenario file, or a shipped name.",
-        ),
-    ],
-    *,
-    calibration: CalibrationOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it.
-
-    Example: `uav-twin scenario check level_turns`
-    """
-    record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
-    if json:
-        terminal.print_json(record)
-        return
-    memory = record["memory"] / 2**20
-    terminal.say(f"{record['name']}: {record['title']}")
-    terminal.say(f"Flown: {record['flown']}.")
-    terminal.say(f"Believed: {record['believed']}.")
-    terminal.say(f"Uncertain: {record['uncertain']}, {record['draws']} draws.")
-    terminal.say(f"State: {record['states']} states, {_levels_in_words(record['levels'])}.")
-    terminal.say(f"Controls: {', '.join(record['controls'])}. Sensors: {record['sensors']}.")
-    terminal.say(f"Mission: {record['steps']} {record['step_name']}s, {record['prediction_steps']} ahead.")
-    terminal.say(f"Memory of the twin: about {memory:.3g} MiB.")

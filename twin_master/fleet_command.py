@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +18,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
-from twin_master import parts
+from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
     ClusterOption,
@@ -29,12 +29,22 @@ from twin_master.command_options import (
 )
 from twin_master.errors import TwinMasterError
 
-WORDS = "twin_master.fleet"
-"""The package whose words are printed."""
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from twin_master.fleet.engine import Engine
+    from twin_master.fleet.flight import FleetOutcome
+    from twin_master.fleet.plan import Fleet
+    from twin_master.fleet.reading import Estimated
+    from twin_master.fleet.watched_asset import WatchedAsset
+
+
 Standing = Mapping[str, Any]
 """How each asset of a watched fleet stands, as `FleetWatch.standing` tells it."""
 ROWS = 20
 """The number of assets in the table on the console, the worst first."""
+MOST_ENDINGS = 10
+"""The number of failed or ended flights whose reasons are printed."""
 
 
 @accepts_former_options(steps="--turns")
@@ -77,10 +87,15 @@ def watch(
 
     Example: `uav-twin fleet watch fleet.toml --follow`
     """
-    fleet = parts.load_fleet(file, seed)
+    from twin_master.fleet.plan import load_fleet
+    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.fleet.watching import FleetWatch
+    from twin_master.watch.signals import call_on_end_signal
+
+    fleet = load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
-    watched = parts.FleetWatch(
+    watched = FleetWatch(
         fleet,
         folder,
         console.tell,
@@ -89,10 +104,10 @@ def watch(
         steps=steps,
         authority=ca_file,
     )
-    server = ViewServer(parts.is_fleet, parts.serve_fleet)
+    server = ViewServer(is_fleet, serve_fleet)
     try:
         with (
-            parts.call_on_end_signal(watched.ask),
+            call_on_end_signal(watched.ask),
             view_beside(view, server) as begun,
             console.live_display,
         ):
@@ -121,14 +136,17 @@ class _Console:
     """
 
     def __init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
         self._is_for_people = sys.stdout.isatty()
-        self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
+        self._live = Live(console=Console(), auto_refresh=False, transient=False)
         self._last_standing: Standing = {}
         self.live_display: AbstractContextManager[object] = nullcontext()
         if self._is_for_people and not terminal.loudness.quiet:
             self.live_display = self._live
 
-    def tell(self, asset: "parts.WatchedAsset", decision: Mapping[str, Any]) -> None:
+    def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Print the new notices of a decision and, for a program, the decision."""
         for notice in decision["notices"]:
             was_told = notice["sentence"] in asset.alarms
@@ -160,11 +178,25 @@ class _Console:
 
 def _heading(standing: Standing) -> str:
     """Return how many assets are watched, with their steps and alarms, in words."""
-    return parts.Words(WORDS).say("heading", counts=parts.counts_of(standing))
+    from twin_master.fleet.watched_asset import counts_of
+
+    counts = counts_of(standing)
+    words = [
+        counted(counts["assets"], "asset"),
+        counted(counts["steps"], "step"),
+        counted(counts["alarms"], "alarm"),
+    ]
+    if counts["messages refused"]:
+        words.append(f"{counted(counts['messages refused'], 'message')} refused")
+    if counts["not watched"]:
+        words.append(f"{counts['not watched']} not watched")
+    return ", ".join(words)
 
 
-def _table_of_worst_assets(standing: Standing) -> "parts.Table":
+def _table_of_worst_assets(standing: Standing) -> "Table":
     """Return the table of the assets with the most alarms and the most severe damage."""
+    from twin_master.mission.decision_record import health_in_words
+
     assets = {}
     for name, asset in standing["assets"].items():
         if asset["last"] is not None:  # it has had a step
@@ -182,7 +214,7 @@ def _table_of_worst_assets(standing: Standing) -> "parts.Table":
     rows = []
     for name in worst:
         last = assets[name]["last"]
-        health = parts.health_in_words(last)
+        health = health_in_words(last)
         cells = [health.get(state, "") for state in states]
         alarms = str(assets[name]["alarms"] or "")
         row = [name, str(last["step"]), last["control"], *cells, last["next_control"], alarms]
@@ -220,7 +252,9 @@ def run(
 
     Example: `uav-twin fleet run fleet.toml --workers 2`
     """
-    fleet = parts.load_fleet(file, seed)
+    from twin_master.fleet.plan import load_fleet
+
+    fleet = load_fleet(file, seed)
     engine = choose_engine(workers, cluster)
     fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
 
@@ -248,15 +282,23 @@ def learn(
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
-    lessons = parts.learn_from_fleet(folder, out, progress=terminal.progress())
+    from twin_master.fleet.learn import learn_from_fleet
+    from twin_master.fleet.lessons import lesson_rows
+
+    lessons = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _write_report(folder)
-    record = {"file": str(out), **lessons}
-    rows = parts.lesson_rows(lessons)
-    terminal.answer("learn", WORDS, record, json=json, rows=rows, out=out)
+    if json:
+        terminal.print_json({"file": str(out), **lessons})
+        return
+    rows = lesson_rows(lessons)
+    if rows:
+        headings = ["group", "learnt", "assumed", "mean", "95 % interval"]
+        terminal.print_table(headings, rows)
+    terminal.say(f"Learnt: {out}")
 
 
-def choose_engine(workers: int | None, cluster: str | None) -> "parts.Engine":
+def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
     """Return the processes that fly a fleet.
 
     Parameters
@@ -266,24 +308,26 @@ def choose_engine(workers: int | None, cluster: str | None) -> "parts.Engine":
     cluster : str or None
         The address of the scheduler of a Dask cluster.
     """
+    from twin_master.fleet.engine import Engine
+
     if cluster is not None:
         if workers is not None:
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
-        return parts.Engine(cluster=cluster)
+        return Engine(cluster=cluster)
     if workers is None:
         workers = len(os.sched_getaffinity(0))
-    return parts.Engine(workers)
+    return Engine(workers)
 
 
 def fly_and_print_fleet(
-    fleet: "parts.Fleet",
+    fleet: "Fleet",
     out: Path | None,
-    engine: "parts.Engine",
+    engine: "Engine",
     *,
     replace: bool,
     report: bool,
     json: bool,
-) -> "parts.FleetOutcome":
+) -> "FleetOutcome":
     """Fly a fleet, and print its figures.
 
     Parameters
@@ -301,38 +345,61 @@ def fly_and_print_fleet(
     json : bool
         Whether to print JSON.
     """
+    from twin_master.fleet.flight import fly_fleet
+
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
     with terminal.interruptible(lambda: hint):
-        outcome = parts.fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
+        outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     if report:
         _write_report(outcome.folder)
     figures = _figures_by_group([outcome.folder])
-    record = {
-        "folder": str(outcome.folder),
-        "twins": outcome.twins,
-        "failed": len(outcome.failures),
-        "failures": outcome.failures,
-        "ended": outcome.ended,
-        "groups": figures,
-    }
-    terminal.answer(
-        "run",
-        WORDS,
-        record,
-        json=json,
-        outcome=outcome,
-        rows=parts.figure_rows(figures),
-        groups=list(figures),
-        told=[*outcome.failures.items(), *outcome.ended.items()],
-        page=outcome.folder / "report.html",
-    )
+    if json:
+        terminal.print_json(
+            {
+                "folder": str(outcome.folder),
+                "twins": outcome.twins,
+                "failed": len(outcome.failures),
+                "failures": outcome.failures,
+                "ended": outcome.ended,
+                "groups": figures,
+            }
+        )
+    else:
+        _print_figures(figures)
+        _print_outcome(outcome)
     return outcome
 
 
+def _print_outcome(outcome: "FleetOutcome") -> None:
+    """Print how many twins flew, why flights failed or ended early, and where the report is."""
+    from twin_master.fleet.configuration import REPORT_NAME
+
+    flown = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
+    if outcome.shards_kept:
+        flown += f", {counted(outcome.shards_kept, 'shard')} there before"
+    endings = f"{len(outcome.failures)} failed in flight"
+    if outcome.ended:
+        endings += f", {len(outcome.ended)} ended early"
+    terminal.say(f"{flown}; {endings}.")
+    reasons = [*outcome.failures.items(), *outcome.ended.items()]
+    for name, reason in reasons[:MOST_ENDINGS]:
+        terminal.say(f"  {name}: {reason}", fg="yellow")
+    if len(reasons) > MOST_ENDINGS:
+        further = len(reasons) - MOST_ENDINGS
+        terminal.say(f"  and {further} more, in {outcome.folder / 'fleet.json'}")
+    report = outcome.folder / REPORT_NAME
+    if report.is_file():
+        terminal.say(f"Report: {report}")
+    else:
+        terminal.say(f"Fleet: {outcome.folder}")
+
+
 def _write_report(folder: Path) -> None:
+    from twin_master.fleet.report import write_fleet_report
+
     with terminal.progress().stage("Writing the report"):
-        parts.write_fleet_report(folder)
+        write_fleet_report(folder)
 
 
 def compare(
@@ -351,22 +418,35 @@ def compare(
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
     figures = _figures_by_group(folders)
-    rows = parts.figure_rows(figures)
-    terminal.answer("compare", WORDS, figures, json=json, rows=rows, groups=list(figures))
+    if json:
+        terminal.print_json(figures)
+    else:
+        _print_figures(figures)
 
 
-Figures = dict[str, dict[str, "parts.Estimated | int"]]
+Figures = dict[str, dict[str, "Estimated | int"]]
 """The figures of each group, by the name of the group and of the figure."""
 
 
 def _figures_by_group(folders: list[Path]) -> Figures:
     """Return the figures of each group; if there are several folders, its name has the folder."""
+    from twin_master.fleet.reading import group_figures, open_fleet
+
     figures = {}
     for folder in folders:
-        for name, group in parts.open_fleet(folder).items():
+        for name, group in open_fleet(folder).items():
             full_name = name if len(folders) == 1 else f"{folder}: {name}"
-            figures[full_name] = parts.group_figures(group)
+            figures[full_name] = group_figures(group)
     return figures
+
+
+def _print_figures(figures: Figures) -> None:
+    """Print the figures as a table with a column for each group."""
+    from twin_master.fleet.reading import figure_rows
+
+    rows = figure_rows(figures)
+    if rows:
+        terminal.print_table(["figure (SI)", *figures], rows)
 
 
 _POLLING_INTERVAL = 0.05
@@ -439,7 +519,10 @@ def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Call
 def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None) -> None:
     """Show a mission once it is prepared, until the process that flies it ends."""
     if server is None:
-        server = ViewServer(parts.is_prepared, parts.serve)
+        from twin_master.viewer.flight import is_prepared
+        from twin_master.viewer.server import serve
+
+        server = ViewServer(is_prepared, serve)
     # Ctrl-C is for the mission, which then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICENESS_OF_VIEW)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,9 +12,20 @@ from reporting import terminal
 from reporting.command_options import JsonOption
 from reporting.files import atomic_write_bytes
 from reporting.words import comma_list
-from twin_master import parts
 from twin_master.command_options import CalibrationOption, ScenarioArgument, SeedOption
 from twin_master.errors import MissionInputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from reporting.arrays import Float
+    from twin_master.mission.planning import ComparedPolicy
+    from twin_master.mission.preparation import Knowledge
+    from twin_master.mission.sensor_design import SensorDesign
+    from twin_master.network.belief_planning import BeliefPlan
+    from twin_master.network.decision_problem import DecisionProblem
+    from twin_master.scenario.schema import Scenario
+
 
 Record = dict[str, Any]
 """The result of a command, as it is printed as JSON."""
@@ -34,9 +45,9 @@ class _PlannedMission:
         Its returns in simulated missions.
     """
 
-    problem: "parts.DecisionProblem"
-    plan: "parts.BeliefPlan"
-    simulated: "parts.ComparedPolicy"
+    problem: "DecisionProblem"
+    plan: "BeliefPlan"
+    simulated: "ComparedPolicy"
 
 
 def plan(
@@ -72,27 +83,30 @@ def plan(
 
     Example: `uav-twin plan inspected_wing --out policy.npz`
     """
+    from twin_master.mission.planning import compare_simple_rules, encode_policy, share_beyond_limit
+    from twin_master.report.planning import plan_figure
+
     knowledge = _prepare(scenario, seed, calibration).knowledge
     without_value_of = None
     if value_of is not None:
         without_value_of = _without_information(knowledge, [value_of])
     planned = _plan_mission(knowledge)
     if out is not None:
-        atomic_write_bytes(out, parts.encode_policy(planned.plan.policy, knowledge.model))
+        atomic_write_bytes(out, encode_policy(planned.plan.policy, knowledge.model))
     if picture is not None:
-        _write_picture(picture, parts.plan_figure(planned.plan.policy, knowledge.model))
+        _write_picture(picture, plan_figure(planned.plan.policy, knowledge.model))
     record: Record = {
         "lower": planned.plan.lower,
         "upper": planned.plan.upper,
         "simulated": planned.simulated.mean,
         "half_width": planned.simulated.half_width,
-        "beyond_limit": parts.share_beyond_limit(
+        "beyond_limit": share_beyond_limit(
             knowledge.scenario, planned.problem, knowledge.rewards, planned.plan.policy
         ),
     }
     rules = [planned.simulated]
     if without_value_of is None:
-        rules += parts.compare_simple_rules(knowledge.scenario, planned.problem)
+        rules += compare_simple_rules(knowledge.scenario, planned.problem)
     else:
         simulated_without = _plan_mission(without_value_of).simulated
         rules.append(replace(simulated_without, name=f"planned without {value_of}"))
@@ -137,15 +151,15 @@ class _GaugePlaces:
         The outlines of a wing and its regions, in metres; empty for other structures.
     """
 
-    positions: "parts.Float | None" = None
-    outlines: "list[parts.Float]" = field(default_factory=list)
+    positions: "Float | None" = None
+    outlines: "list[Float]" = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class _Prepared:
     """What the twin of a scenario knows before any plan on the belief, and where its gauges are."""
 
-    knowledge: "parts.Knowledge"
+    knowledge: "Knowledge"
     places: _GaugePlaces
 
 
@@ -168,30 +182,37 @@ def _prepare(
     candidates : str, optional
         Candidates for gauges, as for `add_candidate_gauges`.
     """
-    loaded = parts.load_scenario(scenario_name)
-    scenario = parts.resolve_scenario(loaded, {"seed": seed, "calibration": calibration})
-    parts.believed_source(scenario).check()
+    from twin_master.assets.resolution import believed_source, resolve_scenario
+    from twin_master.mission.preparation import prepare_without_folder
+    from twin_master.mission.sensor_design import add_candidate_gauges
+    from twin_master.scenario.reading import load_scenario
+
+    loaded = load_scenario(scenario_name)
+    scenario = resolve_scenario(loaded, {"seed": seed, "calibration": calibration})
+    believed_source(scenario).check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
-            scenario = parts.add_candidate_gauges(scenario, candidates, Path(folder, "candidates"))
-        source = parts.believed_source(scenario)
-        knowledge = parts.prepare_without_folder(scenario, source, terminal.progress())
+            scenario = add_candidate_gauges(scenario, candidates, Path(folder, "candidates"))
+        source = believed_source(scenario)
+        knowledge = prepare_without_folder(scenario, source, terminal.progress())
         return _Prepared(knowledge, _find_gauges(scenario))
 
 
-def _plan_mission(knowledge: "parts.Knowledge") -> _PlannedMission:
+def _plan_mission(knowledge: "Knowledge") -> _PlannedMission:
     """Plan on the belief, and simulate the plan."""
+    from twin_master.mission.planning import plan_within_limit, simulate_policy
+
     scenario = knowledge.scenario
     problem = knowledge.problem
-    plan = parts.plan_within_limit(scenario, problem, knowledge.rewards).plan
-    return _PlannedMission(problem, plan, parts.simulate_policy(scenario, problem, plan.policy))
+    plan = plan_within_limit(scenario, problem, knowledge.rewards).plan
+    return _PlannedMission(problem, plan, simulate_policy(scenario, problem, plan.policy))
 
 
 _BLIND = 1e6
 """The standard deviation of a blind sensor, relative to the largest value that it could show."""
 
 
-def _without_information(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowledge":
+def _without_information(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     """Return the knowledge of a twin for which some gauges or inspections show nothing.
 
     They keep their place, but their noise becomes so large that their readings tell nothing.
@@ -223,7 +244,7 @@ def _without_information(knowledge: "parts.Knowledge", names: Sequence[str]) -> 
     return replace(knowledge, scenario=blind_scenario)
 
 
-def _check_names(scenario: "parts.Scenario", names: Sequence[str]) -> None:
+def _check_names(scenario: "Scenario", names: Sequence[str]) -> None:
     """Refuse names that are neither a gauge nor an action that inspects."""
     titles = _sensor_titles(scenario)
     inspecting = [action.name for action in scenario.action if action.inspects]
@@ -236,15 +257,17 @@ def _check_names(scenario: "parts.Scenario", names: Sequence[str]) -> None:
             )
 
 
-def _sensor_titles(scenario: "parts.Scenario") -> tuple[str, ...]:
+def _sensor_titles(scenario: "Scenario") -> tuple[str, ...]:
     """Return the titles of the sensors; if they have none, their numbers from 1."""
     section = scenario.observation
     return section.titles or tuple(str(number + 1) for number in range(section.count))
 
 
-def _write_picture(path: Path, figure: "parts.Figure") -> None:
+def _write_picture(path: Path, figure: "Figure") -> None:
     """Write a figure as PNG or SVG, by the suffix of the file."""
-    picture = parts.to_png(figure) if path.suffix.lower() == ".png" else parts.to_svg(figure)
+    from reporting.figures import to_png, to_svg
+
+    picture = to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure)
     atomic_write_bytes(path, picture)
 
 
@@ -303,16 +326,18 @@ def design(
 
     Example: `uav-twin design level_turns --sensors 6 --picture gauges.svg`
     """
+    from twin_master.mission.sensor_design import choose_sensors, draw_readings, level_separations
+
     prepared = _prepare(scenario, None, calibration, candidates)
     knowledge = prepared.knowledge
     titles = _sensor_titles(knowledge.scenario)
     candidate_titles = _candidate_titles(titles, among)
     candidate_indices = [titles.index(title) for title in candidate_titles]
-    readings = parts.draw_readings(knowledge)
-    choice = parts.choose_sensors(readings, candidate_indices, sensors)
+    readings = draw_readings(knowledge)
+    choice = choose_sensors(readings, candidate_indices, sensors)
     chosen_titles = [titles[sensor] for sensor in choice.sensors]
     not_separated = []
-    separations = parts.level_separations(knowledge, readings, candidate_indices)
+    separations = level_separations(knowledge, readings, candidate_indices)
     for (factor, level), separation in separations.items():
         if separation < 1.0:
             not_separated.append(_levels_in_words(knowledge, factor, level))
@@ -349,7 +374,7 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
 
 
 def _compare_returns(
-    knowledge: "parts.Knowledge", chosen: Sequence[str], candidates: Sequence[str]
+    knowledge: "Knowledge", chosen: Sequence[str], candidates: Sequence[str]
 ) -> dict[str, list[float]]:
     """Return the returns with the chosen sensors and with all candidates, as mean and half width."""
     titles = _sensor_titles(knowledge.scenario)
@@ -376,43 +401,49 @@ def _print_design(record: Record, candidates: int) -> None:
         terminal.say(f"Expected return, {sensors}: {mean:.4g} ± {half_width:.2g} (95 %).")
 
 
-def _levels_in_words(knowledge: "parts.Knowledge", factor_name: str, level: int) -> str:
+def _levels_in_words(knowledge: "Knowledge", factor_name: str, level: int) -> str:
     """Return a level of a state factor, given by its index, and the next one in words."""
+    from twin_master.scenario.section import printed_state
+
     index = knowledge.scenario.state_names.index(factor_name)
     factor = knowledge.scenario.state[index]
-    scale, unit = parts.printed_state(factor.unit)
+    scale, unit = printed_state(factor.unit)
     low = scale * factor.levels[level]
     high = scale * factor.levels[level + 1]
     return f"{factor_name} of {low:g} {unit} from {high:g} {unit}"
 
 
-def _write_vtu(path: Path, places: _GaugePlaces, choice: "parts.SensorDesign") -> None:
+def _write_vtu(path: Path, places: _GaugePlaces, choice: "SensorDesign") -> None:
     """Write the gauges as points; their rank is 1 for the first chosen one, and 0 if not chosen."""
     import numpy as np
+
+    from fe.structure.operators import write_vtu
 
     if places.positions is None:
         raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
     rank = np.zeros(len(places.positions))
     rank[list(choice.sensors)] = np.arange(1, len(choice.sensors) + 1)
     cells = ("vertex", np.arange(len(rank))[:, None])
-    parts.write_vtu(path, places.positions, cells, {"rank": rank}, {})
+    write_vtu(path, places.positions, cells, {"rank": rank}, {})
 
 
 def _write_design_picture(
     path: Path,
     places: _GaugePlaces,
-    choice: "parts.SensorDesign",
+    choice: "SensorDesign",
     chosen_titles: Sequence[str],
 ) -> None:
     """Draw the information of the chosen sensors, and where they are."""
     import numpy as np
+
+    from twin_master.report.planning import design_figure
 
     positions = places.positions
     if positions is not None:
         # The picture shows the two axes along which the gauges extend most.
         axes_by_extent = np.argsort(-np.ptp(positions, axis=0), kind="stable")
         positions = positions[:, np.sort(axes_by_extent[:2])]
-    figure = parts.design_figure(
+    figure = design_figure(
         list(choice.information),
         choice.of_all,
         chosen_titles,
@@ -423,17 +454,22 @@ def _write_design_picture(
     _write_picture(path, figure)
 
 
-def _find_gauges(scenario: "parts.Scenario") -> _GaugePlaces:
+def _find_gauges(scenario: "Scenario") -> _GaugePlaces:
     """Return where the gauges are, from the structure file or the design of a wing."""
     import numpy as np
 
+    from fe.wing.design import load_design
+    from twin_master.assets.design_source import DESIGN_COPY
+    from twin_master.assets.structure_source import MODEL_COPY
+    from twin_master.report.structure import gauge_places, planform_of
+
     files = scenario.belief.all_files()
-    positions = parts.gauge_places(files.get(parts.MODEL_COPY))
+    positions = gauge_places(files.get(MODEL_COPY))
     if positions is not None and scenario.observation.role == "strain":
         return _GaugePlaces(positions)
-    design_file = files.get(parts.DESIGN_COPY)
-    wing_design = None if design_file is None else parts.load_design(design_file)
-    planform = parts.planform_of(wing_design, scenario)
+    design_file = files.get(DESIGN_COPY)
+    wing_design = None if design_file is None else load_design(design_file)
+    planform = planform_of(wing_design, scenario)
     if planform is None:
         return _GaugePlaces()
     positions = np.insert(planform.gauges, 2, 0.0, axis=1)  # at z = 0

@@ -8,7 +8,7 @@ import typer
 
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
-from twin_master import command, fleet_command, plan_command
+from twin_master import command, fleet_command, plan_command, scenario_command
 from uav_twin import (
     calibrate_commands,
     discrepancy_campaigns,
@@ -134,10 +134,10 @@ app.command("design", rich_help_panel=MISSIONS)(plan_command.design)
 app.command("view", rich_help_panel=MISSIONS)(command.view)
 app.command("watch", rich_help_panel=MISSIONS)(watch_command.watch)
 app.command("compare", rich_help_panel=MISSIONS)(fleet_command.compare)
-app.command("scenarios", rich_help_panel=MISSIONS)(command.list_scenarios)
+app.command("scenarios", rich_help_panel=MISSIONS)(scenario_command.list_scenarios)
 
 scenario_group = _add_group("scenario", MISSIONS, "Check a scenario before it is flown.")
-scenario_group.command("check")(command.check_scenario)
+scenario_group.command("check")(scenario_command.check_scenario)
 
 wing_group = _add_group_command(
     "wing",

@@ -20,6 +20,8 @@ WATCHED_KIND = "uav-twin fleet watch"
 """The kind in the configuration of a fleet that is watched."""
 GROUPS = "groups"
 """The folder with the prepared knowledge of the twins of each group: model, policy and draws."""
+REPORT_NAME = "report.html"
+"""The page of a fleet in its folder."""
 
 _SCENARIOS = "fleet.groups.scenarios"
 PRESENT_NAMES = {

@@ -18,7 +18,7 @@ from reporting.files import atomic_write_text
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError, TwinMasterError
-from twin_master.fleet.configuration import KIND, WATCHED_KIND, fleet_config
+from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.page_figures import course_figure, map_figure
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 WORDS = Words("twin_master.fleet")
 """The texts of the page."""
-REPORT_NAME = "report.html"
 ATTENTION_ROWS = 15
 """Rows of the table of assets that need attention next, in the report."""
 _FAILURE_ROWS = 10
