@@ -1,4 +1,4 @@
-"""What commands take from rooms and other packages: read by type checkers, by editors and by `parts.py`."""
+"""Imports of the commands from modules and other packages, for type checkers, editors and `parts.py`."""
 
 from matplotlib.figure import Figure as Figure
 from rich.console import Console as Console
