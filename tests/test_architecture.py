@@ -1,4 +1,4 @@
-"""The house: floors, rooms and files import downwards only, and stay small enough to live in."""
+"""Layers, modules and files import downwards only, and stay short enough to read."""
 
 import ast
 import re
@@ -15,28 +15,28 @@ from setuptools import find_namespace_packages
 
 ROOT = Path(__file__).parents[1]
 
-# Floors from the ground up, as docs/architecture.md draws them: each package imports those below its own.
-FLOORS = (
+# Layers from the lowest up, as docs/architecture.md draws them: a package imports those of lower layers.
+LAYERS = (
     ("reporting",),
     ("fe",),
     ("fmu_asset", "calibration", "scenarios"),
     ("twin_master", "discrepancy"),
     ("uav_twin",),
 )
-MAY_IMPORT = {package: {*chain(*FLOORS[:number])} for number, floor in enumerate(FLOORS) for package in floor}
+MAY_IMPORT = {package: {*chain(*LAYERS[:number])} for number, layer in enumerate(LAYERS) for package in layer}
 MAY_IMPORT["scenarios"] = set()
 
 BESIDE = {"benchmarks", "evidence", "tests"}
 """What imports the product and is not distributed with it."""
 
-ROOMS = dict(
+MODULE_TABLES = dict(
     re.findall(
-        r"^Rooms of `(\w+)`:\n\n((?:- .*\n)+)",
+        r"^### Modules of `(\w+)`\n\n\| module \| contents \|\n\| --- \| --- \|\n((?:\| `.*\n)+)",
         (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"),
         re.MULTILINE,
     )
 )
-"""What the page says of the rooms of each package, from the ground up; a file at its root is a room, too."""
+"""The table rows of each package's modules, from the lowest up: its folders and the files at its root."""
 
 LONGEST_MODULE = 350
 """Lines of code of a module (docstrings, help of options, comments and blank lines left out)."""
@@ -62,8 +62,8 @@ LONGER: dict[str, str] = {
 
 
 @cache
-def modules() -> dict[str, Path]:
-    """Return every module of the project by its dotted name."""
+def source_files() -> dict[str, Path]:
+    """Return every Python file of the product by its dotted name."""
     found = {}
     for package in MAY_IMPORT:
         for path in sorted((ROOT / package).rglob("*.py")):
@@ -83,7 +83,9 @@ def nodes(path: Path) -> tuple[ast.Import | ast.ImportFrom | ast.FunctionDef | a
 @cache
 def imported(name: str, path: Path) -> frozenset[str]:
     """Return the project modules that `name` imports, in functions and for type checking too."""
-    return frozenset(other for other in named_imports(name, path) if other in modules() and other != name)
+    return frozenset(
+        other for other in named_imports(name, path) if other in source_files() and other != name
+    )
 
 
 def named_imports(name: str, path: Path) -> Iterator[str]:
@@ -107,7 +109,7 @@ def test_imports_run_downwards_only_and_never_to_what_stands_beside(package):
     refused = {*MAY_IMPORT, *BESIDE} - MAY_IMPORT[package] - {package}
     wrong = [
         f"{name} imports {other}"
-        for name, path in modules().items()
+        for name, path in source_files().items()
         if name.split(".")[0] == package
         for other in named_imports(name, path)
         if other.split(".")[0] in refused
@@ -115,25 +117,35 @@ def test_imports_run_downwards_only_and_never_to_what_stands_beside(package):
     assert not wrong
 
 
-@pytest.mark.parametrize("package", sorted(ROOMS))
-def test_rooms_import_rooms_below_them_only(package):
-    known = modules()
-    told = re.findall(r"`(\w+)`", " ".join(row.split(":")[0] for row in ROOMS[package].splitlines()))
-    order = {room: height for height, room in enumerate(("errors", "sentences", *told))}
-    own = {name: name.split(".")[1] for name in known if name.startswith(f"{package}.")}
-    assert set(own.values()) <= set(order), "a room without a place in the order"
-    assert {room for room in told if (ROOT / package / room).is_dir()} | set(own.values()) >= set(told)
+def test_the_page_has_the_modules_of_every_package_that_has_layers_inside():
+    assert set(MODULE_TABLES) == {"fe", "fmu_asset", "calibration", "twin_master", "discrepancy"}
+
+
+@pytest.mark.parametrize("package", sorted(MODULE_TABLES))
+def test_modules_import_modules_below_them_only(package):
+    files = source_files()
+    listed = [
+        module
+        for row in MODULE_TABLES[package].splitlines()
+        for module in re.findall(r"`(\w+)`", row.split(" | ")[0])
+    ]
+    height = {module: number for number, module in enumerate(("errors", *listed))}
+    module_of = {name: name.split(".")[1] for name in files if name.startswith(f"{package}.")}
+    assert len(height) == len(listed) + 1, "a module stands in the table twice"
+    assert set(module_of.values()) <= set(height), "a module is missing in the table"
+    folders = {module for module in listed if (ROOT / package / module).is_dir()}
+    assert folders | set(module_of.values()) >= set(listed), "a module of the table does not exist"
     wrong = [
         f"{name} imports {other}"
-        for name, room in own.items()
-        for other in imported(name, known[name])
-        if other in own and order[own[other]] > order[room]
+        for name, module in module_of.items()
+        for other in imported(name, files[name])
+        if other in module_of and height[module_of[other]] > height[module]
     ]
     assert not wrong
 
 
 def test_no_two_files_import_each_other_in_a_circle():
-    known = modules()
+    known = source_files()
     # A package's __init__ re-exports its files, and its files never need it: leave it out of the graph.
     graph = {
         name: {o for o in imported(name, path) if known[o].name != "__init__.py"}
@@ -156,7 +168,7 @@ def test_no_two_files_import_each_other_in_a_circle():
 
 def test_modules_and_functions_are_short_or_say_why_not():
     long: dict[str, int] = {}
-    for path in modules().values():
+    for path in source_files().values():
         place = path.relative_to(ROOT).as_posix()
         if code_lines(path) > LONGEST_MODULE:
             long[place] = code_lines(path)
@@ -214,7 +226,7 @@ def lines_of_option_help(tree: ast.AST) -> set[int]:
 
 def test_the_runtime_imports_numpy_the_standard_library_and_itself_only():
     """By relative imports: its folder goes into FMUs as it is."""
-    for name, path in modules().items():
+    for name, path in source_files().items():
         for node in nodes(path) if name.startswith("fe.runtime") else ():
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom):

@@ -60,6 +60,32 @@ def test_pages_use_the_terms_of_the_glossary():
     assert not found
 
 
+HOW_TO_ADD = sorted((ROOT / "docs" / "how_to_add").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", HOW_TO_ADD, ids=lambda page: page.stem)
+def test_examples_of_how_to_add_are_lines_of_the_files_that_they_name(page):
+    text = page.read_text(encoding="utf-8")
+    examples = re.findall(r"^```(?:py|toml)\n# (\S+)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert examples
+    for file, lines in examples:
+        source = (ROOT / file).read_text(encoding="utf-8")
+        position = 0
+        for piece in lines.split("...\n"):
+            position = source.find(f"\n{piece}", position)
+            assert position >= 0, f"{file} has no longer, in this order:\n{piece}"
+            position += len(piece)
+
+
+@pytest.mark.parametrize("page", HOW_TO_ADD, ids=lambda page: page.stem)
+def test_paths_of_how_to_add_exist(page):
+    text = page.read_text(encoding="utf-8")
+    folders = "benchmarks|discrepancy|docs|fe|reporting|tests|twin_master|uav_twin"
+    paths = re.findall(rf"(?:(?<=`)|(?<= ))(?:{folders})(?:/[\w*]+)+(?:\.\w+)*", text)
+    assert paths
+    assert [path for path in paths if "NAME" not in path and not list(ROOT.glob(path))] == []
+
+
 IMAGES = ROOT / "docs" / "images"
 
 

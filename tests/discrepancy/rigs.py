@@ -1,4 +1,4 @@
-"""What all rooms of tests share: trials, campaigns, what models show of them, effects by name, small rigs."""
+"""Shared by all folders of tests: trials, campaigns, responses of models, effects by name, small rigs."""
 
 import shutil
 import tomllib

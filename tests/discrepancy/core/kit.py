@@ -23,7 +23,7 @@ from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch, RunOffset, SensorDrift
 from tests.discrepancy.rigs import chosen, hiding, setting_of
 
-__all__ = ["chosen"]  # of all rooms
+__all__ = ["chosen"]  # for all folders of tests
 
 OUTPUTS = ("y1", "y2", "y3")
 STATIC_SHAPES = np.array([[1.0, 0.6, 0.3], [0.02, -0.03, 0.05]])  # by parameter and output

@@ -222,8 +222,8 @@ def test_every_file_that_shapes_the_model_counts_for_the_key():
     code = "import sys, fe.reduction.patch_basis; print(*(n for n in sys.modules if n.startswith('fe.')))"
     words = [sys.executable, "-c", code]
     result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
-    rooms = {name.split(".")[1] for name in result.stdout.split()}
-    assert rooms - {"designs", "sentences"} == set(MODELLING_PACKAGES)
+    modules = {name.split(".")[1] for name in result.stdout.split()}
+    assert modules - {"designs", "sentences"} == set(MODELLING_PACKAGES)
 
 
 @pytest.mark.slow
