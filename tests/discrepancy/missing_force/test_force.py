@@ -201,7 +201,7 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
     """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
     problem, random = blind(tmp_path, CART), np.random.default_rng(8)
     every = problem.with_trials(problem.campaign.trials)
-    start = every.start(Candidate())
+    start = every.prior_mean_point(Candidate())
     for number, data in enumerate(every.trials):
         bare, _ = every.response(number, start.shared, start.local[number], ModelPatch())
         response = gain * every.prediction(number, start, bare)
