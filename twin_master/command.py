@@ -1,14 +1,9 @@
-"""Commands of one asset: `run`, also as `python -m twin_master`, `watch` and `view`."""
+"""Commands of one mission: `run`, also as `python -m twin_master`, and `view`."""
 
 import json
-import os
-import shlex
-import signal
-import sys
-import time
 import traceback
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,11 +13,10 @@ import typer
 from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
-from reporting.former_options import accepts_former_options, former_names_as_lines
-from reporting.words import counted, number
+from reporting.former_options import former_names_as_lines
+from reporting.words import number
 from twin_master.command_options import (
     CalibrationOption,
-    CertificateOption,
     ClusterOption,
     LibraryOption,
     SeedOption,
@@ -32,16 +26,10 @@ from twin_master.command_options import (
 )
 from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
-from twin_master.watch.cause_search import CauseSearch
 
 if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
     from twin_master.store.writing import RunOutcome
-    from twin_master.watch.folder import Watch
-
-
-Decision = Mapping[str, Any]
-"""The decision of a twin in a step, as `decision_from_line` returns it."""
 
 
 def run(
@@ -400,228 +388,6 @@ def main() -> None:
     application.command()(run)
     run_with_options = terminal.with_common_options(application)
     run_command_line(lambda: run_with_options(prog_name="python -m twin_master"))
-
-
-@accepts_former_options(steps="--turns", from_step="--from-turn")
-def watch(
-    scenario: Annotated[
-        str | None,
-        typer.Argument(
-            show_default=False,
-            metavar="[SCENARIO]",
-            autocompletion=complete_scenario,
-            help="A shipped scenario, or the path of a TOML file.",
-        ),
-    ] = None,
-    *,
-    observations: Annotated[
-        str | None,
-        typer.Option(
-            "--observations",
-            metavar="SOURCE",
-            show_default="the recording of the scenario, else -",
-            help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines "
-            "on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
-            "TLS).",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            show_default="runs/SCENARIO",
-            help="The folder of the watch.",
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Take up the watch in --out.",
-        ),
-    ] = False,
-    replace: Annotated[
-        bool,
-        typer.Option(
-            "--replace",
-            help="Replace the folder if it exists.",
-        ),
-    ] = False,
-    follow: Annotated[
-        bool,
-        typer.Option(
-            "--follow",
-            help="Wait at the end of a CSV file for more.",
-        ),
-    ] = False,
-    pace: Annotated[
-        float,
-        typer.Option(
-            "--pace",
-            min=0.0,
-            max=3600.0,
-            help="Seconds to wait after each step, to look at a recording.",
-        ),
-    ] = 0.0,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            "--steps",
-            min=0,
-            help="End after so many steps in all.",
-        ),
-    ] = None,
-    model_patch: Annotated[
-        Path | None,
-        typer.Option(
-            "--model-patch",
-            help="Believe this patch (`patch.json` of `discrepancy run`) from --from-step on.",
-        ),
-    ] = None,
-    from_step: Annotated[
-        int | None,
-        typer.Option(
-            "--from-step",
-            min=0,
-            help="The first step that --model-patch is believed in.",
-        ),
-    ] = None,
-    teach: Annotated[
-        bool,
-        typer.Option(
-            "--teach",
-            help="Look for the cause of an alarm, and believe what is named.",
-        ),
-    ] = False,
-    allow_unknown: Annotated[
-        bool,
-        typer.Option(
-            "--allow-unknown",
-            help="Pass over keys and columns that are no sensor.",
-        ),
-    ] = False,
-    ca_file: CertificateOption = None,
-    seed: SeedOption = None,
-    calibration: CalibrationOption = None,
-    library: LibraryOption = None,
-    last: Annotated[
-        int,
-        typer.Option(
-            "--last",
-            min=1,
-            help="Steps, the last ones, in run.nc and report.",
-        ),
-    ] = 1000,
-    view: ViewOption = False,
-    no_report: NoReportOption = False,
-    cause_search: CauseSearch | None = None,
-) -> None:
-    """Watch a real asset: observations in, a decision for each step out, as a line of JSON.
-
-    The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
-
-    Everything is kept in the folder after every step. Ctrl-C ends a watch in order; --resume takes it up.
-
-    Example: `uav-twin watch watched_wing --out runs/watched`
-    """
-    from twin_master.watch import broker_address, opening
-
-    watches: list[Watch] = []
-    comes_from_broker = broker_address.is_broker(observations or "")
-    is_live = follow or observations is None or observations == "-" or comes_from_broker
-
-    def print_decision(decision: Decision) -> None:
-        has_reader = _print_decision(watches[0], decision, flush=is_live)
-        time.sleep(pace)
-        if not has_reader and not comes_from_broker:
-            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
-
-    with view_beside(view) as begun:
-
-        def begin_watch(watched: "Watch") -> None:
-            watches.append(watched)
-            begun(watched.folder)
-
-        folder = opening.watch(
-            scenario,
-            observations,
-            out,
-            {"seed": seed, "calibration": calibration, "library": library},
-            decide=print_decision,
-            resume=resume,
-            follow=follow,
-            steps=steps,
-            model_patch=model_patch,
-            from_step=from_step,
-            teach=teach,
-            allow_unknown=allow_unknown,
-            ca_file=ca_file,
-            replace=replace,
-            last=last,
-            report=not no_report,
-            otherwise="-",
-            begun=begin_watch,
-            cause_search=cause_search,
-            progress=terminal.progress(),
-        )
-        _print_end_of_watch(folder, watches[0], report=not no_report)
-    _exit_on_complaint(watches[0])
-
-
-def _exit_on_complaint(watched: "Watch") -> None:
-    """End the command with exit code 1 if the observations of a watch were not in order."""
-    complaint = watched.intake.complaint()
-    if complaint:
-        raise terminal.error_exit(complaint)
-
-
-def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None:
-    """Flush the decisions; print how many messages came, and where folder and report are."""
-    from twin_master.store.writing import REPORT_NAME
-
-    _write_to_output("", flush=True)
-    if terminal.loudness.quiet:
-        return
-    counts = watched.intake.counts
-    refused = ""
-    if counts.rejected:
-        refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
-    received = counted(counts.received, "message")
-    typer.echo(f"Watch: {folder}, {received}{refused}.", err=True)
-    if report and (folder / REPORT_NAME).is_file():
-        typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
-
-
-def _print_decision(watched: "Watch", decision: Decision, *, flush: bool) -> bool:
-    """Print a decision and its notices; return whether the output still has a reader."""
-    from twin_master.mission.decision_record import decision_line
-
-    # Notices go to the error stream, so that people see them also if a program reads the decisions.
-    for notice in decision["notices"]:
-        sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
-        typer.secho(sentence, fg="yellow", err=True)
-    if terminal.loudness.quiet:
-        return True
-    is_for_people = sys.stdout.isatty()
-    if not is_for_people:
-        return _write_to_output(json.dumps(decision) + "\n", flush=flush)
-    if "control" not in decision:  # before the first observation nothing is decided
-        return True
-    return _write_to_output(decision_line(watched.scenario, decision) + "\n", flush=True)
-
-
-def _write_to_output(text: str, *, flush: bool) -> bool:
-    """Write to standard output; return whether it still has a reader."""
-    try:
-        sys.stdout.write(text)
-        if flush:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader has ended, as in `watch | head`. Python would complain at its end that it
-        # cannot write the rest of the buffer, so the rest goes to the null device.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return False
-    return True
 
 
 def view(

@@ -2,12 +2,12 @@
 
 import inspect
 
-from twin_master import command
+from twin_master import watch_command
 from uav_twin.cause_search import with_discrepancy_search
 
-watch = with_discrepancy_search(command.watch)
+watch = with_discrepancy_search(watch_command.watch)
 
 # The options of a command are read from its signature, and the search is no option
-_SIGNATURE = inspect.signature(command.watch)
+_SIGNATURE = inspect.signature(watch_command.watch)
 _OPTIONS = [option for name, option in _SIGNATURE.parameters.items() if name != "cause_search"]
 vars(watch)["__signature__"] = _SIGNATURE.replace(parameters=_OPTIONS)

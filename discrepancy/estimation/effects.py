@@ -1,7 +1,7 @@
 """The effects of a hypothesis along a trajectory: forces at ports and errors of sensors."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
 from .laws import LawForce, force_and_tangents
-from .linearised import LinearisedForce, LinearisedSensorErrors, Trajectory
+from .linearised import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
 
 HALF_DIFFERENCE = 0.02
 """Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
@@ -52,148 +52,89 @@ class EffectLaws:
         return self.candidate.parameter_count
 
     def linearise_along_trajectory(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
+        self, arguments: LawArguments
     ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
         """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        effect : (E,) array
-            The values of the effects' unknowns.
-        shared : (K,) array
-            The values of the shared unknowns.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
-
-        Returns
-        -------
-        (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
-            The forces by the number of the port, and the changes of the readings; None if an effect
-            is not possible at these values.
+        See `HypothesisLaws.linearise_along_trajectory`.
         """
         try:
-            forces = self._linearised_forces(trial_index, trajectory, effect, shared, speed_window)
-            return forces, self._linearised_sensor_errors(trial_index, trajectory, effect)
+            return self._linearised_forces(arguments), self._linearised_sensor_errors(arguments)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
-    def forces_along_trajectory(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
-    ) -> Mapping[int, LawForce] | None:
+    def forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, LawForce] | None:
         """Return the forces of all laws at ports along a trajectory, not their derivatives.
 
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        effect : (E,) array
-            The values of the effects' unknowns.
-        shared : (K,) array
-            The values of the shared unknowns.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
-
-        Returns
-        -------
-        mapping of int to LawForce or None
-            The forces by the number of the port; None if an effect is not possible at these values.
+        See `HypothesisLaws.forces_along_trajectory`.
         """
         try:
-            return self._checked_forces(trial_index, trajectory, effect, shared, speed_window)
+            return self._checked_forces(arguments)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
     # ------------------------------------------------------------ laws
 
-    def _checked_forces(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
-    ) -> dict[int, LawForce]:
+    def _checked_forces(self, arguments: LawArguments) -> dict[int, LawForce]:
         """Return the forces of all laws, by port; raise an error if an effect is not possible."""
-        patch = self.evaluate_model_laws(shared) + self._patch_in_trial(trial_index, effect).of(
-            PortForce
-        )
-        return self._forces_of_patch(trial_index, trajectory, patch, speed_window)
+        laws_of_model = self.evaluate_model_laws(arguments.shared)
+        changes = self._patch_in_trial(arguments.trial_index, arguments.effect)
+        return self._forces_of_patch(arguments, laws_of_model + changes.of(PortForce))
 
-    def _linearised_forces(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
-    ) -> dict[int, LinearisedForce]:
+    def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
         """Return the forces of all laws, by port, with their derivatives by unknowns.
 
-        The parameters are those of `linearise_along_trajectory`. The derivatives are central
-        differences. The K shared unknowns are numbered first, then those of the effects.
+        The derivatives are central differences. The K shared unknowns are numbered first, then
+        those of the effects.
         """
-
-        def forces_at(effect_values: FloatArray, shared_values: FloatArray) -> dict[int, LawForce]:
-            return self._checked_forces(
-                trial_index, trajectory, effect_values, shared_values, speed_window
-            )
-
-        forces = forces_at(effect, shared)
+        forces = self._checked_forces(arguments)
         derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
+
+        effect, shared = arguments.effect, arguments.shared
         for k in range(self.effect_unknown_count):
-            above = forces_at(with_step(effect, k, HALF_DIFFERENCE), shared)
-            below = forces_at(with_step(effect, k, -HALF_DIFFERENCE), shared)
-            self._store_derivatives(derivatives, len(shared) + k, above, below)
+            self._add_derivatives(
+                derivatives,
+                len(shared) + k,
+                above=replace(arguments, effect=with_step(effect, k, HALF_DIFFERENCE)),
+                below=replace(arguments, effect=with_step(effect, k, -HALF_DIFFERENCE)),
+            )
         for k in self.unknowns_of_model_laws:
-            above = forces_at(effect, with_step(shared, k, HALF_DIFFERENCE))
-            below = forces_at(effect, with_step(shared, k, -HALF_DIFFERENCE))
-            self._store_derivatives(derivatives, k, above, below)
+            self._add_derivatives(
+                derivatives,
+                k,
+                above=replace(arguments, shared=with_step(shared, k, HALF_DIFFERENCE)),
+                below=replace(arguments, shared=with_step(shared, k, -HALF_DIFFERENCE)),
+            )
         return {
             port: LinearisedForce(force_at_port, derivatives[port])
             for port, force_at_port in forces.items()
         }
 
-    @staticmethod
-    def _store_derivatives(
+    def _add_derivatives(
+        self,
         derivatives: Mapping[int, dict[int, FloatArray]],
         unknown: int,
-        above: Mapping[int, LawForce],
-        below: Mapping[int, LawForce],
+        above: LawArguments,
+        below: LawArguments,
     ) -> None:
-        """Store the derivatives of the forces at ports by one unknown, unless they are zero.
+        """Add the derivatives of the forces at ports by one unknown, unless they are zero.
 
         Parameters
         ----------
         derivatives : mapping of int to dict of int to (F,) array
-            The derivatives by port and unknown, to which those of the unknown are added.
+            The derivatives by port and unknown, to which those by the unknown are added.
         unknown : int
             The number of the unknown.
-        above, below : mapping of int to LawForce
-            The forces with the unknown `HALF_DIFFERENCE` above and below its value, by port.
+        above, below : LawArguments
+            The arguments with the unknown `HALF_DIFFERENCE` above and below its value.
         """
-        for port, slopes_at_port in derivatives.items():
-            if port in above and port in below:
-                slope = (above[port].force - below[port].force) / (2.0 * HALF_DIFFERENCE)
-                if np.any(slope):
-                    slopes_at_port[unknown] = slope
+        forces_above = self._checked_forces(above)
+        forces_below = self._checked_forces(below)
+        for port, derivatives_at_port in derivatives.items():
+            if port in forces_above and port in forces_below:
+                rise = forces_above[port].force - forces_below[port].force
+                if np.any(rise):
+                    derivatives_at_port[unknown] = rise / (2.0 * HALF_DIFFERENCE)
 
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
@@ -209,24 +150,13 @@ class EffectLaws:
         """Return the index in the problem, which has static trials too, of a dynamic trial."""
         return self.column_builder.trial_indices[trial_index]
 
-    def _forces_of_patch(
-        self, trial_index: int, trajectory: Trajectory, patch: ModelPatch, speed_window: float
-    ) -> dict[int, LawForce]:
+    def _forces_of_patch(self, arguments: LawArguments, patch: ModelPatch) -> dict[int, LawForce]:
         """Return the forces of a patch's laws along a trajectory, summed by the number of the port.
 
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        patch : ModelPatch
-            The patch; what is not a law at a port is left out.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
+        What is not a law at a port is left out of the patch.
         """
-        trial = self.trials[trial_index]
+        trial = self.trials[arguments.trial_index]
+        trajectory = arguments.trajectory
         forces: dict[int, LawForce] = {}
         for law in self.column_builder.problem.model.forces_at_ports(patch):
             if not isinstance(law, PortForce):
@@ -237,30 +167,19 @@ class EffectLaws:
                 trial.fine_time,
                 trajectory.positions[:, port],
                 trajectory.speeds[:, port],
-                speed_window,
+                arguments.speed_window,
             )
             forces[port] = force.plus(forces[port]) if port in forces else force
         return forces
 
     # ------------------------------------------------------------ sensors
 
-    def _linearised_sensor_errors(
-        self, trial_index: int, trajectory: Trajectory, effect: FloatArray
-    ) -> LinearisedSensorErrors:
-        """Return the changes of a trial's readings by errors of sensors, with their derivatives.
-
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        effect : (E,) array
-            The values of the effects' unknowns.
-        """
+    def _linearised_sensor_errors(self, arguments: LawArguments) -> LinearisedSensorErrors:
+        """Return the changes of a trial's readings by errors of sensors, with their derivatives."""
+        trial_index = arguments.trial_index
         trial = self.trials[trial_index]
         setting = self.column_builder.problem.setting
-        motion = motion_for_columns(trajectory)
+        motion = motion_for_columns(arguments.trajectory)
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
             return self._readings_change_by_effect(trial_index, motion, term, values)
@@ -269,7 +188,7 @@ class EffectLaws:
         derivatives: dict[int, FloatArray] = {}
         # the unknowns of effects follow the shared ones
         first_unknown = len(trial.shared_derivatives)
-        for term, values in self.candidate.split_by_term(effect):
+        for term, values in self.candidate.split_by_term(arguments.effect):
             has_law = bool(len(term.patch(setting, values).of(PortForce)))
             # an effect without a law at a port changes readings only
             if not has_law:

@@ -29,6 +29,7 @@ from discrepancy.missing_force.trial import PortedTrial
 
 from .laws import LawForce
 from .linearised import (
+    LawArguments,
     LinearisedForce,
     LinearisedSensorErrors,
     LinearisedTrial,
@@ -69,28 +70,14 @@ class HypothesisLaws(Protocol):
         """The number E of unknowns of its effects, each with a standard normal prior."""
 
     def linearise_along_trajectory(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
+        self, arguments: LawArguments
     ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
         """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        effect : (E,) array
-            The values of the effects' unknowns.
-        shared : (K,) array
-            The values of the shared unknowns.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
+        arguments : LawArguments
+            The trial, its motion, and the values of unknowns.
 
         Returns
         -------
@@ -99,29 +86,13 @@ class HypothesisLaws(Protocol):
             is not possible at these values.
         """
 
-    def forces_along_trajectory(
-        self,
-        trial_index: int,
-        trajectory: Trajectory,
-        effect: FloatArray,
-        shared: FloatArray,
-        speed_window: float,
-    ) -> Mapping[int, LawForce] | None:
+    def forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, LawForce] | None:
         """Return the forces of all laws at ports along a trajectory, not their derivatives.
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
-        trajectory : Trajectory
-            The motion of the trial.
-        effect : (E,) array
-            The values of the effects' unknowns.
-        shared : (K,) array
-            The values of the shared unknowns.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
+        arguments : LawArguments
+            The trial, its motion, and the values of unknowns.
 
         Returns
         -------
@@ -253,6 +224,12 @@ class EstimatorStart:
     shared: FloatArray
     trajectories: tuple[Trajectory, ...]
     processes: Mapping[int, Process]
+
+    def law_arguments(self, trial_index: int, speed_window: float) -> LawArguments:
+        """Return the arguments of the laws in a trial; `speed_window` as in `LawArguments`."""
+        return LawArguments(
+            trial_index, self.trajectories[trial_index], self.effect, self.shared, speed_window
+        )
 
 
 def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
@@ -518,7 +495,7 @@ class MotionEstimator:
         for trial_index, trial in enumerate(self.trials):
             trajectory = start.trajectories[trial_index]
             forces_and_sensor_errors = laws.linearise_along_trajectory(
-                trial_index, trajectory, start.effect, start.shared, speed_window
+                start.law_arguments(trial_index, speed_window)
             )
             if forces_and_sensor_errors is None:
                 return None
@@ -635,7 +612,7 @@ class MotionEstimator:
         for trial_index, trial in enumerate(linear.trials):
             trajectory = stepped.trajectories[trial_index]
             true_forces = laws.forces_along_trajectory(
-                trial_index, trajectory, stepped.effect, stepped.shared, speed_window
+                stepped.law_arguments(trial_index, speed_window)
             )
             if true_forces is None:
                 return None

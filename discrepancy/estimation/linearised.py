@@ -65,6 +65,32 @@ class Trajectory:
 
 
 @dataclass(frozen=True, eq=False)
+class LawArguments:
+    """The arguments of a hypothesis' laws in one trial: its motion, and the values of unknowns.
+
+    Attributes
+    ----------
+    trial_index : int
+        The index of the trial.
+    trajectory : Trajectory
+        The motion of the trial.
+    effect : (E,) ndarray
+        The values of the effects' unknowns.
+    shared : (K,) ndarray
+        The values of the shared unknowns.
+    speed_window : float
+        The half width of the window of speeds over which laws of the speed are averaged, divided by
+        the rms speed.
+    """
+
+    trial_index: int
+    trajectory: Trajectory
+    effect: FloatArray
+    shared: FloatArray
+    speed_window: float
+
+
+@dataclass(frozen=True, eq=False)
 class LinearisedForce:
     """The force of a hypothesis' laws at a port along a trajectory, with its derivatives.
 
