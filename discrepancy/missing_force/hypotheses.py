@@ -34,8 +34,9 @@ from fe.runtime.sensors import clock_of
 
 from .filtered import Process
 from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
+from .ported_trial import ported_trial
 from .process_search import Processes
-from .trial import PortedTrial, TrialColumn, ported_trial
+from .trial import PortedTrial, TrialColumn
 
 SHAPE_VALUES = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which a parameter that is not a magnitude is tried."""

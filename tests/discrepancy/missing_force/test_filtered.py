@@ -13,9 +13,10 @@ from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.explained import fit_missing_forces
 from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, sum_regressions
 from discrepancy.missing_force.linear_trials import LinearTrials
+from discrepancy.missing_force.ported_trial import correlated_noise_part
 from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
-from discrepancy.missing_force.trial import ColouredNoise, PortedTrial, SampleIntervals, correlated_noise_part
+from discrepancy.missing_force.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem

@@ -22,8 +22,8 @@ from discrepancy.judgement.conclusion import named_effects
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
 from discrepancy.missing_force.port_force import explained_variance, missing_force
+from discrepancy.missing_force.ported_trial import ported_trial
 from discrepancy.missing_force.shares import ForceShares
-from discrepancy.missing_force.trial import ported_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence, size_sentence

@@ -1,0 +1,309 @@
+"""A trial of a problem, made into a `PortedTrial`: linear about a point, with its ports.
+
+Terms and shapes are those of `trial`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from discrepancy.campaign.noise import NoiseModel
+from discrepancy.campaign.records import FloatArray, Trial
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
+from discrepancy.fits.problem import Problem
+from discrepancy.system.response import PortedSystem
+from discrepancy.system.sensing import shift_clock_to_first_sample
+from fe.runtime.patch import ModelPatch
+
+from .trial import ColouredNoise, GainUnknown, PortedTrial
+
+MOST_SUBSTEPS, FEWEST_SUBSTEPS = 16, 4
+"""Largest and smallest number of substeps in an interval between two samples."""
+LARGEST_SUBSTEP_PHASE = 0.15
+"""Largest phase of the fastest mode in a substep [rad]."""
+LONGEST_CORRELATION, LEAST_WHITE_SHARE = 2000, 1e-3
+"""Largest number of samples over which the correlation of a noise is computed. Least share of its
+variance that is taken as white, so that the filter does not divide by zero."""
+HALF_DIFFERENCE = 1e-3
+"""Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
+
+
+def correlated_noise_part(
+    channel: int, noise: NoiseModel, interval: float | None
+) -> ColouredNoise | None:
+    """Return the part of a channel's noise that is correlated in time, or None if it is white.
+
+    The noise is taken as white noise plus an autoregression of first order. The autocovariance of
+    the sum at lags of one and two samples determines both parts.
+
+    Parameters
+    ----------
+    channel : int
+        The index of the channel.
+    noise : NoiseModel
+        Its noise, with the coefficients of an autoregression of any order.
+    interval : float or None
+        The interval between samples [s]; None if the samples are not equally spaced.
+    """
+    if interval is None or not noise.can_whiten(interval):
+        return None
+    impulse_response = lfilter(
+        [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_CORRELATION)]
+    )
+    # up to a common factor, the autocovariances at lags of 0, 1 and 2 samples
+    autocovariances = [
+        float(impulse_response[: len(impulse_response) - lag] @ impulse_response[lag:])
+        for lag in range(3)
+    ]
+    if not 0.0 < autocovariances[2] < autocovariances[1]:
+        return None
+    # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
+    decay = autocovariances[2] / autocovariances[1]
+    share = autocovariances[1] / decay / autocovariances[0]
+    return ColouredNoise(
+        channel=channel,
+        share=min(share, 1.0 - LEAST_WHITE_SHARE),
+        decay_rate=-float(np.log(decay)) / interval,
+    )
+
+
+def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTrial:
+    """Return a dynamic trial of a problem, linear about a point.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model; the model must describe how its ports move.
+    trial_index : int
+        The index of the trial in the problem.
+    point : Point
+        The values of the unknowns about which the trial is linear.
+    """
+    data = problem.trials[trial_index]
+    trial = data.trial
+    # linear system with ports, at the point
+    gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
+    system, system_derivatives = _ported_system(problem, trial, point.shared)
+    system = _with_gains(system, gains)
+    substeps = _substep_count(system, trial.time)
+    # response of the model, about which the missing forces are added
+    positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
+    residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
+    deviation = trial.noise_factor * np.array(
+        [noise.static_deviation for noise in data.noise_models]
+    )
+    return PortedTrial(
+        name=trial.name,
+        time=trial.time,
+        residual=residual / deviation * trial.used,
+        used=trial.used,
+        deviation=deviation,
+        coloured_noises=_coloured_noises(data.noise_models, trial.whitening_interval),
+        shared_derivatives=by_shared / deviation * trial.used,
+        local_derivatives=by_local / deviation * trial.used,
+        local_precision=data.unknowns.precision,
+        system=system,
+        system_derivatives=[
+            None if derivative is None else _with_gains(derivative, gains)
+            for derivative in system_derivatives
+        ],
+        substeps=substeps,
+        port_positions=positions_and_speeds[0],
+        port_speeds=positions_and_speeds[1],
+        begins_at_rest=trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        linearisation_point=np.concatenate((point.shared, point.local[trial_index])),
+        gain_unknowns=_gain_unknowns(problem, trial, gains),
+        port_motion_derivatives=by_unknowns,
+    )
+
+
+def _residual_and_derivatives(
+    problem: Problem, trial_index: int, point: Point
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the residuals at zero unknowns, and the derivatives of the readings.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    trial_index : int
+        The index of the trial in the problem.
+    point : Point
+        The values u_0 of the unknowns about which the model is linear.
+
+    Returns
+    -------
+    residual : (N, C) array
+        The readings minus the prediction of the linear model at zero unknowns [unit of the
+        channel].
+    by_shared, by_local : (K, N, C), (L, N, C) array
+        The derivatives D of the prediction by the shared unknowns, and by those of the trial alone.
+    """
+    data = problem.trials[trial_index]
+    linear_response = problem.linearise(trial_index, point, Candidate())
+    derivatives, shared_of_column = problem.prediction_derivatives(
+        trial_index, point, linear_response, Candidate()
+    )
+    by_local = derivatives[: data.unknowns.unknown_count]
+    by_shared = np.zeros((problem.shared.unknown_count, *linear_response.response.shape))
+    by_shared[shared_of_column] = derivatives[data.unknowns.unknown_count :]
+    residual = data.trial.values - problem.prediction(trial_index, point, linear_response.response)
+    # the linear prediction is p(u_0) + D (u - u_0); at u = 0 it is p(u_0) - D u_0
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
+        point.local[trial_index], by_local, 1
+    )
+    return residual, by_shared, by_local
+
+
+def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[GainUnknown]:
+    """Return the shared unknowns that are gains of the trial's channels.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    trial : Trial
+        The trial.
+    gains : (C,) array
+        The gain of each channel of the trial at the point; 1 is a channel without an error.
+    """
+    shared = problem.shared
+    unknowns = []
+    for index, channel_name in enumerate(shared.gain_channels):
+        if channel_name in trial.channels:
+            number = shared.parameter_count + index
+            channel = trial.channels.index(channel_name)
+            scale = float(shared.scale[number]) / float(gains[channel])
+            unknowns.append(GainUnknown(number, channel, scale))
+    return unknowns
+
+
+def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[ColouredNoise]:
+    """Return the parts of the channels' noises that are correlated in time."""
+    noise_parts = [
+        correlated_noise_part(channel, noise, interval) for channel, noise in enumerate(noises)
+    ]
+    return [noise_part for noise_part in noise_parts if noise_part is not None]
+
+
+def _substep_count(system: PortedSystem, time: FloatArray) -> int:
+    """Return the number of substeps in an interval between two samples.
+
+    The phase of the fastest mode changes by at most `LARGEST_SUBSTEP_PHASE` in a substep, if that
+    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`.
+    """
+    interval = float(np.median(np.diff(time)))
+    fastest_angular_frequency = float(
+        np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
+    )
+    needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
+    return int(np.clip(needed, FEWEST_SUBSTEPS, MOST_SUBSTEPS))
+
+
+def _port_motion(
+    problem: Problem, trial_index: int, point: Point, substeps: int
+) -> tuple[FloatArray, dict[int, FloatArray]]:
+    """Return the motion of the ports by the model alone, and its derivatives by the unknowns.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    trial_index : int
+        The index of the trial in the problem.
+    point : Point
+        The values of the unknowns.
+    substeps : int
+        The number of substeps in an interval between two samples.
+
+    Returns
+    -------
+    motion : (2, F, P) array
+        The positions and speeds of the P ports at the fine stamps [m or rad, and per s].
+    by_unknowns : dict of int to (2, F, P) array
+        The derivatives of the motion, by the number of the unknown in
+        `PortedTrial.linearisation_point`.
+    """
+    data = problem.trials[trial_index]
+    shared = problem.shared
+    trial_in_own_clock, _ = shift_clock_to_first_sample(data.trial, ModelPatch())
+
+    def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
+        parameters = shared.parameters(shared_values)
+        conditions = data.unknowns.conditions(data.trial, parameters, local_values)
+        return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, substeps))
+
+    local = point.local[trial_index]
+    motion_at_point = motion(point.shared, local)
+    by_unknowns = {}
+    for k in range(shared.parameter_count):
+        by_unknowns[k] = (
+            motion(with_step(point.shared, k), local) - motion_at_point
+        ) / PARAMETER_STEP
+    # the first unknowns of a trial are the zeros of its channels, which do not move the ports
+    for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
+        stepped_motion = motion(point.shared, with_step(local, k))
+        by_unknowns[shared.unknown_count + k] = (stepped_motion - motion_at_point) / PARAMETER_STEP
+    return motion_at_point, by_unknowns
+
+
+def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
+    """Return a system whose outputs are multiplied by the gains (C,) of their channels."""
+    return replace(system, outputs=system.outputs * gains[:, None], through=system.through * gains)
+
+
+def _ported_system(
+    problem: Problem, trial: Trial, shared: FloatArray
+) -> tuple[PortedSystem, list[PortedSystem | None]]:
+    """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
+
+    A derivative is None if it is zero. The last unknowns are gains of channels, which do not change
+    the system.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    trial : Trial
+        The trial.
+    shared : (K,) array
+        The values of the shared unknowns.
+    """
+    unknowns = problem.shared
+    outputs = problem.campaign.outputs(trial)
+
+    def system(u: FloatArray) -> PortedSystem:
+        return problem.model.ported_system(trial, outputs, unknowns.parameters(u))
+
+    derivatives: list[PortedSystem | None] = []
+    for k in range(unknowns.parameter_count):
+        above = system(with_step(shared, k, HALF_DIFFERENCE))
+        below = system(with_step(shared, k, -HALF_DIFFERENCE))
+        derivatives.append(_system_derivative(above, below))
+    derivatives += [None] * (unknowns.unknown_count - len(derivatives))
+    return system(shared), derivatives
+
+
+def _system_derivative(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+    """Return the derivative of a system by a parameter, a central difference; None if zero.
+
+    Parameters
+    ----------
+    above, below : PortedSystem
+        The system with the parameter `HALF_DIFFERENCE` above and below its value.
+    """
+
+    def slope(upper: FloatArray, lower: FloatArray) -> FloatArray:
+        return np.asarray((upper - lower) / (2.0 * HALF_DIFFERENCE))
+
+    derivative = replace(
+        above,
+        generator=slope(above.generator, below.generator),
+        actions=slope(above.actions, below.actions),
+        outputs=slope(above.outputs, below.outputs),
+        through=slope(above.through, below.through),
+    )
+    arrays = (derivative.generator, derivative.actions, derivative.outputs, derivative.through)
+    return derivative if any(np.any(array) for array in arrays) else None
