@@ -1,4 +1,4 @@
-"""The usage lines in docs/command_line.md: every command with all its arguments and options.
+"""The usage lines of every command, with all its arguments and options.
 
 ``python -m benchmarks.command_page`` writes them anew from the commands themselves.
 """
@@ -14,7 +14,7 @@ from typer.main import get_command
 from reporting.files import atomic_write_text
 from uav_twin.cli import app
 
-PAGE = Path(__file__).parents[1] / "docs" / "command_line.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "command_line.md"
 BEGIN, END = "<!-- usage -->\n```\n", "```\n<!-- end of usage -->"
 EVERYWHERE = {"help", "install_completion", "show_completion"}
 WIDTH = 120

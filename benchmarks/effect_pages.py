@@ -16,7 +16,7 @@ from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import KIND_NAMES
 from reporting.files import atomic_write_bytes, atomic_write_text
 
-FOLDER = Path(__file__).parents[1] / "docs" / "effects"
+FOLDER = Path(__file__).parents[1] / "docs" / "reference" / "effects"
 
 LETTERS = {"static": "S", "ring-down": "R", "forced": "O", "driven": "D", "flight": "F"}
 

@@ -113,7 +113,7 @@ def _choose(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix == ".fmu":
         raise ModelError(
             f"{path} is an FMU: give a TOML file that says which of its variables are load, "
-            'outputs and ports (kind = "fmu", docs/fmu_models.md), or for the wing its '
+            'outputs and ports (kind = "fmu", docs/how_to/fmu_models.md), or for the wing its '
             "calibration.nc or design."
         )
     if path.suffix and not path.is_file():

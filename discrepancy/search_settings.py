@@ -201,4 +201,4 @@ class SearchSettings:
 
 
 SEARCH = SearchSettings()
-"""The settings that verdicts are reached with; `docs/blind_test.md` measures them."""
+"""The settings that verdicts are reached with; `docs/explanation/blind_test.md` measures them."""

@@ -1,7 +1,7 @@
 """Files for the FMU of a structure: its binding, and the file by which campaigns use it as a model.
 
 With the latter, campaigns are calibrated and missing effects are searched for:
-`docs/fmu_models.md`.
+`docs/how_to/fmu_models.md`.
 """
 
 import numpy as np

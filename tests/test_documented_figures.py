@@ -32,7 +32,7 @@ def test_the_error_reward_with_and_without_the_load_factor():
         rewards = -distance / normaliser
         return float(np.einsum("ts,st->t", flight.filtered, rewards.mean(axis=0)).mean())
 
-    page = (DOCS / "departures.md").read_text(encoding="utf-8")
+    page = (DOCS / "explanation" / "departures.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith("| error reward"))
     printed, divided = (float(figure) for figure in re.findall(r"-0\.\d{3}", row))
     assert mean(np.ones(len(flight.observed))) == pytest.approx(printed, abs=5e-4)
@@ -50,7 +50,7 @@ def test_the_largest_strain_error_and_what_it_does_to_the_nearest_state(publishe
     theirs = library.strain[:, sharp]
     relative = ours / theirs - 1.0
     state, gauge = np.unravel_index(np.abs(relative).argmax(), relative.shape)
-    page = (DOCS / "model_card.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference" / "model_card.md").read_text(encoding="utf-8")
     row = re.search(r"gauge (\d+) at z1 = (\d+) %, z2 = (\d+) % \| ([\d.]+) %, (\d+) microstrain", page)
     assert row
     assert int(row[1]) == gauge + 1

@@ -33,9 +33,9 @@ def same_line(printed: str, answered: str) -> bool:
 @pytest.mark.parametrize(
     ("page", "folder", "published"),
     [
-        ("real_wing.md", "UAV-Experimental-Calibration", "uav_experimental_calibration"),
-        ("measured_rigs.md", "FOLDER", "measured/two_tanks"),
-        ("discrepancy.md", "", ""),
+        ("explanation/real_wing.md", "UAV-Experimental-Calibration", "uav_experimental_calibration"),
+        ("explanation/measured_rigs.md", "FOLDER", "measured/two_tanks"),
+        ("how_to/discrepancy.md", "", ""),
     ],
 )
 def test_the_commands_of_a_page_print_what_it_says(page, folder, published, tmp_path):

@@ -51,7 +51,9 @@ def linked(place: str, target: Path) -> Callable[[Path], None]:
 
 def patch_file(folder: Path) -> None:
     """The patch that the page shows."""
-    (patch,) = (text for text in blocks(ROOT / "docs" / "fmu.md", "json") if "uav-twin patch" in text)
+    (patch,) = (
+        text for text in blocks(ROOT / "docs" / "reference" / "fmu.md", "json") if "uav-twin patch" in text
+    )
     (folder / "patch.json").write_text(patch, encoding="utf-8")
 
 
@@ -76,7 +78,7 @@ def converted_wing(folder: Path) -> None:
 
 def bracket(folder: Path) -> None:
     """Write the structure of the page, and a mesh with its sets."""
-    text, *_ = blocks(ROOT / "docs" / "structures.md", "toml")  # the others are of scenarios
+    text, *_ = blocks(ROOT / "docs" / "how_to" / "structures.md", "toml")  # the others are of scenarios
     (folder / "bracket.toml").write_text(text, encoding="utf-8")
     points, cells = box("hexahedron", (12, 2, 2))
     ends = {"ROOT": points[:, 0] == 0.0, "TOP": points[:, 2] == 1.0}
@@ -111,34 +113,38 @@ VERDICT = (
 
 READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     "README.md": (flown("level_turns", 22, "runs/demo"),),
-    "docs/another_asset.md": ("library sample pump_wear --out pump.nc",),
-    "docs/calibrate_a_wing.md": (calibrated_wing,),
-    "docs/calibration.md": (
+    "docs/how_to/another_asset.md": ("library sample pump_wear --out pump.nc",),
+    "docs/how_to/calibrate_a_wing.md": (calibrated_wing,),
+    "docs/explanation/calibration.md": (
         linked("UAV-Experimental-Calibration", REFERENCE / "uav_experimental_calibration"),
     ),
-    "docs/campaign.md": ("discrepancy example static my_campaign --seed 1",),
-    "docs/cart_in_ten_minutes.md": (lambda folder: (folder / "my_cart").mkdir(),),
+    "docs/reference/campaign.md": ("discrepancy example static my_campaign --seed 1",),
+    "docs/tutorials/cart_in_ten_minutes.md": (lambda folder: (folder / "my_cart").mkdir(),),
     # Each step has damage of its own in the search for an effect.
-    "docs/discrepancy_missions.md": (flown("growing_damage", 12, "runs/mission"),),
-    "docs/fmu_models.md": (WING_FMU, linked("rig.toml", INPUTS.folder / "rig.toml")),
-    "docs/fmu.md": (
+    "docs/explanation/discrepancy_missions.md": (flown("growing_damage", 12, "runs/mission"),),
+    "docs/how_to/fmu_models.md": (WING_FMU, linked("rig.toml", INPUTS.folder / "rig.toml")),
+    "docs/reference/fmu.md": (
         linked("scenarios", ROOT / "scenarios"),
         patch_file,
         "fmu build --patch patch.json --out wing_with_effects.fmu",
     ),
-    "docs/inference.md": (linked("path/to/UAV-Digital-Twin", REFERENCE / "uav_digital_twin"),),
-    "docs/locating.md": (
+    "docs/explanation/inference.md": (linked("path/to/UAV-Digital-Twin", REFERENCE / "uav_digital_twin"),),
+    "docs/explanation/locating.md": (
         "discrepancy example laboratory demo --model three_mass_chain --effect coulomb_friction@joint=0.004",
     ),
     # The page packs the FMU itself.
-    "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
-    "docs/real_wing.md": (converted_wing,),
+    "docs/reference/python.md": (
+        "fmu build --out drafted.fmu",
+        "fmu bind drafted.fmu --out wing.toml",
+        *VERDICT,
+    ),
+    "docs/explanation/real_wing.md": (converted_wing,),
     # With the step up to which the page reports, and one more.
-    "docs/report.md": (flown("level_turns", 22, "runs/level_turns"),),
-    "docs/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
-    "docs/structures.md": (bracket,),
-    "docs/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
-    "docs/verdict.md": VERDICT,
+    "docs/reference/report.md": (flown("level_turns", 22, "runs/level_turns"),),
+    "docs/reference/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
+    "docs/how_to/structures.md": (bracket,),
+    "docs/how_to/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
+    "docs/reference/verdict.md": VERDICT,
 }
 """What is in the reader's folder before the first block: commands that were run, and what makes more."""
 

@@ -47,7 +47,7 @@ TURNED = ("one sees", "the house", "that we know", "believes ours", "gone on wit
 
 
 def test_pages_use_the_terms_of_the_glossary():
-    glossary = ROOT / "docs" / "glossary.md"
+    glossary = ROOT / "docs" / "reference" / "glossary.md"
     rows = re.findall(r"^\| (.+?) \| .+ \| (.+?) \|$", glossary.read_text(encoding="utf-8"), re.MULTILINE)
     refused = [word for _, words in rows[2:] for word in words.split(", ")]
     assert len(refused) > 30
@@ -60,7 +60,7 @@ def test_pages_use_the_terms_of_the_glossary():
     assert not found
 
 
-HOW_TO_ADD = sorted((ROOT / "docs" / "how_to_add").glob("*.md"))
+HOW_TO_ADD = sorted((ROOT / "docs" / "how_to" / "add").glob("*.md"))
 
 
 @pytest.mark.parametrize("page", HOW_TO_ADD, ids=lambda page: page.stem)

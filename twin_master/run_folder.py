@@ -1,6 +1,6 @@
 """The run folder: complete or absent, never overwritten by mistake, resumable at any moment.
 
-`docs/run_folder.md` describes its layout.
+`docs/reference/run_folder.md` describes its layout.
 """
 
 import json

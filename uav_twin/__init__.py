@@ -1,8 +1,8 @@
 """A predictive structural digital twin of a UAV wing: the one name to import.
 
 Each name comes from the package that holds it, and is imported when it is used, so that
-`import uav_twin` takes no time. `docs/python.md` shows all of them at work; the command line is
-`uav-twin`.
+`import uav_twin` takes no time. `docs/reference/python.md` shows all of them at work; the command
+line is `uav-twin`.
 """
 
 from importlib import import_module

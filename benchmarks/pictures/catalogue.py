@@ -38,14 +38,18 @@ PICTURES = {
         Picture(
             "missing_force",
             front.draw_missing_force,
-            (Statement("docs/discrepancy.md", "a step of {step} N over the speed"),),
+            (Statement("docs/how_to/discrepancy.md", "a step of {step} N over the speed"),),
             minutes=True,
             source=NOTEBOOK_EFFECT,
         ),
         Picture(
             "force_at_joint",
             examples.draw_force_at_joint,
-            (Statement("docs/locating.md", "a force of {rms} N (rms), at most {largest} N"),),
+            (
+                Statement(
+                    "docs/explanation/locating.md", "a force of {rms} N (rms), at most {largest} N"
+                ),
+            ),
             minutes=True,
         ),
         Picture(
@@ -68,14 +72,14 @@ PICTURES = {
         Picture(
             "fleet",
             missions.draw_fleet,
-            (Statement("docs/fleets.md", "![A fleet of {assets}:"),),
+            (Statement("docs/how_to/fleets.md", "![A fleet of {assets}:"),),
             minutes=True,
             source=NOTEBOOK_FLEET,
         ),
         Picture(
             "three_regions",
             missions.draw_three_regions,
-            (Statement("docs/scenarios.md", "![Beliefs in three regions at step {step}]"),),
+            (Statement("docs/how_to/scenarios.md", "![Beliefs in three regions at step {step}]"),),
             minutes=True,
         ),
         Picture(
@@ -83,7 +87,7 @@ PICTURES = {
             missions.draw_learnt,
             (
                 Statement(
-                    "docs/learning.md",
+                    "docs/explanation/learning.md",
                     "![What was learnt in {steps} steps of the shipped scenario]",
                 ),
             ),
@@ -95,7 +99,7 @@ PICTURES = {
             missions.draw_plan,
             (
                 Statement(
-                    "docs/planning.md",
+                    "docs/how_to/planning.md",
                     "planned on the belief (bounds {lower} and {upper}, after 10 s) | {expected} |",
                 ),
             ),
@@ -106,14 +110,19 @@ PICTURES = {
             missions.draw_design,
             (
                 Statement(
-                    "docs/planning.md", "Eight of the 24 gauges tell {chosen} of {of_all} bit."
+                    "docs/how_to/planning.md",
+                    "Eight of the 24 gauges tell {chosen} of {of_all} bit.",
                 ),
             ),
         ),
         Picture(
             "view",
             missions.draw_view,
-            (Statement("docs/view.md", "![The page at step {step} of the paper's mission]"),),
+            (
+                Statement(
+                    "docs/how_to/view.md", "![The page at step {step} of the paper's mission]"
+                ),
+            ),
             browser=True,
         ),
         Picture(
@@ -121,7 +130,8 @@ PICTURES = {
             measured.draw_plate_against_box,
             (
                 Statement(
-                    "docs/verification.md", "all 24 gauges, rms | | {rms} ({largest}: {gauge}) |"
+                    "docs/explanation/verification.md",
+                    "all 24 gauges, rms | | {rms} ({largest}: {gauge}) |",
                 ),
             ),
             minutes=True,
@@ -131,7 +141,7 @@ PICTURES = {
             measured.draw_real_wing_residuals,
             (
                 Statement(
-                    "docs/real_wing.md",
+                    "docs/explanation/real_wing.md",
                     "leaves {without} µV (rms) without and {with_effects} µV with",
                 ),
             ),
@@ -142,7 +152,7 @@ PICTURES = {
         Picture(
             "real_wing_force",
             measured.draw_real_wing_force,
-            (Statement("docs/real_wing.md", "a moment of at most {largest} N m"),),
+            (Statement("docs/explanation/real_wing.md", "a moment of at most {largest} N m"),),
             record=WING_RECORDS,
             minutes=True,
             source=REAL_WING,
@@ -150,7 +160,11 @@ PICTURES = {
         Picture(
             "falling_phone",
             measured.draw_falling_phone,
-            (Statement("docs/measured_rigs.md", "![The missing force of {falls} falls over"),),
+            (
+                Statement(
+                    "docs/explanation/measured_rigs.md", "![The missing force of {falls} falls over"
+                ),
+            ),
             record="measured/falling_phone",
             minutes=True,
         ),
@@ -159,7 +173,7 @@ PICTURES = {
             measured.draw_cooling_water,
             (
                 Statement(
-                    "docs/measured_rigs.md",
+                    "docs/explanation/measured_rigs.md",
                     "begins at {level} ({low} to {high}) of the largest excess temperature",
                 ),
             ),

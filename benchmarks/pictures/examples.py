@@ -11,7 +11,8 @@ from reporting.figures import publication_style, to_png
 
 CHAIN = "three_mass_chain"
 HIDDEN_FRICTION = "coulomb_friction@joint=0.004"
-"""The effect that the example of docs/discrepancy.md and docs/locating.md hides."""
+"""The effect that the example of docs/how_to/discrepancy.md and docs/explanation/locating.md
+hides."""
 
 
 def draw_force_at_joint() -> Drawing:

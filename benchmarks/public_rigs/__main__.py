@@ -1,7 +1,8 @@
 """Campaigns of further rigs that others measured: `python -m benchmarks.public_rigs DATA OUT`.
 
 DATA holds the records as they were published, `falling.txt`, `CoolingWater.csv` and `Q1.txt`, which
-are not part of the project (docs/measured_rigs.md says where they are). Campaign and `model.toml`
+are not part of the project (docs/explanation/measured_rigs.md says where they are). Campaign and
+`model.toml`
 of each are in the folder of its name here; they were written before the first run. Printed: the
 commands that search them.
 """

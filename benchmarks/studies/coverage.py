@@ -1,4 +1,6 @@
-"""How often the intervals of a wing's calibration hold the truth; docs/calibration.md shows it.
+"""How often the intervals of a wing's calibration hold the truth.
+
+Shown in docs/explanation/calibration.md.
 
 `python -m benchmarks.studies.coverage --wings 200` draws wings from the prior of the calibration,
 simulates the experiments on each (load test, weighing, five ring-down records with noise), fits

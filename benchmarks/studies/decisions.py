@@ -1,4 +1,6 @@
-"""What notices are worth to belief and decisions under a fault; docs/notices.md shows it.
+"""What notices are worth to belief and decisions under a fault.
+
+Shown in docs/explanation/notices.md.
 
 `python -m benchmarks.studies.decisions --flights 300` flies the mission of level_turns with a wing
 whose gauges or skin are not as the model says. Each seed is flown twice: by the twin of the

@@ -1,4 +1,4 @@
-"""What a fleet learns about its probabilities to worsen; docs/fleets.md shows the figures.
+"""What a fleet learns about its probabilities to worsen; docs/how_to/fleets.md shows the figures.
 
     python -m benchmarks.studies.fleets coverage --fleets 200
     python -m benchmarks.studies.fleets groups --fleets 40

@@ -1,4 +1,6 @@
-"""Missions with an effect unknown to the twin; docs/discrepancy_missions.md shows the figures.
+"""Missions with an effect unknown to the twin.
+
+Shown in docs/explanation/discrepancy_missions.md.
 
 `python -m benchmarks.studies.hidden_effects --seeds 5` flies the scenario growing_damage with each
 of several hidden effects in the FMU of the wing. The run folder alone is then read as a campaign

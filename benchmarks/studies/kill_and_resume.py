@@ -1,4 +1,6 @@
-"""A killed and resumed run has the files of an uninterrupted one; docs/benchmarks.md shows it.
+"""A killed and resumed run has the files of an uninterrupted one.
+
+Shown in docs/explanation/benchmarks.md.
 
 `python -m benchmarks.studies.kill_and_resume --trials 20` flies the shipped mission, kills it at
 random moments, resumes it, and compares every file byte for byte. Further options after `--` go to

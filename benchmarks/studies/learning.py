@@ -1,4 +1,6 @@
-"""What learning in operation is worth; docs/learning.md and docs/notices.md show the figures.
+"""What learning in operation is worth.
+
+Shown in docs/explanation/learning.md and docs/explanation/notices.md.
 
 `python -m benchmarks.studies.learning --missions 3000 --first-seed 0` draws e of each wing from
 the prior of the scenario `level_turns_learning` and flies its mission twice from the same seed: by

@@ -1,4 +1,6 @@
-"""How reliably the twin steers the paper's mission; docs/benchmarks.md shows the figures.
+"""How reliably the twin steers the paper's mission.
+
+Shown in docs/explanation/benchmarks.md.
 
 `python -m benchmarks.studies.level_turns --missions 300` flies the reduced model of the shipped
 wing under many seeds; `--strain-library FOLDER` flies the authors' library instead, `--fmu` the

@@ -1,4 +1,6 @@
-"""How well beliefs hold a truth between the levels of their states; docs/scenarios.md shows it.
+"""How well beliefs hold a truth between the levels of their states.
+
+Shown in docs/how_to/scenarios.md.
 
 `python -m benchmarks.studies.levels --missions 300` flies the wing, the bracket and the stiffened
 panel with damage that grows between levels, at the mean rate of the twin: a little in every step

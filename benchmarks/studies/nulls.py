@@ -1,4 +1,6 @@
-"""How often campaigns without a fault raise a false alarm; docs/benchmarks.md shows the rate.
+"""How often campaigns without a fault raise a false alarm.
+
+Shown in docs/explanation/benchmarks.md.
 
 `python -m benchmarks.studies.nulls --campaigns 200` draws one to three kinds of trials of a shipped
 rig: their rows, stamps (even, jittered, with gaps, on a logger's clock), noise (white or coloured;

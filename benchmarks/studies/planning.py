@@ -1,4 +1,6 @@
-"""Bounds of plans on the belief beside an independent solver; docs/planning.md shows the wing's.
+"""Bounds of plans on the belief beside an independent solver.
+
+Shown in docs/how_to/planning.md.
 
 `python -m benchmarks.studies.planning` plans public problems and the inspected wing, and prints
 both bounds of the return from the prior, and the seconds. `--storm` adds the bounds of Storm's

@@ -1,4 +1,6 @@
-"""Cost and errors of reduced structures with many damage regions; docs/structures.md shows them.
+"""Cost and errors of reduced structures with many damage regions.
+
+Shown in docs/how_to/structures.md.
 
 `python -m benchmarks.studies.regions plate --regions 6` makes a plate with a hole, a tube, the
 shipped bracket or the wing with so many regions, packs it as an FMU in this process, and compares

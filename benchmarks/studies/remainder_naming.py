@@ -1,4 +1,4 @@
-"""Verdicts where no hypothesis is exact; docs/benchmarks.md shows their counts.
+"""Verdicts where no hypothesis is exact; docs/explanation/benchmarks.md shows their counts.
 
 `python -m benchmarks.studies.remainder_naming DIR [--count 24] [--seed 1]` simulates campaigns on
 the lumped rig of the blind test. Each hides an effect of the catalogue and a disturbance that no

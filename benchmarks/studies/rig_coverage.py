@@ -1,4 +1,6 @@
-"""How often the intervals of a rig's calibration hold the truth; docs/calibration.md shows it.
+"""How often the intervals of a rig's calibration hold the truth.
+
+Shown in docs/explanation/calibration.md.
 
 `python -m benchmarks.studies.rig_coverage --rigs 200` draws chains of one to four masses whose
 springs, damping and last mass are parameters, draws their true values from the prior, measures a

@@ -1,4 +1,4 @@
-"""Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/planning.md.
+"""Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/how_to/planning.md.
 
 `python -m benchmarks.studies.sensors --missions 300` flies `growing_damage` with eight of the
 wing's gauges; the others are lost from the first step on. The table shows for each choice the rms

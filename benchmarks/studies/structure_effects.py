@@ -1,4 +1,4 @@
-"""Verdicts on effects hidden in the shipped bracket; docs/structures.md shows them.
+"""Verdicts on effects hidden in the shipped bracket; docs/how_to/structures.md shows them.
 
 `python -m benchmarks.studies.structure_effects` loads the bracket at its end in four cycles of
 load levels, or with `--ringdown` releases its end from four deflections. The readings come from

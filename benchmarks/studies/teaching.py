@@ -1,4 +1,4 @@
-"""What teaching in flight is worth; docs/watch.md shows the figures.
+"""What teaching in flight is worth; docs/how_to/watch.md shows the figures.
 
 `python -m benchmarks.studies.teaching` flies level_turns with each of several hidden effects in
 the FMU, and watches the recorded strains three times: by a twin that is never taught, by one that

@@ -25,8 +25,8 @@ MODEL_ERROR = (0.01, 0.05)
 """Relative standard deviations of the model's two frequencies about those of the wing [1].
 
 The frequency of a wing is f_i (1 + delta_i) with the frequency f_i of the model with the same
-state, and independent delta_i ~ N(0, tau_i^2); these are tau_1 and tau_2. See `docs/calibration.md`
-for the choice and for other choices.
+state, and independent delta_i ~ N(0, tau_i^2); these are tau_1 and tau_2. See
+`docs/explanation/calibration.md` for the choice and for other choices.
 """
 
 
@@ -74,9 +74,9 @@ SHIPPED_PRIOR = {
     "damping_alpha": (1.03, 0.37),
     "damping_beta": (7.56e-4, 1.84e-4),
 }
-"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e
-of the paper, its masses, and the damping of the joint posterior, whose standard deviation includes
-that of the measurement."""
+"""Mean and standard deviation of the calibrated state of the shipped wing
+(docs/explanation/calibration.md): e of the paper, its masses, and the damping of the joint
+posterior, whose standard deviation includes that of the measurement."""
 _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 

@@ -31,7 +31,7 @@ as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_
 the place, "quantity of the place" for what it measures. A primitive with `if` is left out where
 that is zero.
 
-Time and events of the campaign (`docs/when.md`)::
+Time and events of the campaign (`docs/explanation/when.md`)::
 
     events = ["pump_on"]                         # names of [[event]] that expressions below use
 

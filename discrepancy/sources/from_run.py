@@ -1,6 +1,6 @@
 """The run folder of a mission as a campaign: every step is a row of a flight.
 
-`docs/run_folder.md` describes the folder; only its files are read.
+`docs/reference/run_folder.md` describes the folder; only its files are read.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Published measurements of rigs as campaigns, read as they were published.
 
-The data are not part of the package; `docs/measured_rigs.md` says where they are.
+The data are not part of the package; `docs/explanation/measured_rigs.md` says where they are.
 """
 
 from collections.abc import Callable, Sequence

@@ -73,10 +73,12 @@ def _interface(text: str) -> str:
 def _gallery(text: str) -> str:
     """Return the page of pictures: one for each effect, leading to its page."""
     pictures = []
-    for page in sorted((DOCS / "effects").glob("[!R]*.md")):
+    for page in sorted((DOCS / "reference" / "effects").glob("[!R]*.md")):
         title = page.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
-        picture = f"![{title}](../effects/images/{page.stem}.png)"
-        pictures.append(f"- [{picture}](../effects/{page.name})\n  [{title}](../effects/{page.name})")
+        picture = f"![{title}](../reference/effects/images/{page.stem}.png)"
+        pictures.append(
+            f"- [{picture}](../reference/effects/{page.name})\n  [{title}](../reference/effects/{page.name})"
+        )
     return f"{text}\n:::{{container}} gallery\n" + "\n".join(pictures) + "\n:::\n"
 
 

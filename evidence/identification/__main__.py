@@ -3,7 +3,8 @@
 Called in a checkout of the project. `DIR` holds clones of the authors' repositories UAV-Digital-Twin and
 UAV-Experimental-Calibration. `--out RESULT` leaves a design file, a record and a report, `--from-prior`
 begins at the prior means, `--design FILE` at another design, `--steps N` says how many full models there are
-at most, and `--remesh FACTOR` evaluates the result on another mesh as well. `docs/identification.md` says
+at most, and `--remesh FACTOR` evaluates the result on another mesh as well.
+`docs/explanation/identification.md` says
 what is fitted to what, how, and what came out. Ends with 1 if the fit has not converged.
 """
 

@@ -17,8 +17,8 @@ HEADER = (
     "",
     "Written by `python -m evidence.identification`. Lengths of the planform are those of the wing as built.",
     "Numbers marked 'identified' were fitted together to outputs of the published model",
-    "(docs/identification.md says which, how well, and what was held out). They are effective numbers of",
-    "this idealisation, not measured properties of the wing.",
+    "(docs/explanation/identification.md says which, how well, and what was held out).",
+    "They are effective numbers of this idealisation, not measured properties of the wing.",
 )
 
 _NOTES = {

@@ -1,7 +1,8 @@
 """The wing once more, as a sandwich plate beside the box: `python -m evidence.sandwich_plate`.
 
 Called in a checkout of the project. `--design FILE` takes another design, `--quick` a coarse mesh and no
-limits on the differences. `docs/verification.md` says what came out. Ends with 1 if a limit is broken.
+limits on the differences. `docs/explanation/verification.md` says what came out. Ends with 1 if a limit is
+broken.
 """
 
 from collections.abc import Iterator

@@ -2,7 +2,7 @@
 
 Called in a checkout of the project: the elements against known answers, test decks of CalculiX against its
 published results, and a ring-down of the wing against CalculiX, where these are installed.
-`docs/verification.md` says what came out. Ends with 1 if a limit is broken.
+`docs/explanation/verification.md` says what came out. Ends with 1 if a limit is broken.
 """
 
 import tempfile

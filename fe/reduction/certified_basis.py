@@ -1,7 +1,7 @@
 """The static part of a reduced model: a greedy search with a certified error bound.
 
-`docs/reduced_model.md` describes the method and its accuracy. Displacements and loads are whitened,
-see `fe.full.subspace`.
+`docs/explanation/reduced_model.md` describes the method and its accuracy. Displacements and loads
+are whitened, see `fe.full.subspace`.
 """
 
 from bisect import bisect_left

@@ -2,7 +2,7 @@
 
 A working basis is grown by Davidson corrections until the modes of sampled states have small
 residuals in it. The modes of many states, computed in the working basis, are then compressed by
-singular values. `docs/reduced_model.md` describes the method and its accuracy.
+singular values. `docs/explanation/reduced_model.md` describes the method and its accuracy.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """The wing under a patch: stiffness, mass, loads and outputs with the changes of its primitives.
 
 NumPy and relative imports only: this file is copied into the FMU. The arrays are those of
-`fe.runtime.wing_rows`; the equations are in `docs/patches.md`.
+`fe.runtime.wing_rows`; the equations are in `docs/explanation/patches.md`.
 """
 
 from collections.abc import Callable

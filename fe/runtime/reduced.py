@@ -1,8 +1,8 @@
 """The reduced model of a structure: its statics with error bounds, its modes, and its motion.
 
-Everything here is evaluated online, with NumPy alone. The equations are in `docs/reduced_model.md`;
-`fe.reduction.reduced_basis` makes reduced models. NumPy and relative imports only: this file is
-copied into the FMU.
+Everything here is evaluated online, with NumPy alone. The equations are in
+`docs/explanation/reduced_model.md`; `fe.reduction.reduced_basis` makes reduced models. NumPy and
+relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Mapping, Sequence

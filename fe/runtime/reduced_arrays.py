@@ -1,7 +1,7 @@
 """The stored arrays of a reduced structure, and its certified static solution.
 
-The equations are in `docs/reduced_model.md`. NumPy and relative imports only: this file is copied
-into the FMU.
+The equations are in `docs/explanation/reduced_model.md`. NumPy and relative imports only: this
+file is copied into the FMU.
 """
 
 from dataclasses import dataclass
@@ -317,7 +317,9 @@ class CertifiedSolver:
         return solution
 
     def solve(self, theta: FloatArray, load: FloatArray, losses: Losses) -> CertifiedSolution:
-        """Return the static solution with certified error bounds, see `docs/reduced_model.md`.
+        """Return the static solution with certified error bounds.
+
+        The bounds are derived in `docs/explanation/reduced_model.md`:
 
         |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, with the residual r,
         the dual solution psi of the output l, and norms dual to that of the reference.

@@ -1,4 +1,4 @@
-"""Stiffness of a wing's skin that remains under local losses; see `docs/patches.md`.
+"""Stiffness of a wing's skin that remains under local losses; see `docs/explanation/patches.md`.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """

@@ -1,7 +1,7 @@
 """Rows of a wing for patches: its displacements, loads, ports and outputs.
 
 NumPy and relative imports only: this file is copied into the FMU. The equations are in
-`docs/patches.md`.
+`docs/explanation/patches.md`.
 """
 
 import re

@@ -133,7 +133,7 @@ def kept(checks, limits):
 
 @pytest.mark.long
 def test_both_models_of_the_wing_agree(shipped_operators):
-    """Nothing is fitted to either; docs/verification.md says what is left and why."""
+    """Nothing is fitted to either; docs/explanation/verification.md says what is left and why."""
     checks = [*command.plate_checks(shipped_operators)]
     assert [check.name for check in checks if not check.passed] == []
 

@@ -271,7 +271,7 @@ def test_every_name_is_there_under_its_own_name_and_documented():
     assert set(uav_twin.__all__) <= set(dir(uav_twin))
     # The import of a module of the command line would take the place of a name like it.
     assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
-    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
     for name in uav_twin.__all__:
         found = getattr(uav_twin, name)
         assert (callable(found), found.__name__) == (True, name)

@@ -151,7 +151,7 @@ def test_the_force_of_a_ring_down_is_none_though_a_column_gives_it():
 
 
 def test_the_documented_files_print_the_documented_tables():
-    page = (Path(__file__).parents[2] / "docs" / "laboratory_files.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how_to" / "laboratory_files.md").read_text("utf-8")
     blocks = re.findall(r"^```\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     loading, release, asked, given, written, checked = blocks[:6]
     Path("loading.csv").write_text(loading, "utf-8-sig")

@@ -183,7 +183,7 @@ class Run:
     """A run of T steps, S joint states of K factors, G sensors, U controls and H predicted steps.
 
     ``run["filtered/mean"]`` is a variable of `run.nc` as an array in SI units; the page
-    `docs/run_folder.md` lists the variables.
+    `docs/reference/run_folder.md` lists the variables.
 
     Attributes
     ----------

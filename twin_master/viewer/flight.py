@@ -36,7 +36,7 @@ MOST_NEW_LINES = 200
 """Largest number of lines that an update reads, so that viewers are answered in between."""
 
 StepRecord = dict[str, Any]
-"""The line of a step in the journal; `docs/run_folder.md` lists its keys."""
+"""The line of a step in the journal; `docs/reference/run_folder.md` lists its keys."""
 
 
 class StepBeliefs(NamedTuple):

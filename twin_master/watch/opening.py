@@ -200,7 +200,8 @@ def open_run(folder: Path | str) -> "xr.DataTree":
     -------
     xarray.DataTree
         The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and
-        `truth`; each variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+        `truth`; each variable has its unit in `.attrs["units"]`. The layout is in
+        `docs/reference/run_folder.md`.
 
     Raises
     ------
@@ -270,7 +271,8 @@ def watch(
     scenario : LoadedScenario, str or Path, optional
         The scenario, its shipped name, or its file; it may be left out if a watch is resumed.
     observations : iterable of mapping, str or Path, optional
-        Messages as they come, mappings with the keys that `docs/watch.md` lists; or a recording: a
+        Messages as they come, mappings with the keys that `docs/how_to/watch.md` lists; or a
+        recording: a
         CSV or NetCDF file, or the folder of another watch or run; or the address of a broker,
         ``mqtt://[USER@]HOST[:PORT]/TOPIC`` or ``mqtts://``, where the decisions are published, too;
         or ``-`` for JSON lines on standard input. The recording of the scenario if left out.

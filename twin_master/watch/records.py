@@ -6,9 +6,9 @@ from typing import Any, NotRequired, TypedDict
 JsonObject = dict[str, Any]
 """An object of JSON, whose keys the function says that makes it."""
 JournalLine = Mapping[str, Any]
-"""A line of `journal.jsonl`; `docs/run_folder.md` lists its keys."""
+"""A line of `journal.jsonl`; `docs/reference/run_folder.md` lists its keys."""
 Decision = Mapping[str, Any]
-"""A decision as it is published; `docs/watch.md` lists its keys."""
+"""A decision as it is published; `docs/how_to/watch.md` lists its keys."""
 DecisionSink = Callable[[Decision], object]
 """A function that is called with each decision, once its step is in the journal."""
 

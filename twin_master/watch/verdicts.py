@@ -32,7 +32,7 @@ ABSOLUTE_FIT = "absolute fit"
 """The gate of a verdict that says whether only noise is left unexplained by the named cause."""
 
 VerdictJson = Mapping[str, Any]
-"""The object `verdict` of `verdict.json`; `docs/verdict.md` lists its keys."""
+"""The object `verdict` of `verdict.json`; `docs/reference/verdict.md` lists its keys."""
 
 
 def read_verdict(

@@ -24,7 +24,9 @@ from tests.refusals import Inputs, refused
 INPUTS = Inputs(__file__)
 PYLON, BUFFER = INPUTS.text("pylon.toml"), INPUTS.text("buffer.toml")
 (PUMP_PULL,) = re.findall(
-    r"```toml\n(.*?)```", (Path(__file__).parents[3] / "docs" / "when.md").read_text("utf-8"), re.DOTALL
+    r"```toml\n(.*?)```",
+    (Path(__file__).parents[3] / "docs" / "explanation" / "when.md").read_text("utf-8"),
+    re.DOTALL,
 )
 
 

@@ -229,7 +229,7 @@ def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_o
 
 
 def test_the_rules_stand_in_the_page_in_their_order():
-    page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "how_to" / "discrepancy.md").read_text(encoding="utf-8")
     rules = SENTENCES.tables["rule"]
     table = "".join(f"| {rule['verdict']} | {rule['when']} |\n" for rule in rules)
     assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page

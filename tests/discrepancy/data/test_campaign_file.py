@@ -178,8 +178,8 @@ def test_inputs_come_out_in_si(tmp_path):
 
 
 def test_the_documented_campaign_is_read(tmp_path):
-    """That of docs/campaign.md, which shows how its tables begin; a record is longer."""
-    text = (Path(__file__).parents[3] / "docs" / "campaign.md").read_text(encoding="utf-8")
+    """That of docs/reference/campaign.md, which shows how its tables begin; a record is longer."""
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "campaign.md").read_text(encoding="utf-8")
     toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
     tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
     (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")

@@ -139,7 +139,7 @@ def json_schema(record, schema):
 def test_the_shipped_schema_is_that_of_the_records_and_every_key_in_the_page(name, document, schema):
     shipped = shipped_schema(name)
     assert shipped == json.loads(json_schema(document, schema))
-    page = (Path(__file__).parents[3] / "docs" / "verdict.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "verdict.md").read_text(encoding="utf-8")
     for table in (shipped, *shipped["$defs"].values()):
         if table.get("properties", {}).get("kind", {}).get("const") in PRIMITIVES:
             continue  # parameters of primitives are those of fe.runtime.patch

@@ -247,7 +247,7 @@ def test_a_release_can_be_held_by_a_force(rig: FmuModel, make) -> None:
 
 
 def test_the_documented_file_is_one() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "fmu_models.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "how_to" / "fmu_models.md").read_text(encoding="utf-8")
     described = FmuModelDescription.model_validate(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
     assert described.effects == {"point_mass": "unmodelled_point_mass"}
     assert described.scales.length == 0.4

@@ -242,7 +242,7 @@ def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(tmp_path):
 
 def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(tmp_path):
     """Its tables begin as they are shown side by side, and jitter."""
-    folder, text = tmp_path, write_rig("cart_in_ten_minutes.md", tmp_path, "my_cart")
+    folder, text = tmp_path, write_rig("tutorials/cart_in_ten_minutes.md", tmp_path, "my_cart")
     shown = re.search(r"my_cart/rest.csv +my_cart/ride_1.csv\n(.*?)```", text, re.DOTALL)
     columns = zip(*(line.split() for line in shown.group(1).splitlines()), strict=True)
     for name, lines in zip(("rest", "ride_1"), columns, strict=True):

@@ -33,7 +33,7 @@ from tests.test_documented_python import blocks
 
 DRIVER, HOST = (Path(__file__).with_name(name) for name in ("driver.c", "host.c"))
 REFUSED = tables(__file__)
-USE_THE_WING = ROOT / "docs" / "use_the_wing_in.md"
+USE_THE_WING = ROOT / "docs" / "how_to" / "use_the_wing_in.md"
 WARNINGS = (
     *("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wcast-qual", "-Wstrict-prototypes"),
     "-Werror",

@@ -278,7 +278,7 @@ NOISE = np.array([0.4, 0.5, 0.6, 0.15])
 
 
 def show(control: str, wear: float, clogging: float, viscosity: float) -> Float:
-    """Flow, torque, temperature and filter pressure drop, from the equations of docs/another_asset.md."""
+    """Flow, torque, temperature and filter pressure drop, as in docs/how_to/another_asset.md."""
     displacement = 16e-6 / (2 * math.pi)
     speed, load = 2 * math.pi * CONTROLS[control][0] / 60, 1e5 * CONTROLS[control][1]
 
