@@ -42,7 +42,8 @@ def studies() -> list[Path]:
 
 @pytest.mark.parametrize("file", studies(), ids=lambda file: file.stem)
 def test_a_study_names_the_page_of_its_figures_and_the_page_names_its_command(file):
-    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
+    assert docstring is not None
     pages = re.findall(r"docs/[\w/]+\.md", docstring)
     assert pages
     for page in pages:
