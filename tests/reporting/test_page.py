@@ -16,6 +16,7 @@ from benchmarks.browser import CHROMIUM, open_browser
 from reporting import figures
 from reporting.errors import InvalidFigureError
 from reporting.page import Page, PageColumn, Table, Words, script_source
+from reporting.record_table import TitledTable, add_titled_table, number_cells, table_of_records, text_cells
 
 VOID = {"meta", "br", "link", "img"}
 
@@ -112,18 +113,43 @@ def test_what_can_be_no_part_of_a_page_is_refused():
         Table((PageColumn("a"), PageColumn("b")), [("1", "2"), ("3",)])
 
 
-def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there():
-    words = Words("twin_master.report", half=0.5)
-    cells = [
-        {"text": "name", "cell": "{{ row }}"},
-        {"number": "{{ what }}", "unit": "m", "cell": "{{ half }}"},
-    ]
-    words.content = {"tables": {"t": {"columns": [*cells, {"text": "more", "cell": "x", "when": "long"}]}}}
-    columns, rows = words.table("t", ["a"], what="length", long=False)
-    assert (columns, rows) == ([PageColumn("name"), PageColumn("length", "m", numeric=True)], [["a", "0.5"]])
-    assert words.table("t", ["a"], what="length", long=True)[1] == [["a", "0.5", "x"]]
-    words.content["tables"]["t"] = {"columns": ["item", "value"], "rows": [["{{ what }}", "1"], ["none", ""]]}
-    assert words.table("t", [["b", "2"]], what="length")[1] == [["length", "1"], ["b", "2"]]
+def test_a_table_of_records_has_a_row_for_each_and_units_of_numbers():
+    columns = [text_cells("name", lambda length: f"rod {length}"), number_cells("length", str, "m")]
+
+    table = table_of_records(columns, [1, 2])
+
+    assert table.columns == [PageColumn("name"), PageColumn("length", "m", numeric=True)]
+    assert table.rows == [["rod 1", "1"], ["rod 2", "2"]]
+
+
+def test_a_table_without_rows_is_left_out_of_a_page():
+    page = Page("Empty table")
+
+    add_titled_table(page, TitledTable(Table([PageColumn("name")], []), "Rods", "None was found."))
+
+    assert "Rods" not in page.render()
+
+
+def test_words_fill_the_fields_of_headings_and_captions():
+    words = Words("twin_master.report")
+    words.content = {
+        "tables": {
+            "rods": {
+                "title": "Rods of {{ asset }}",
+                "caption": "Measured.",
+                "columns": ["name", {"number": "{{ what }}", "unit": "m"}],
+            }
+        }
+    }
+    page = Page("Rods")
+
+    words.add_table(
+        page, "rods", [["a", "0.5", "x"]], more=[PageColumn("mark")], asset="frame", what="length"
+    )
+
+    text = page.render()
+    assert "Rods of frame" in text
+    assert re.findall(r"<th[^>]*>([^<]+)<", text) == ["name", "length", "mark"]
 
 
 X = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
