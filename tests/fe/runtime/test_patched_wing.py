@@ -48,7 +48,10 @@ class Compared:
         self.place, self.row = wing.arrays.load_place, wing.force_row("tip_load")
         self.factors = Factorisation(operators.stiffness(FACTOR, STATE[1]))
         masses = self.design.masses
-        mass, self.upwards = operators.mass(point_masses(masses.servo, masses.pitot)), rigid(operators)
+        mass, self.upwards = (
+            operators.mass(point_masses(masses.servo, masses.pitot)),
+            rigid(operators),
+        )
         self.weight = STANDARD_GRAVITY * (mass @ self.upwards)  # along the free unknowns [N]
 
     def structure(
@@ -58,11 +61,16 @@ class Compared:
         return self.wing.structure_at(vector, ModelPatch(items), temperature)
 
     def load(self, load_factor: float, *items: Any) -> FloatArray:
-        return np.array((load_factor, load_factor**2)) @ self.wing.manoeuvre_loads(ModelPatch(items))
+        return np.array((load_factor, load_factor**2)) @ self.wing.manoeuvre_loads(
+            ModelPatch(items)
+        )
 
     def alike(self, reduced: FloatArray, full: FloatArray, operators: AffineOperators) -> None:
         strain, tip = operators.gauge_output @ full, float(operators.tip_row @ full)
-        assert np.abs(self.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
+        assert (
+            np.abs(self.arrays.strain_rows[0] @ reduced - strain).max()
+            <= STRAIN * np.abs(strain).max()
+        )
         assert float(self.arrays.tip_row @ reduced) == pytest.approx(tip, rel=DISPLACEMENT)
 
     def softened(self, operators: AffineOperators, start: float, end: float, loss: float) -> Any:
@@ -98,7 +106,12 @@ def softer(both: Compared, first: int, last: int, loss: float) -> Any:
     """A local loss between mesh lines is softer cells."""
     start, end = both.arrays.strip_lines[[first, last]]
     stiffness = both.softened(both.operators, start, end, loss)
-    return both.structure(LocalStiffnessLoss(loss, start, end - start)), both.operators, stiffness, MASSES
+    return (
+        both.structure(LocalStiffnessLoss(loss, start, end - start)),
+        both.operators,
+        stiffness,
+        MASSES,
+    )
 
 
 def moved(both: Compared, station: float, added: float) -> Any:
@@ -112,8 +125,12 @@ def moved(both: Compared, station: float, added: float) -> Any:
 
 def warm(both: Compared, coefficient: float, e: float = STATE[0], loss: Any = STATE[1]) -> Any:
     """A temperature is a change of the modulus factor; without a coefficient nothing is changed."""
-    stiffness = both.operators.stiffness({"young_modulus_factor": e * (1.0 - 25.0 * coefficient)}, loss)
-    structure = both.structure(patch.ModulusTemperature(coefficient), state=(e, loss), temperature=25.0)
+    stiffness = both.operators.stiffness(
+        {"young_modulus_factor": e * (1.0 - 25.0 * coefficient)}, loss
+    )
+    structure = both.structure(
+        patch.ModulusTemperature(coefficient), state=(e, loss), temperature=25.0
+    )
     return structure, both.operators, stiffness, MASSES
 
 
@@ -143,7 +160,12 @@ def test_a_change_of_the_structure_is_that_of_the_full_model(both, change, given
 
 def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both):
     """On the same wing in cells of 40 mm along the span."""
-    finer, start, end, loss = assemble(both.design.changed(mesh={"span_size": 0.01})), 0.2, 0.45, 0.4
+    finer, start, end, loss = (
+        assemble(both.design.changed(mesh={"span_size": 0.01})),
+        0.2,
+        0.45,
+        0.4,
+    )
     lines = finer.wing_mesh.span_lines
     start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))
     matrices = finer.stiffness(), both.softened(finer, start, end, loss)
@@ -152,7 +174,9 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both):
     strain = finer.gauge_output @ before
     wanted = finer.gauge_output @ after / strain
     item = LocalStiffnessLoss(loss, start, end - start)
-    plain, u = (both.structure(*items, state=SOUND).static(both.load(1.0)) for items in ((), (item,)))
+    plain, u = (
+        both.structure(*items, state=SOUND).static(both.load(1.0)) for items in ((), (item,))
+    )
     rows = both.arrays.strain_rows[0]
     ratio = both.wing.strain_factors(ModelPatch((item,))) * (rows @ u) / (rows @ plain)
     scale = np.abs(strain) / np.abs(strain).max()
@@ -166,12 +190,17 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both):
 
 
 def test_strips_make_the_skin_and_losses_that_overlap_multiply(both):
-    everywhere = both.structure(LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND).stiffness
+    everywhere = both.structure(
+        LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND
+    ).stiffness
     skin = np.tensordot((0.75, 0.75, 0.75, 1.0), both.arrays.stiffness, 1)
     assert np.abs(everywhere - skin).max() < 1e-6 * np.abs(skin).max()
     start, end = both.arrays.strip_lines[[4, 6]]
     once, as_one = (LocalStiffnessLoss(loss, start, end - start) for loss in (0.3, 0.51))
-    assert np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max() < 1e-12
+    assert (
+        np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max()
+        < 1e-12
+    )
     beyond, within = (LocalStiffnessLoss(0.3, start, end - start) for start in (-0.2, 0.0))
     assert np.array_equal(both.structure(beyond).stiffness, both.structure(within).stiffness)
     # strains need no factor where a box ends at strips
@@ -205,7 +234,12 @@ def washed(both: Compared, exponent: float) -> tuple[FloatArray, FloatArray]:
     course = partial(DISTRIBUTIONS[lift.distribution], both.design.planform)
     points, weights = np.polynomial.legendre.leggauss(400)
     eta = 0.5 * (points + 1.0)
-    kept = weights * course(eta) @ (1.0 - coefficient * factor * eta**exponent) / (weights @ course(eta))
+    kept = (
+        weights
+        * course(eta)
+        @ (1.0 - coefficient * factor * eta**exponent)
+        / (weights @ course(eta))
+    )
 
     def less(planform: Any, station: Any) -> Any:
         return course(station) * (1.0 - coefficient * factor * station**exponent)
@@ -242,7 +276,9 @@ def test_a_change_of_the_loads_is_that_of_the_full_model(both, change, given):
     reduced, full = change(both, *given)
     u, solution = both.structure().static(reduced), both.factors.solve(full)
     both.alike(u, solution, both.operators)
-    if change is placed:  # the place itself yields by what the trailing edge gives way under the force, too
+    if (
+        change is placed
+    ):  # the place itself yields by what the trailing edge gives way under the force, too
         assert float(reduced @ u) == pytest.approx(float(full @ solution), rel=3e-3)
 
 
@@ -262,11 +298,16 @@ def test_a_turned_gauge_follows_from_the_three_components(both, degrees):
 def test_outputs_and_places_by_name(both):
     wing, elastic = both.wing, float(both.arrays.line_chord[0])
     u = both.structure().static(both.load(1.0))
-    tip, there = wing.output_row("tip_displacement"), wing.output_row(f"displacement[{wing.span}, {elastic}]")
+    tip, there = (
+        wing.output_row("tip_displacement"),
+        wing.output_row(f"displacement[{wing.span}, {elastic}]"),
+    )
     assert float(tip @ u) == pytest.approx(float(there @ u), rel=1e-9)
     components = [wing.output_row(f"strain[24]{part}") for part in ("", ".transverse", ".shear")]
     np.testing.assert_array_equal(components, both.arrays.strain_rows[:, 23])
-    unknown = "strain[0] | strain[25] | strain[-1] | displacement[1.9, 0.3] | displacement[a, b] | speed"
+    unknown = (
+        "strain[0] | strain[25] | strain[-1] | displacement[1.9, 0.3] | displacement[a, b] | speed"
+    )
     assert [wing.output_row(name) for name in unknown.split(" | ")] == [None] * 6
     by_place = wing.force_row((both.place, elastic))
     assert np.abs(by_place - both.row).max() < 1e-9 * np.abs(by_place).max()
@@ -299,7 +340,10 @@ def integrator(model: ReducedModel) -> ModalIntegrator:
 def test_rest_is_the_static_response_and_stays(kind, model, beam_reduction, integrator):
     values, motion = {"load_factor": 3.0, "tip_force": 5.0}, integrator
     if kind == "beam":
-        model, values = beam_reduction.model, {"z1": 0.3, "pump": 0.07, "load_factor": 3.0, "push": 50.0}
+        model, values = (
+            beam_reduction.model,
+            {"z1": 0.3, "pump": 0.07, "load_factor": 3.0, "push": 50.0},
+        )
         motion = ModalIntegrator(model.structure_at(model.vector(values)), 5.0, 2e-5)
     load, static = model.load_coefficients(model.vector(values)), model.static_response(values)
     state, wanted = motion.state_at_rest(load), np.append(static.strain, static.displacement)
@@ -311,7 +355,10 @@ def test_rest_is_the_static_response_and_stays(kind, model, beam_reduction, inte
 
 def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     """Once the high modes have died away, strain, position and acceleration agree."""
-    model, values = beam_reduction.model, {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0}
+    model, values = (
+        beam_reduction.model,
+        {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0},
+    )
     vector, let_go = (model.vector({**values, "push": push}) for push in (100.0, 0.0))
     motion = ModalIntegrator(model.structure_at(vector), *model.damping)
     state = motion.state_at_rest(model.load_coefficients(vector))
@@ -330,7 +377,9 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     assert np.all(np.abs(motion.outputs(state) - wanted) < 5e-3 * size)
     same = ModalIntegrator(model.structure_at(vector), *model.damping)
     taken = motion.outputs(same.take_over(state, motion))
-    np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
+    np.testing.assert_allclose(
+        taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max())
+    )
 
 
 def test_a_released_wing_for_patches_moves_as_all_its_unknowns(both):
@@ -359,7 +408,9 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
             integrator.state_after_release(0.03, (3.0, 0.0), TIP_FORCE), duration, (3.0, 0.0)
         )
         after = damaged.take_over(before, integrator)
-        assert damaged.outputs(after)[-1] == pytest.approx(integrator.outputs(before)[-1], abs=2e-3 * 0.1)
+        assert damaged.outputs(after)[-1] == pytest.approx(
+            integrator.outputs(before)[-1], abs=2e-3 * 0.1
+        )
         kept = damaged.modes.shape.T @ damaged.modes.mass @ integrator.modes.shape @ before.velocity
         np.testing.assert_allclose(after.velocity, kept, atol=1e-9 * np.abs(kept).max())
         was = integrator.modes.output[-1] @ before.velocity
@@ -373,7 +424,9 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
     assert 0.9 * 0.03 < integrator.point_displacement(released, TIP_FORCE) < 0.03
     # from rest, damage sets the wing moving about its new, lower-stiffness equilibrium
     taken = damaged.take_over(integrator.state_at_rest((3.0, 0.0)), integrator)
-    kept = damaged.structure.modal_projection @ integrator.structure.unit_responses[:, :2] @ (3.0, 0.0)
+    kept = (
+        damaged.structure.modal_projection @ integrator.structure.unit_responses[:, :2] @ (3.0, 0.0)
+    )
     np.testing.assert_allclose(taken.displacement, kept, atol=1e-9 * np.abs(kept).max())
 
 
