@@ -14,8 +14,19 @@ from calibration.geometry import published_lengths, read_lengths, tailored_desig
 from calibration.joint.wing_table import weighed
 from calibration.paper.procedure import read_published_results
 from calibration.static.experiments import published_measurements, read_measurements
-from calibration.virtual_wing import VirtualWing, measure_lengths, measure_load_test, measure_ring_down, weigh
-from calibration.wing.lab_data import published_data, read_lab_folder, read_weighed_mass, write_lab_folder
+from calibration.virtual_wing import (
+    VirtualWing,
+    measure_lengths,
+    measure_load_test,
+    measure_ring_down,
+    weigh,
+)
+from calibration.wing.lab_data import (
+    published_data,
+    read_lab_folder,
+    read_weighed_mass,
+    write_lab_folder,
+)
 from fe.runtime.errors import InvalidDesignError, OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
 from fe.wing.design import load_design
@@ -96,7 +107,11 @@ READERS = {
 ERRORS = {"File": ExperimentFileError, "Data": ExperimentDataError}
 
 
-BAD = [pytest.param(name, *row, id=f"{name}: {row[-1]}") for name in READERS for row in INPUTS.refused(name)]
+BAD = [
+    pytest.param(name, *row, id=f"{name}: {row[-1]}")
+    for name in READERS
+    for row in INPUTS.refused(name)
+]
 
 
 @pytest.mark.parametrize(("name", "old", "new", "kind", "sentence"), BAD)
@@ -119,13 +134,17 @@ def test_a_file_that_is_not_there(tmp_path, name):
         READERS[name](tmp_path / "picture.csv")
 
 
-@pytest.mark.parametrize(("load", "displacement", "sentence"), [*INPUTS.refused("units"), (0.0, 0.0, "")])
+@pytest.mark.parametrize(
+    ("load", "displacement", "sentence"), [*INPUTS.refused("units"), (0.0, 0.0, "")]
+)
 def test_wrong_units_are_recognised(tmp_path, load, displacement, sentence):
     pairs = np.loadtxt(INPUTS.text("load_test.csv").splitlines(), delimiter=",", skiprows=1)
     pairs = pairs * [load, displacement] if load else pairs[:, ::-1]  # exchanged
     rows = "\n".join(f"{load:.10g},{displacement:.10g}" for load, displacement in pairs)
     (tmp_path / "pairs.csv").write_text(f"load,displacement\n{rows}\n", encoding="utf-8")
-    with refused(ExperimentDataError, f"{sentence}.*expected before calibration|expected.*{sentence}"):
+    with refused(
+        ExperimentDataError, f"{sentence}.*expected before calibration|expected.*{sentence}"
+    ):
         read_measurements(tmp_path / "pairs.csv")
 
 
@@ -135,7 +154,9 @@ def test_wrong_units_are_recognised(tmp_path, load, displacement, sentence):
 def lengths(**measured):
     """The published lengths, some measured otherwise [m]."""
     published = published_lengths()
-    changes = {name: replace(getattr(published, name), measured=value) for name, value in measured.items()}
+    changes = {
+        name: replace(getattr(published, name), measured=value) for name, value in measured.items()
+    }
     return published._replace(**changes)
 
 
@@ -150,7 +171,9 @@ def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre():
         assert length.posterior.mean == pytest.approx(mean, rel=1e-12)
         assert length.posterior.standard_deviation == pytest.approx(1e-3 * precision**-0.5 / 1.96)
         assert getattr(found, name) == round(mean, 4)
-        assert (length.prior.low, length.prior.high) == pytest.approx((0.9 * designed, 1.1 * designed))
+        assert (length.prior.low, length.prior.high) == pytest.approx(
+            (0.9 * designed, 1.1 * designed)
+        )
 
 
 @pytest.mark.parametrize(("changes", "measured", "kind", "words"), INPUTS.refused("planform"))
@@ -222,8 +245,12 @@ def test_records_give_back_the_truth(wing):
         ("damping_ratio", 0, 0.0281, 5e-3), ("damping_ratio", 1, 0.0716, 0.04),
     ):  # fmt: skip
         assert average(trials, name, mode).mean == pytest.approx(value, rel=error)
-    assert bench.tip_displacement(9.81) == pytest.approx(9.81 / wing.tip_stiffness(1.0073), rel=1e-12)
-    with pytest.raises(ExperimentDataError, match="has 22 gauges, but a release is recorded at gauge 23"):
+    assert bench.tip_displacement(9.81) == pytest.approx(
+        9.81 / wing.tip_stiffness(1.0073), rel=1e-12
+    )
+    with pytest.raises(
+        ExperimentDataError, match="has 22 gauges, but a release is recorded at gauge 23"
+    ):
         virtual_wing.check_recorded(22)
     with pytest.raises(ExperimentDataError, match="frequency error"):
         VirtualWing(wing, TRUTH, frequency_error=(-1.0, 0.0))
@@ -248,7 +275,9 @@ def test_reading_errors_are_as_stated_and_follow_the_seed():
     ):
         assert np.mean(readings) == pytest.approx(mean, abs=bias)
         assert np.std(readings) == pytest.approx(deviation, rel=error)
-    one, two, other = (measure_ring_down(Beam(), seed, trials=2, duration=2.0) for seed in (4, 4, 5))
+    one, two, other = (
+        measure_ring_down(Beam(), seed, trials=2, duration=2.0) for seed in (4, 4, 5)
+    )
     assert one[1].signal.tobytes() == two[1].signal.tobytes()
     assert len({record.signal.tobytes() for record in (*one, *other)}) == 4
     assert measure_load_test(Beam(), 4).sha256 == measure_load_test(Beam(), 4).sha256
@@ -268,12 +297,22 @@ def test_a_folder_is_read_back_and_what_is_not_there_is_as_published(tmp_path, a
     records = measure_ring_down(Beam(), 2, trials=2, duration=1.0, sampling_rate=rate)
     folder = tmp_path / above
     files = write_lab_folder(
-        folder, lengths=lengths, load_test=load_test, records=records, total_mass=weighed(0.4711, 2e-3)
+        folder,
+        lengths=lengths,
+        load_test=load_test,
+        records=records,
+        total_mass=weighed(0.4711, 2e-3),
     )
     lab, published = read_lab_folder(tmp_path, free=True), published_data()
     assert [origin.read for origin in lab.origins] == [True] * 3
     assert "weighed_mass.csv read" in lab.origins[2].text
-    assert lab.input_hashes.keys() == {"lengths", "load_test", "weighed_mass", "ring_down_1", "ring_down_2"}
+    assert lab.input_hashes.keys() == {
+        "lengths",
+        "load_test",
+        "weighed_mass",
+        "ring_down_1",
+        "ring_down_2",
+    }
     assert not lab.input_hashes.items() & published.input_hashes.items()
     np.testing.assert_allclose(lab.pairs.load, load_test.load, rtol=1e-9)
     np.testing.assert_allclose(lab.pairs.displacement, load_test.displacement, rtol=1e-9)
@@ -293,5 +332,7 @@ def test_a_folder_is_read_back_and_what_is_not_there_is_as_published(tmp_path, a
     assert [origin.read for origin in rest.origins] == [True, False, False]
     assert rest.input_hashes == published.input_hashes | {"lengths": lab.input_hashes["lengths"]}
     assert (rest.readings, rest.trials) == (published.readings, None)
-    with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
+    with pytest.raises(
+        ExperimentFileError, match="no ring-down record, and --measured asks for them"
+    ):
         read_lab_folder(tmp_path, "measured")

@@ -40,7 +40,9 @@ def test_table_1_of_the_paper():
     assert posterior.mean == pytest.approx(limit.mean, abs=2e-4)
     assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, abs=1e-4)
     assert posterior.stiffness.mean == pytest.approx(575.2 * posterior.mean + 101.8)
-    assert posterior.stiffness.standard_deviation == pytest.approx(575.2 * posterior.standard_deviation)
+    assert posterior.stiffness.standard_deviation == pytest.approx(
+        575.2 * posterior.standard_deviation
+    )
     # readings whose ratio has heavy tails
     vague = replace(DATA, displacement_standard_deviation=2e-3)
     posterior = particle_filter(vague, seed=0, particle_count=200_000)
@@ -48,7 +50,9 @@ def test_table_1_of_the_paper():
     assert posterior.mean == pytest.approx(limit.mean, abs=1e-3)
     assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, rel=0.02)
 
-    first, again, other = (particle_filter(DATA, seed=seed, particle_count=20_000) for seed in (7, 7, 8))
+    first, again, other = (
+        particle_filter(DATA, seed=seed, particle_count=20_000) for seed in (7, 7, 8)
+    )
     assert first.mean == again.mean != other.mean
     assert np.array_equal(first.density, again.density)
     assert np.array_equal(first.likelihood, again.likelihood)
@@ -57,7 +61,12 @@ def test_table_1_of_the_paper():
 @pytest.mark.parametrize(
     ("change", "count", "prior", "words"),
     [
-        ({"displacement": DATA.displacement * 0.5}, 2000, GaussianPrior(), "no particle explains pair"),
+        (
+            {"displacement": DATA.displacement * 0.5},
+            2000,
+            GaussianPrior(),
+            "no particle explains pair",
+        ),
         ({}, 100, GaussianPrior(0.93, 0.015), "effectively remain"),
     ],
 )
@@ -76,8 +85,12 @@ def test_step_2_of_the_paper():
     assert prior.mean == pytest.approx(677.0, abs=0.01)
     assert prior.standard_deviation == pytest.approx(575.2 * 0.05 / 1.96, rel=1e-4)
     assert exact.mean == pytest.approx(575.2 * result.exact.mean + 101.8, abs=1e-6)
-    assert exact.standard_deviation == pytest.approx(575.2 * result.exact.standard_deviation, rel=1e-6)
-    assert exact.interval() == pytest.approx(PUBLISHED_LINE.stiffness(result.exact.interval()), abs=1e-3)
+    assert exact.standard_deviation == pytest.approx(
+        575.2 * result.exact.standard_deviation, rel=1e-6
+    )
+    assert exact.interval() == pytest.approx(
+        PUBLISHED_LINE.stiffness(result.exact.interval()), abs=1e-3
+    )
     assert result.particle.stiffness.mean == pytest.approx(681.2, abs=0.6)
     assert "differ by 0.47 mm" in result.quality.remarks[0]
     chi_square = float(np.sum(result.quality.standardised_residual**2))
@@ -89,7 +102,10 @@ def test_step_2_of_the_paper():
     assert means == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
     # the assumption of a shared offset alone is wide enough to reach the end of a short curve
     line = stiffness_line(575.2, 101.8, "short", 0.9, 1.06)
-    assert [*calibrate_static(line, particle_count=20_000).alternatives] == ["flat in load", "ratio"]
+    assert [*calibrate_static(line, particle_count=20_000).alternatives] == [
+        "flat in load",
+        "ratio",
+    ]
 
 
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
@@ -137,7 +153,9 @@ def test_moments_quantiles_and_intervals_of_a_gaussian():
     assert posterior.standard_deviation == pytest.approx(0.02, rel=1e-9)
     probability = np.array([1e-6, 0.025, 0.3, 0.5, 0.99])
     assert posterior.quantile(probability) == pytest.approx(prior.quantile(probability), abs=2e-6)
-    assert posterior.interval(0.95) == pytest.approx((1 - 1.959964 * 0.02, 1 + 1.959964 * 0.02), abs=1e-6)
+    assert posterior.interval(0.95) == pytest.approx(
+        (1 - 1.959964 * 0.02, 1 + 1.959964 * 0.02), abs=1e-6
+    )
     value = np.array([0.95, 1.0, 1.01])
     below = norm.cdf(value, prior.mean, prior.standard_deviation)
     assert posterior.cumulative(value) == pytest.approx(below, abs=1e-5)
@@ -183,7 +201,9 @@ def test_a_table_meets_its_model_within_the_stated_error():
         below, at, above = curve.stiffness([end - 1e-6, end, end + 1e-6])
         assert at - below == pytest.approx(above - at, rel=1e-3)
     anywhere = np.linspace(0.3, 1.9, 33)
-    assert curve.young_modulus_factor(curve.stiffness(anywhere)) == pytest.approx(anywhere, abs=1e-7)
+    assert curve.young_modulus_factor(curve.stiffness(anywhere)) == pytest.approx(
+        anywhere, abs=1e-7
+    )
 
 
 def test_a_rough_curve_is_refused():
@@ -204,7 +224,9 @@ def test_pair_likelihoods_equal_quadrature_over_the_true_displacement(measure):
     weight = true if measure == "ratio" else 1.0
     brute = np.empty((DATA.count, FACTORS.size))
     for pair, (load, displacement) in enumerate(zip(DATA.load, DATA.displacement, strict=True)):
-        of_displacement = norm.pdf(displacement, true, DATA.displacement_standard_deviation) * weight
+        of_displacement = (
+            norm.pdf(displacement, true, DATA.displacement_standard_deviation) * weight
+        )
         for index, stiffness in enumerate(k):
             of_load = norm.pdf(load, stiffness * true, DATA.load_standard_deviation)
             brute[pair, index] = np.trapezoid(of_load * of_displacement, true)
@@ -220,7 +242,9 @@ def test_a_shared_zero_offset_equals_the_full_covariance(zero_offset):
         for run in DATA.run_indices:
             of_run = DATA.run == run
             count = int(of_run.sum())
-            variance = DATA.load_standard_deviation**2 + (k * DATA.displacement_standard_deviation) ** 2
+            variance = (
+                DATA.load_standard_deviation**2 + (k * DATA.displacement_standard_deviation) ** 2
+            )
             covariance = variance * np.eye(count) + (k * zero_offset) ** 2
             residual = DATA.load[of_run] - k * DATA.displacement[of_run]
             expected[index] += multivariate_normal.logpdf(residual, np.zeros(count), covariance)

@@ -21,7 +21,9 @@ from tests.calibration.decays import free_decay
 LIMITS = np.array([[0.85, 1.15], [0.05, 0.3], [0.0, 0.3]])
 CENTRE = np.array([1.0, 0.169, 0.1345])
 AT_CENTRE = np.log([5.632, 28.544])
-SLOPE = np.array([[0.41, 0.325], [-0.94, -0.69], [-0.98, -0.64]])  # of ln f1, ln f2, as of the shipped wing
+SLOPE = np.array(
+    [[0.41, 0.325], [-0.94, -0.69], [-0.98, -0.64]]
+)  # of ln f1, ln f2, as of the shipped wing
 VALIDITY = dict(zip(STATE[:3], ((low, high) for low, high in LIMITS.tolist()), strict=True))
 STATIC = published_measurements()
 MODAL = PUBLISHED_MODES
@@ -62,7 +64,9 @@ def test_enumeration_finds_mean_and_deviation():
     prior = wing_priors(VALIDITY, damping_alpha=(2.0, 0.3), damping_beta=(8e-4, 1e-4))
     found = asked(TABLES, priors=prior, count=20_000)
     axes = np.linspace(0.95, 1.07, 31), np.linspace(0.09, 0.24, 61), np.linspace(0.466, 0.478, 25)
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)  # e, servo, weighed total
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )  # e, servo, weighed total
     quantities = grid - np.array([0.0, 0.0, 2.0]) * grid[:, 1:2]
     inside = (quantities[:, 2] > 0.0) & (quantities[:, 2] < 0.3)
     quantities, grid = quantities[inside], grid[inside]
@@ -176,16 +180,21 @@ def test_frequencies_of_spectral_peaks_carry_their_bias():
 
 
 @pytest.mark.parametrize(
-    ("count", "scatter", "widening"), [(1, 0.05, None), (2, 0.05, 4.0), (5, 0.05, 2.0), (5, 0.0, None)]
+    ("count", "scatter", "widening"),
+    [(1, 0.05, None), (2, 0.05, 4.0), (5, 0.05, 2.0), (5, 0.0, None)],
 )
-def test_trials_that_scatter_beyond_their_fits_widen_the_error_of_the_mean(count, scatter, widening):
+def test_trials_that_scatter_beyond_their_fits_widen_the_error_of_the_mean(
+    count, scatter, widening
+):
     fitted = fit_trials(trials(0.0, 1, scatter=scatter)[:count], free=True, start=-1.0)
     for read in measured_modes(fitted):
         name, mode = read.name[:-2], int(read.name[-1]) - 1
         values = [getattr(fit.modes[mode], name) for fit in fitted]
         squares = [fit.modes[mode].standard_error[name] ** 2 for fit in fitted]
         assert read.value == pytest.approx(np.mean(values))
-        if scatter == 0.0 or read.name == "frequency_1":  # a linear wing has statistical errors alone
+        if (
+            scatter == 0.0 or read.name == "frequency_1"
+        ):  # a linear wing has statistical errors alone
             variance = widening * np.var(values, ddof=1) if widening else np.mean(squares)
             assert read.deviation == pytest.approx(math.sqrt(variance / count), rel=1e-9), read.name
 

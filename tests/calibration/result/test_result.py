@@ -29,7 +29,9 @@ def test_what_it_gives(make_calibration):
     assert len(states) == 40
     told = states[7].young_modulus_factor, states[7].servo_mass, states[7].damping_beta
     assert told == (*result.samples[7, :2], result.samples[7, 4])
-    with pytest.raises(CalibrationRecordError, match="no samples of `mass`; it has young_modulus_factor"):
+    with pytest.raises(
+        CalibrationRecordError, match="no samples of `mass`; it has young_modulus_factor"
+    ):
         result.draws_of("mass")
     (reading,) = result.readings
     off = stiffness.mean() - 682.1
@@ -56,7 +58,9 @@ def test_stratified_draws_take_one_sample_from_each_stratum(make_calibration, co
     edge = 60.0 * np.arange(count + 1) / count
     assert np.all(place >= np.floor(edge[:-1]))
     assert np.all(place <= np.ceil(edge[1:]) - 1)
-    np.testing.assert_array_equal(draws, result.stratified_draws("young_modulus_factor", count, seed))
+    np.testing.assert_array_equal(
+        draws, result.stratified_draws("young_modulus_factor", count, seed)
+    )
 
 
 def test_figures_that_follow_one_another_have_no_information(make_calibration):
@@ -64,7 +68,9 @@ def test_figures_that_follow_one_another_have_no_information(make_calibration):
     made = make_calibration(count=4000)
     result = replace(made, priors=made.priors[:2], quantities=(), samples=made.samples[:, :2],
                      prior_samples=made.prior_samples[:, :2])  # fmt: skip
-    assert result.information == pytest.approx(2.0 * (0.5 * (1.0 / 9.0 - 1.0) + np.log(3.0)), rel=0.05)
+    assert result.information == pytest.approx(
+        2.0 * (0.5 * (1.0 / 9.0 - 1.0) + np.log(3.0)), rel=0.05
+    )
     line = np.column_stack([result.samples[:, 0], 1.0 - 2.0 * result.samples[:, 0]])
     assert replace(result, samples=line).information is None
 
@@ -118,7 +124,10 @@ def test_other_files_are_told(tmp_path, make_calibration):
         path.write_bytes(bytes(content))
         with pytest.raises(CalibrationRecordError, match=words):
             load_calibration(path)
-    for place, words in ((tmp_path, "is no file"), (tmp_path / "d.nc", "is not there; give the calibration")):
+    for place, words in (
+        (tmp_path, "is no file"),
+        (tmp_path / "d.nc", "is not there; give the calibration"),
+    ):
         with pytest.raises(CalibrationRecordError, match=words):
             load_calibration(place)
 
