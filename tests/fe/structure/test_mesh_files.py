@@ -64,7 +64,9 @@ def refuses(path: Path, sentence: str) -> None:
 def test_formats_agree(kind, file_format, tmp_path):
     """MED counts the nodes of a cell as seen in a mirror; its families are of several groups."""
     points, cells = box(kind, (2, 1, 1))
-    ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(file_format, file_format)
+    ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(
+        file_format, file_format
+    )
     tags, half = [np.zeros(len(cells), dtype=np.int32)], points[cells].mean(axis=1)[:, 0] < 0.5
     data = {"gmsh:physical": tags, "gmsh:geometrical": tags} if ending == "msh" else {}
     data |= {"cell_tags": [np.where(half, -1, -2)]} if ending == "med" else {}
@@ -90,21 +92,28 @@ def test_formats_agree(kind, file_format, tmp_path):
 def test_physical_groups_of_gmsh_are_sets(tmp_path):
     """An element of two groups, which version 2 writes again for each, counts once."""
     points, cells = box("tetra10", (2, 1, 1))
-    faces = [[cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra10"].face_nodes]
+    faces = [
+        [cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra10"].face_nodes
+    ]
     faces = [row for row in faces if (points[row, 0] == 0.0).all()]
     names = {"wall": (7, 2), "left": (1, 3), "right": (2, 3), "lug": (3, 3)}
     groups = [[7] * len(faces), [1] * 6 + [2] * 6 + [3] * 2]
     mesh = meshio.Mesh(
         points,
         [("triangle6", faces), ("tetra10", np.concatenate((cells, cells[:2])))],
-        cell_data={"gmsh:physical": groups, "gmsh:geometrical": [[1] * len(group) for group in groups]},
+        cell_data={
+            "gmsh:physical": groups,
+            "gmsh:geometrical": [[1] * len(group) for group in groups],
+        },
         field_data={name: np.array(pair) for name, pair in names.items()},
     )
     meshio.write(tmp_path / "m.msh", mesh, file_format="gmsh22")
     found = read_mesh(tmp_path / "m.msh", 1.0, "m")
     assert volume(found) == pytest.approx(1.0)
     assert sorted(found.cells_of("left", "here")) == list(range(6))
-    assert sorted(found.cells_of("RIGHT", "here")) == list(range(6, 12))  # another case is the same name
+    assert sorted(found.cells_of("RIGHT", "here")) == list(
+        range(6, 12)
+    )  # another case is the same name
     np.testing.assert_array_equal(found.cells[found.cells_of("lug", "here")], cells[:2])
     np.testing.assert_array_equal(found.points[found.nodes_of("wall", "here"), 0], 0.0)
     assert (len(found.nodes_of("wall", "here")), len(found.faces_of("wall", "here"))) == (9, 2)
@@ -115,7 +124,9 @@ def test_physical_groups_of_gmsh_are_sets(tmp_path):
 def saved_all(path: Path, groups: list[list[int]], cells: np.ndarray, points: np.ndarray) -> None:
     """Write edges, faces and tetrahedra with their physical groups as Gmsh does with Mesh.SaveAll = 1."""
     edges = [cell[:2] for cell in cells.tolist()[:4]]
-    faces = [[cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra"].face_nodes]
+    faces = [
+        [cell[n] for n in face] for cell in cells.tolist() for face in KINDS["tetra"].face_nodes
+    ]
     faces = [row for row in faces if (points[row, 0] == 0.0).all()]
     blocks = [("line", edges), ("triangle", faces), ("tetra", cells)]
     geometrical = [[number] * len(rows) for number, (_, rows) in enumerate(blocks, start=1)]
@@ -145,7 +156,10 @@ def test_elements_of_gmsh_without_a_physical_group_are_left_out(tmp_path):
     mesh = read_mesh(path, 1.0, "m")
     assert len(mesh.cells) == len(cells)
     saved_all(path, [[0] * 4, [0] * 2, [0] * len(cells)], cells, points)
-    assert (len(read_mesh(path, 1.0, "m").cells), read_mesh(path, 1.0, "m").remarks) == (len(cells), ())
+    assert (len(read_mesh(path, 1.0, "m").cells), read_mesh(path, 1.0, "m").remarks) == (
+        len(cells),
+        (),
+    )
 
 
 ALL_SAVED = """$MeshFormat
@@ -186,7 +200,10 @@ $EndElements
 def test_a_file_of_gmsh_of_version_4_with_all_saved_is_refused_with_the_remedy(tmp_path):
     path = tmp_path / "m.msh"
     path.write_text(ALL_SAVED)
-    refuses(path, r"m\.msh: some elements are in a physical group and others in none, .* Mesh.SaveAll = 0")
+    refuses(
+        path,
+        r"m\.msh: some elements are in a physical group and others in none, .* Mesh.SaveAll = 0",
+    )
     path.write_text(ALL_SAVED.replace("5 0 0 0 1 1 0 0 0", "5 0 0 0 1 1 0 1 7 0"))
     assert read_mesh(path, 1.0, "m").cells_of("body", "here").tolist() == [0]
 
@@ -212,7 +229,11 @@ def test_arrays_of_a_vtu_that_are_sets(tmp_path):
     """As meshio writes sets, and as a mask of zeros and ones; the values keep their names."""
     points, cells = box("hexahedron", (2, 1, 1))
     root = np.flatnonzero(points[:, 0] == 0.0)
-    sets = {"cell_sets": {"left": [[0]]}, "point_sets": {"root": root}, "cell_data": {"right": [[0, 1]]}}
+    sets = {
+        "cell_sets": {"left": [[0]]},
+        "point_sets": {"root": root},
+        "cell_data": {"right": [[0, 1]]},
+    }
     mesh = meshio.Mesh(points, [("hexahedron", cells)], **sets)
     mesh.cell_sets_to_data()
     mesh.point_sets_to_data()
@@ -240,10 +261,17 @@ def test_other_files_that_cannot_be_read_are_refused(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
     points, cells = box("hexahedron", (1, 1, 1))
     finer, tetrahedra = box("tetra10", (1, 1, 1))
-    kinds = [(kind, cells[:, :count]) for kind, count in (("hexahedron", 8), ("wedge", 6), ("hexahedron", 8))]
+    kinds = [
+        (kind, cells[:, :count])
+        for kind, count in (("hexahedron", 8), ("wedge", 6), ("hexahedron", 8))
+    ]
     swapped = tetrahedra[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]
     for places, blocks, words in (
-        (points, kinds, "one kind of elements is expected .*, but 2 8-node hexahedra, 1 6-node wedges"),
+        (
+            points,
+            kinds,
+            "one kind of elements is expected .*, but 2 8-node hexahedra, 1 6-node wedges",
+        ),
         (points, [("pyramid", cells[:, :5])], r"is expected \(.*\), but 1 pyramid came"),
         (points, [("quad", cells[:, :4])], "but none that is solid came"),
         (finer, [("tetra10", swapped)], "lies far from the middle of its edge"),
@@ -260,12 +288,18 @@ def test_a_deck_is_read_with_its_sets(tmp_path):
     assert mesh.cell_numbers.tolist() == [10, 20]
     assert mesh.cells_of("BODY", "here").tolist() == [0, 1]
     assert mesh.cells_of("left", "here").tolist() == [0]
-    for name, numbers in {"root": [1, 4, 11, 14], "both": [1, 3, 4, 11, 14], "end": [3, 6, 13, 16]}.items():
+    for name, numbers in {
+        "root": [1, 4, 11, 14],
+        "both": [1, 3, 4, 11, 14],
+        "end": [3, 6, 13, 16],
+    }.items():
         assert mesh.node_numbers[mesh.nodes_of(name, "here")].tolist() == numbers
     top = mesh.faces_of("top", "here")
     assert (top.cell.tolist(), top.face.tolist()) == ([0, 1], [1, 1])
     assert (len(mesh.nodes_of("TOP", "here")), len(mesh.faces_of("END", "here"))) == (6, 1)
-    assert len(mesh.faces_of("sides", "here")) == 2  # whose nodes are those of all faces of the cube
+    assert (
+        len(mesh.faces_of("sides", "here")) == 2
+    )  # whose nodes are those of all faces of the cube
     assert mesh.loose.tolist() == [99]
     with pytest.raises(MeshError, match=r"1 of the nodes of the set 'Nall' .* touch no cell"):
         mesh.nodes_of("Nall", "support[1]")
@@ -273,7 +307,11 @@ def test_a_deck_is_read_with_its_sets(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "old", "new", "sentence"),
-    [(name, *row) for name in ("cubes.inp", "tetrahedron.bdf") for row in INPUTS.refused(name.split(".")[0])],
+    [
+        (name, *row)
+        for name in ("cubes.inp", "tetrahedron.bdf")
+        for row in INPUTS.refused(name.split(".")[0])
+    ],
 )
 def test_a_fault_of_a_deck_is_said_with_its_line(name, old, new, sentence, tmp_path):
     path = tmp_path / f"m.{name[-3:]}"
@@ -289,7 +327,10 @@ def test_a_word_is_read_or_harmless_or_refused_or_told(dialect, tmp_path):
     assert not words.read.keys() & (words.harmless | words.refused.keys())
     passed = [f"{words.mark}{word}" for word in sorted(words.harmless)]
     (remark,) = written(tmp_path / name, *lines, *passed, f"{words.mark}NEWWORD").remarks
-    assert f"line {len(lines) + len(passed) + 1}: {words.mark}NEWWORD is not known and was passed" in remark
+    assert (
+        f"line {len(lines) + len(passed) + 1}: {words.mark}NEWWORD is not known and was passed"
+        in remark
+    )
     for word in sorted(words.refused):
         told = re.escape(f"{name}, line {len(lines) + 1}: {words.mark}{word} ")
         with refused(MeshError, f"{told}.*; "):
@@ -297,7 +338,10 @@ def test_a_word_is_read_or_harmless_or_refused_or_told(dialect, tmp_path):
 
 
 def test_decks_that_include_others(tmp_path):
-    for name, include, count in (("m.inp", "*INCLUDE, INPUT=", 5), ("m.bdf", "BEGIN BULK\ninclude ", 4)):
+    for name, include, count in (
+        ("m.inp", "*INCLUDE, INPUT=", 5),
+        ("m.bdf", "BEGIN BULK\ninclude ", 4),
+    ):
         lines = SOLID if name == "m.inp" else TETRAHEDRON
         (tmp_path / f"part{name}").write_text("\n".join(lines[:count]))
         mesh = written(tmp_path / name, f"{include}part{name}", *lines[count:])
@@ -314,9 +358,14 @@ def test_grid_points_of_any_coordinate_system(kind, form, tmp_path):
     axes = TURN.as_matrix().T
     three = [ORIGIN, ORIGIN + 2.0 * axes[2], ORIGIN + 3.0 * axes[0] - axes[2]]
     shift = np.array([5.0, 6.0, 7.0])
-    given = [(point - shift)[[1, 2, 0]].tolist() for point in three]  # in a system whose x is the y of space
+    given = [
+        (point - shift)[[1, 2, 0]].tolist() for point in three
+    ]  # in a system whose x is the y of space
     lines = [
-        *(card("GRID", n, 4, *row.tolist()) for n, row in enumerate(coordinates(points, kind), start=1)),
+        *(
+            card("GRID", n, 4, *row.tolist())
+            for n, row in enumerate(coordinates(points, kind), start=1)
+        ),
         card("CORD2R", 9, 0, *shift.tolist(), 6.0, 6.0, 7.0, "+"),
         card("+", 5.0, 7.0, 7.0),
         *(card("GRID", 900 + n, "", *row) for n, row in enumerate(given)),
@@ -327,7 +376,11 @@ def test_grid_points_of_any_coordinate_system(kind, form, tmp_path):
     ]
     order = [*range(12), *range(16, 20), *range(12, 16)]
     for number, cell in enumerate(cells[:, order] + 1, start=1):
-        lines += [card("CHEXA", number, 7, *cell[:6], "+"), card("+", *cell[6:14], ""), card("", *cell[14:])]
+        lines += [
+            card("CHEXA", number, 7, *cell[:6], "+"),
+            card("+", *cell[6:14], ""),
+            card("", *cell[14:]),
+        ]
     mesh = written(tmp_path / "m.bdf", "SOL 101", "BEGIN BULK", *lines, "ENDDATA", "nonsense")
     np.testing.assert_allclose(mesh.nodes, points[cells], atol=1e-10)
     assert len(mesh.cells_of("nastran:ref=7", "here")) == 2
@@ -360,13 +413,21 @@ def test_a_continuation_of_nastran_may_stand_before_its_line(end, tmp_path):
     point, hexahedron = cards(tmp_path / "m.bdf")
     nodes = [field for field in hexahedron.fields[2:] if field]
     assert nodes == [str(number) for number in range(1, 21)]
-    assert [field for field in point.fields if field] == ["1", "0.", "0.", "0.", *(["5"] if end else [])]
+    assert [field for field in point.fields if field] == [
+        "1",
+        "0.",
+        "0.",
+        "0.",
+        *(["5"] if end else []),
+    ]
 
 
 def test_a_continuation_of_nastran_that_continues_nothing_is_refused(tmp_path):
     lines = ["GRID,1,,0.,0.,0.,,,+A", "+B,7,8", "GRID,2,,0.,0.,1."]
     (tmp_path / "m.bdf").write_text("\n".join(lines))
-    with refused(MeshError, r"line 2: the continuation '\+B' stands behind no line that it continues"):
+    with refused(
+        MeshError, r"line 2: the continuation '\+B' stands behind no line that it continues"
+    ):
         cards(tmp_path / "m.bdf")
 
 
@@ -402,4 +463,6 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind, tmp_path):
     np.testing.assert_allclose(shifted.nodes[0, 0], (1.0, 2.0, 3.0))
     # A point on x alone turns x about z, after its height is left out.
     turned = written(tmp_path / "m.inp", "*SYSTEM", ",, 0, , 3, 4,", *SOLID)
-    np.testing.assert_allclose(turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_allclose(
+        turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15
+    )
