@@ -10,7 +10,13 @@ import pytest
 from reporting import figures
 from reporting.errors import InvalidFigureError
 from reporting.page import Page, PageColumn, Table, Words, script_source
-from reporting.record_table import TitledTable, add_titled_table, number_cells, table_of_records, text_cells
+from reporting.record_table import (
+    TitledTable,
+    add_titled_table,
+    number_cells,
+    table_of_records,
+    text_cells,
+)
 
 VOID_TAGS = {"meta", "br", "link", "img"}
 
