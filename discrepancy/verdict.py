@@ -32,8 +32,11 @@ class Moment:
     """When something changed [s since the trial's start]: posterior median and 90 % interval."""
 
     value: float
+    """Posterior median [s]."""
     low: float
+    """Quantile 0.05 [s]."""
     high: float
+    """Quantile 0.95 [s]."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +76,17 @@ class Estimate:
     """A number with its 90 % interval: posterior median and quantiles 0.05, 0.95, in `unit`."""
 
     name: str
+    """Name of the number."""
     value: Number
+    """Posterior median [unit of the entry]."""
     low: Number
+    """Quantile 0.05 [unit of the entry]."""
     high: Number
+    """Quantile 0.95 [unit of the entry]."""
     unit: str
+    """Unit of the number."""
     description: str = ""
+    """What the number is."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +94,19 @@ class NamedEffect:
     """An effect in a hypothesis: identifier, name, place, parameters with intervals, patch."""
 
     identifier: str
+    """Identifier of the effect in the catalogue."""
     name: str
+    """Name of the effect."""
     place: str
+    """Where it acts."""
     family: str
+    """Name of its family."""
     parameters: tuple[Estimate, ...]
+    """Its parameters."""
     shape: tuple[Estimate, ...]
+    """Its free exponents, if its family was fitted."""
     patch: Patch
+    """Primitive changes of the model."""
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
@@ -111,9 +127,13 @@ class CalibratedParameter:
     """A calibrated parameter of a hypothesis: posterior mean and standard deviation, in `unit`."""
 
     name: str
+    """Name of the parameter."""
     mean: Number
+    """Posterior mean [unit of the entry]."""
     deviation: Number
+    """Posterior standard deviation [unit of the entry]."""
     unit: str
+    """Unit of the parameter."""
 
 
 @dataclass(frozen=True)
@@ -232,10 +252,15 @@ class ForceMoment:
     """A missing force at a moment: trial, time [s], force, displacement and speed of its port."""
 
     trial: str
+    """Name of the trial."""
     time: Number
+    """Time [s]."""
     force: Number
+    """Force [unit of the force]."""
     displacement: Number
+    """Displacement of the port [m or rad]."""
     speed: Number
+    """Speed of the port [m/s or rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -296,9 +321,13 @@ class UnfittedRecord:
     """
 
     trial: str
+    """Name of the trial."""
     channel: str
+    """Name of the channel."""
     left: Number
+    """Root mean square residual [unit of the channel]."""
     varies: Number
+    """Standard deviation of the readings about their mean [unit of the channel]."""
 
 
 @dataclass(frozen=True)
@@ -333,8 +362,11 @@ class NotFitted:
     """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
 
     identifier: str
+    """Identifier of the effect in the catalogue."""
     reason: str
+    """Why it was not fitted."""
     gain: Number = nan
+    """Gain of log evidence that a screen promised at most [nat]."""
 
 
 @dataclass(frozen=True)
@@ -342,9 +374,13 @@ class Experiment:
     """A proposed next experiment: what to do, its mutual information [nat], cost [1], and why."""
 
     description: str
+    """What to do."""
     information: Number
+    """Mutual information of the result and the open question [nat]."""
     cost: Number
+    """Cost [1]."""
     reason: str
+    """Why it is proposed."""
 
 
 @dataclass(frozen=True)

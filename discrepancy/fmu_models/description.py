@@ -101,7 +101,9 @@ class MotionSection(Section):
     """`[motion]`: ring-downs and forced trials; `step` [s] only if the FMU has one step size."""
 
     step: Positive | None = None
+    """Communication step; needed only if the FMU has one step size [s]."""
     parameters: dict[Name, Number] = Field(default_factory=dict)
+    """Parameters of the FMU in ring-downs and forced trials, in its units [unit of the FMU]."""
 
 
 class ReleaseSection(Section):
@@ -144,7 +146,10 @@ class FmuOutputSection(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for the numbers a to b."""
 
     variable: Variable
+    """Name in the binding or in the FMU, in which `{a..b}` stands for the numbers a to b; by
+    default `name`."""
     quantity: Quantity = Quantity.DISPLACEMENT
+    """What it is."""
 
 
 class FmuInputSection(FmuOutputSection):
@@ -157,24 +162,33 @@ class FmuPortSection(NamedSection):
     """`[[port]]`: where an internal force can act; `rotation`: a moment and an angle."""
 
     force: Name
+    """Input of the force or moment."""
     displacement: Name
+    """Output of the displacement or angle."""
     velocity: Name | None = None
+    """Output of the velocity or angular velocity."""
     rotation: bool = False
+    """Whether the port turns."""
 
 
 class FmuParameterSection(ParameterSection):
     """`[[parameter]]`: a calibrated parameter that is a variable of the FMU."""
 
     variable: Variable
+    """Name in the binding or in the FMU; by default `name`."""
 
 
 class ScalesSection(Section):
     """`[scales]`: natural scales that cannot be computed with the FMU, as in `Scales`; all SI."""
 
     length: Positive | None = None
+    """Characteristic length [m]."""
     tip_stiffness: Positive | None = None
+    """Force at the place of the load for each metre of its displacement [N/m]."""
     modal_mass: Positive | None = None
+    """Mass of the first mode [kg]."""
     angular_frequency: Positive | None = None
+    """Angular frequency of the first mode [rad/s]."""
 
 
 class FmuModelDescription(ModelDescription):

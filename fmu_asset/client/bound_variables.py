@@ -85,14 +85,18 @@ class ScalarBinding(Section):
     """
 
     variable: _Text
+    """Name of the variable in the FMU."""
     unit: _Text
+    """Unit in which the caller gives or takes the value."""
 
 
 class InputBinding(ScalarBinding):
     """An input with a range of its own, in `unit`, within that of the FMU."""
 
     minimum: Number | None = None
+    """Least value that may be given [unit of the entry]."""
     maximum: Number | None = None
+    """Largest value that may be given [unit of the entry]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield a minimum above the maximum."""
@@ -116,6 +120,8 @@ class ParameterBinding(InputBinding):
     """
 
     value: Number | str | None = None
+    """Value that is set at every reset unless the caller gives another; a text for a text
+    parameter, or the name of an item of an enumeration [unit of the entry]."""
 
 
 class VectorBinding(Section):
@@ -125,7 +131,9 @@ class VectorBinding(Section):
     """
 
     variables: Annotated[_Names, Field(min_length=1)]
+    """Names of variables in the FMU, in order; `{a..b}` stands for all numbers from a to b."""
     unit: _Text | _Texts
+    """Unit of all variables, or a list with that of each."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -171,8 +179,11 @@ class PortBinding(Section):
     """
 
     force: VectorBinding
+    """Force or moment at the port."""
     displacement: VectorBinding | None = None
+    """Displacement or angle of the port."""
     velocity: VectorBinding | None = None
+    """Velocity or angular velocity of the port."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the faults of a port: no motion, or a unit that its quantity cannot have."""
@@ -210,3 +221,4 @@ class RecordBinding(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
     variables: _Names = ()
+    """Names of variables in the FMU; `{a..b}` stands for all numbers from a to b."""

@@ -62,24 +62,39 @@ class ScenarioTables(Section):
     """All tables of a scenario, in SI; each table is checked alone, and against the others."""
 
     format: Literal[2]
+    """Version of the format; files of format 1 are still read."""
     mission: Mission
+    """What is flown, and for how long."""
     state: Annotated[tuple[StateFactor, ...], Field(min_length=1)]
+    """The factors of the hidden state, the outermost first."""
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
-    """The controls of the file, followed by one for each action."""
+    """The controls that the twin chooses from."""
     action: tuple[Action, ...] = ()
+    """Inspections, repairs and the end of the mission, beside the controls."""
     observation: ObservationSection
+    """What is observed, and how well."""
     transition: Transition
+    """How the state changes in a step."""
     rewards: Rewards
+    """What the policy maximises."""
     planner: Planner
+    """How the twin decides."""
     asset: SerializeAsAny[AssetSection]
+    """What flies; left out if a real asset is watched."""
     belief: SerializeAsAny[BeliefSection]
+    """The model that predicts the observations of the twin."""
     calibration: Calibration
+    """The uncertain parameter of the model, and its distribution."""
     truth: TruthSection
+    """What really happens, unseen by the twin; left out if a real asset is watched."""
     learning: Learning | None = None
+    """What the twin learns during the mission; nothing without the table."""
     notice: NoticingOrNot = None
-    """When alarms are raised; `reading.load_scenario` says when a scenario has them by default."""
+    """When an alarm is raised; `notice = false` switches alarms off."""
     watch: WatchSection = WatchSection()
+    """How a real asset is watched."""
     reference: tuple[Reference, ...] = ()
+    """Published values that are printed beside figures of the summary."""
 
     @model_validator(mode="before")
     @classmethod

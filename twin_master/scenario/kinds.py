@@ -95,6 +95,7 @@ class KindSection(FileSection):
     """A table whose `kind` decides which subclass it is."""
 
     kind: str
+    """The kind of the table, which decides its other keys."""
     has_unique_model: ClassVar[bool] = False
     """Whether its observations come from a model that no other kind flies or believes."""
 
