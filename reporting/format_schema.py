@@ -54,8 +54,15 @@ def format_schema(model: object, title: str) -> JsonSchema:
 def attribute_descriptions(cls: type) -> dict[str, str]:
     """Return the description of each attribute of a class, also of the inherited ones, by name."""
     descriptions: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if base.__module__.partition(".")[0] not in ("builtins", "typing", "pydantic", "enum"):
+    # A TypedDict has its bases beside the order in which methods are looked up.
+    bases = (*cls.__dict__.get("__orig_bases__", ()), *cls.__mro__)
+    for base in reversed(bases):
+        if isinstance(base, type) and base.__module__.partition(".")[0] not in (
+            "builtins",
+            "typing",
+            "pydantic",
+            "enum",
+        ):
             descriptions |= _own_descriptions(base)
     return descriptions
 
@@ -124,7 +131,9 @@ class _DescribedSchema(GenerateJsonSchema):
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> JsonSchemaValue:
         """Return the schema of a dataclass."""
-        return _described(super().dataclass_schema(schema), schema["cls"])
+        fields: Any = schema["schema"].get("fields", [])
+        names = {field.get("validation_alias", field["name"]): field["name"] for field in fields}
+        return _described(super().dataclass_schema(schema), schema["cls"], names)
 
     def typed_dict_schema(self, schema: core_schema.TypedDictSchema) -> JsonSchemaValue:
         """Return the schema of a `TypedDict`."""
@@ -135,10 +144,21 @@ class _DescribedSchema(GenerateJsonSchema):
         return {"not": {}}
 
 
-def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
+def _described(
+    schema: JsonSchemaValue, cls: type, attribute_of_key: Mapping[str, str] | None = None
+) -> JsonSchemaValue:
     """Return the schema of a class with the descriptions and units of its keys.
 
     Keys that no file contains are left out.
+
+    Parameters
+    ----------
+    schema : dict
+        The schema of the class without descriptions.
+    cls : type
+        The class.
+    attribute_of_key : mapping of str to str, optional
+        The attribute of each key; by default a key has the name of its attribute.
     """
     if "properties" not in schema:
         return schema
@@ -152,8 +172,9 @@ def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
         if described.pop(MUST_BE_STATED, False):
             described.pop("default", None)
             required.append(key)
-        if key in descriptions:
-            described |= _description_and_unit(descriptions[key])
+        attribute = (attribute_of_key or {}).get(key, key)
+        if attribute in descriptions:
+            described |= _description_and_unit(descriptions[attribute])
         properties[key] = described
     described_schema = {**schema, "properties": properties}
     summary = summary_of_class(cls)

@@ -27,7 +27,9 @@ def _as_table(force: object) -> object:
     return {DEFAULT_PLACE: force} if isinstance(force, str) else force
 
 
-Forces = Annotated[dict[Name, Name], BeforeValidator(_as_table)]
+Forces = Annotated[
+    dict[Name, Name], BeforeValidator(_as_table, json_schema_input_type=Name | dict[Name, Name])
+]
 """Force inputs by load place."""
 
 
@@ -85,9 +87,9 @@ class StaticSection(Section):
     limit : float
         Longest motion that is waited for [s].
     tolerance : float
-        At rest, no output moves by more than this share of its largest value.
+        At rest, no output moves by more than this fraction of its largest value [1].
     parameters : table
-        Parameters of the FMU in such trials, in its units.
+        Parameters of the FMU in such trials, in its units [unit of the FMU].
     """
 
     settle: bool = False

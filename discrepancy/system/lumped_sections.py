@@ -43,9 +43,21 @@ def _as_matrix(value: object) -> object:
     return rows
 
 
-Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list)]
-Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_rows)]
-Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_matrix)]
+_NumbersOrRows = Number | tuple[Number, ...] | tuple[tuple[Number, ...], ...]
+"""What a file may state for a matrix: one number, a row or diagonal, or all rows."""
+Vector = Annotated[
+    tuple[Number, ...],
+    Field(min_length=1),
+    BeforeValidator(as_list, json_schema_input_type=Number | tuple[Number, ...]),
+]
+Rows = Annotated[
+    tuple[tuple[Number, ...], ...],
+    BeforeValidator(_as_rows, json_schema_input_type=_NumbersOrRows),
+]
+Matrix = Annotated[
+    tuple[tuple[Number, ...], ...],
+    BeforeValidator(_as_matrix, json_schema_input_type=_NumbersOrRows),
+]
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 """Fraction of critical damping. Above one a mode is overdamped; a value above three is an error."""
 
@@ -53,7 +65,13 @@ Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 class Damping(Section):
     """`[damping]`: modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
 
-    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(as_list)] | None = None
+    ratios: (
+        Annotated[
+            tuple[Ratio, ...],
+            BeforeValidator(as_list, json_schema_input_type=Ratio | tuple[Ratio, ...]),
+        ]
+        | None
+    ) = None
     """Damping ratio of each mode, as a fraction of critical damping [1]."""
     matrix: Matrix | None = None
     """Damping matrix, its diagonal, or one number [SI]."""
@@ -241,7 +259,10 @@ class RootSection(Section):
 class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a calibrated factor that scales the terms that it names."""
 
-    terms: Annotated[tuple[Name, ...], BeforeValidator(as_list)]
+    terms: Annotated[
+        tuple[Name, ...],
+        BeforeValidator(as_list, json_schema_input_type=Name | tuple[Name, ...]),
+    ]
     """Names of what the factor scales: a matrix, a part, an input, a load, a law, a controller or
     one of its gains; one or several."""
     mean: Number = 1.0

@@ -47,7 +47,7 @@ class Gauge(tables.Named, Spot):
     """Strain gauge on the surface: mean strain along `direction`, positive in tension."""
 
     direction: tables.Direction
-    """Direction of the strain, as a vector."""
+    """Direction of the strain, as a vector [1]."""
 
 
 def _span_a_plane(
@@ -71,7 +71,7 @@ class Rosette(Spot):
     name: Annotated[str, Field(max_length=30, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     """Name, to which a letter is added for each gauge."""
     axes: Axes
-    """Two vectors: axis 1, and another vector in the plane of the surface, towards axis 2."""
+    """Two vectors: axis 1, and another vector in the plane of the surface, towards axis 2 [1]."""
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
     """Angle of each gauge from axis 1 towards axis 2 [degrees]."""
 
@@ -135,6 +135,7 @@ class MeshMaterial(tables.AlternativeKeys):
     """
 
     name: tables.Name
+    """Name of the material."""
     set: SetName = "all"
     """Set of the cells."""
     density: float = Field(ge=0.0, le=3e4)
@@ -150,7 +151,7 @@ class MeshMaterial(tables.AlternativeKeys):
     shear_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
     """Shear moduli 12, 13 and 23 [Pa]."""
     axes: Axes | None = None
-    """Two vectors: axis 1, and another vector in the plane of axes 1 and 2."""
+    """Two vectors: axis 1, and another vector in the plane of axes 1 and 2 [1]."""
     scaled_by: tables.Name | None = None
     """Name of the parameter that scales the stiffness."""
     alternatives = (
@@ -267,7 +268,7 @@ class PointOutput(tables.Named):
     point: tables.Vector
     """Place [unit of length]."""
     direction: tables.Direction
-    """Direction, as a vector."""
+    """Direction, as a vector [1]."""
 
 
 class MeshPort(tables.AlternativeKeys, tables.Named):
@@ -277,7 +278,7 @@ class MeshPort(tables.AlternativeKeys, tables.Named):
     """
 
     direction: tables.Direction
-    """Direction of the force, as a vector."""
+    """Direction of the force, as a vector [1]."""
     set: SetName | None = None
     """Set of nodes or faces on which the force acts."""
     point: tables.Vector | None = None

@@ -16,7 +16,10 @@ FileName = Annotated[str, Field(min_length=1)]
 Files = Annotated[
     tuple[FileName, ...],
     Field(min_length=1),
-    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
+    BeforeValidator(
+        lambda files: (files,) if isinstance(files, str) else files,
+        json_schema_input_type=FileName | tuple[FileName, ...],
+    ),
 ]
 
 
@@ -86,7 +89,7 @@ class Extension(tables.AlternativeKeys, tables.Named):
     nodes: tuple[Node, Node] | None = None
     """Numbers of the two nodes that move apart."""
     direction: tables.Direction | None = None
-    """Direction of the strain, as a vector."""
+    """Direction of the strain, as a vector [1]."""
     length: float | None = Field(default=None, gt=0.0)
     """Length over which the nodes move apart [unit of length]."""
 
@@ -101,7 +104,7 @@ class NodeOutput(tables.AlternativeKeys, tables.Named):
     node: Node | None = None
     """Number of the node."""
     direction: tables.Direction | None = None
-    """Direction, as a vector."""
+    """Direction, as a vector [1]."""
 
     alternatives = (("vector",), ("node", "direction"))
 

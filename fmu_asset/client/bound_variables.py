@@ -74,7 +74,10 @@ def expand(pattern: str) -> tuple[str, ...]:
     return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
 
 
-_Names = Annotated[tuple[_Text, ...], BeforeValidator(_with_expanded_patterns)]
+_Names = Annotated[
+    tuple[_Text, ...],
+    BeforeValidator(_with_expanded_patterns, json_schema_input_type=_Text | tuple[_Text, ...]),
+]
 
 
 class ScalarBinding(Section):

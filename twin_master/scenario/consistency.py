@@ -1,14 +1,14 @@
 """All tables of a scenario, with the checks that two or more tables agree with each other."""
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
 from reporting.toml_file import Fault
 from reporting.words import comma_list
-from twin_master.scenario.kinds import AssetSection, BeliefSection
+from twin_master.scenario.kinds import WATCHED_KIND, AssetSection, BeliefSection
 from twin_master.scenario.mission import Calibration, Control, Mission, Reference, StateFactor
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
@@ -33,8 +33,6 @@ from twin_master.scenario.tables import (
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge above which the number was meant in microstrain [1]. Usual
 gauges break at a strain of a few percent."""
-WATCHED_KIND = "watched"
-"""Kind of the asset of a scenario without `[asset]`."""
 
 
 class InspectionReading(NamedTuple):
@@ -60,6 +58,8 @@ class InspectionReading(NamedTuple):
 
 class ScenarioTables(Section):
     """All tables of a scenario, in SI; each table is checked alone, and against the others."""
+
+    filled_in: ClassVar[tuple[str, ...]] = ("asset", "truth")
 
     format: Literal[2]
     """Version of the format; files of format 1 are still read."""

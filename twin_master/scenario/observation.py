@@ -185,6 +185,8 @@ class ObservationSection(Section):
         "standard_deviation": "microstrain",
         "model_error": "percent",
     }
+    filled_in: ClassVar[tuple[str, ...]] = ("count", "standard_deviation")
+
     role: Name = "strain"
     """What is observed: an observation of the binding, or `modes`."""
     count: Count

@@ -527,7 +527,10 @@ def _none_for_false(value: object) -> object:
     return None if value is False else value
 
 
-NoticingOrNot = Annotated[Noticing | None, BeforeValidator(_none_for_false)]
+NoticingOrNot = Annotated[
+    Noticing | None,
+    BeforeValidator(_none_for_false, json_schema_input_type=Noticing | Literal[False]),
+]
 """The table, or `notice = false`."""
 
 
