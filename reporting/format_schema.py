@@ -11,11 +11,12 @@ import inspect
 import re
 from collections.abc import Mapping
 from functools import cache
+from math import isfinite
 from textwrap import dedent
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import TypeAdapter, WithJsonSchema
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, JsonSchemaWarningKind
 from pydantic_core import core_schema
 
 JsonSchema = dict[str, Any]
@@ -121,6 +122,12 @@ def summary_of_class(cls: type) -> str:
 class _DescribedSchema(GenerateJsonSchema):
     """Generates JSON Schemas whose keys have descriptions and units, and no titles."""
 
+    # A default such as an empty array of NumPy belongs to a field that no file contains.
+    ignored_warning_kinds: ClassVar[set[JsonSchemaWarningKind]] = {
+        "skipped-choice",
+        "non-serializable-default",
+    }
+
     def field_title_should_be_set(self, schema: Any) -> bool:
         """Return that a key gets no title, since it would repeat the name of the key."""
         return False
@@ -172,6 +179,9 @@ def _described(
         if described.pop(MUST_BE_STATED, False):
             described.pop("default", None)
             required.append(key)
+        default = described.get("default")
+        if isinstance(default, float) and not isfinite(default):  # JSON has no such number
+            del described["default"]
         attribute = (attribute_of_key or {}).get(key, key)
         if attribute in descriptions:
             described |= _description_and_unit(descriptions[attribute])

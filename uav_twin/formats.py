@@ -170,6 +170,11 @@ FORMATS = {file_format.name: file_format for file_format in _FORMATS}
 """All formats by their names."""
 
 
+def schema_line(name: str) -> str:
+    """Return the first line of a TOML file that names the shipped schema of a format to editors."""
+    return f"#:schema {FORMATS[name].schema_file.as_uri()}\n"
+
+
 def find_format(name: str) -> FileFormat:
     """Return the format with a name.
 

@@ -198,17 +198,31 @@ class FmuModelDescription(ModelDescription):
 
     Attributes
     ----------
-    format, kind : 1, "fmu"
-        What it is.
-    name : str
-        For people.
+    kind : "fmu"
+        Kind of the model.
     fmu : str
         The FMU, seen from the file's folder.
     binding : str, optional
         A binding file, seen from the file's folder, or a shipped binding by name. Without one,
         names here are variables of the FMU.
-    inputs, static, motion, release, input, output, port, parameter, scales
-        See there.
+    inputs : FmuInputsSection
+        Inputs that a trial sets.
+    static : StaticSection
+        How a state at rest is reached.
+    motion : MotionSection
+        How a motion is computed.
+    release : ReleaseSection or None
+        How a ring-down starts.
+    input : tuple of FmuInputSection
+        Inputs that static trials hold in each row, and that drive driven trials.
+    output : tuple of FmuOutputSection
+        What channels can measure.
+    port : tuple of FmuPortSection
+        Where an internal force can act.
+    parameter : tuple of FmuParameterSection
+        Calibrated parameters, which are variables of the FMU.
+    scales : ScalesSection
+        Natural scales that cannot be computed with the FMU.
     effects : table
         Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
         `effect.<id>.<number>`).

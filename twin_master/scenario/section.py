@@ -10,6 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, mo
 from pydantic_core import CoreSchema
 
 from reporting import toml_file
+from reporting.choices import did_you_mean
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
 
 Table = dict[str, Any]
@@ -96,7 +97,11 @@ class Section(toml_file.Section):
             field, unit = cls.split_unit(str(key))
             if field not in cls.model_fields:
                 known_keys = ", ".join(cls._documented_key(name) for name in cls.model_fields)
-                raise ValueError(f"unknown key `{key}`; the keys known there are {known_keys}")
+                question = did_you_mean(str(key), cls._keys_in_file())
+                stop = "." if question else ""
+                raise ValueError(
+                    f"unknown key `{key}`; the keys known there are {known_keys}{stop}{question}"
+                )
             if field in converted:
                 raise ValueError(f"`{field}` was given with and without its unit: keep one of them")
             if unit == "percent":
@@ -122,6 +127,11 @@ class Section(toml_file.Section):
     def _documented_key(cls, name: str) -> str:
         """Return a key for a message, with the unit that it may carry: `levels[_percent]`."""
         return f"{name}[_{cls.units[name]}]" if name in cls.units else name
+
+    @classmethod
+    def _keys_in_file(cls) -> list[str]:
+        """Return the keys that a file may have, with and without their units."""
+        return [*cls.model_fields, *(f"{name}_{unit}" for name, unit in cls.units.items())]
 
     @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:
