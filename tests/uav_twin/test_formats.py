@@ -26,7 +26,6 @@ from uav_twin.cli import app
 from uav_twin.formats import FORMATS, SCHEMA_FOLDER, schema_line
 
 ROOT = Path(__file__).parents[2]
-TESTS = ROOT / "tests"
 SHIPPED = {
     "scenario": [*scenario_files().values()],
     "binding": [*binding_files().values()],
@@ -42,7 +41,7 @@ FILES = {
         ROOT / f"discrepancy/sources/rigs/{name}/campaign.toml" for name in ("pendulum", "two_tanks")
     ],
     "fmu-model": [
-        TESTS / "discrepancy" / "system" / "inputs" / f"{name}.toml" for name in ("console", "wing")
+        ROOT / "tests" / "discrepancy" / "system" / "inputs" / f"{name}.toml" for name in ("console", "wing")
     ],
 }
 
@@ -106,34 +105,46 @@ def test_the_line_for_editors_names_a_shipped_file():
     assert Path(uri.removeprefix("file://")) == FORMATS["binding"].schema_file
 
 
-def scenario_with(change):
-    """Return the content of a shipped scenario, changed by a function."""
-    content = content_of(scenario_files()["level_turns"])
-    change(content)
-    return content
+def read_binding(content, source):
+    """Return the binding in the content of a file."""
+    return parse_binding(content, where=source)
+
+
+SCENARIO = scenario_files()["level_turns"]
+CHAIN = ROOT / "discrepancy" / "lumped_models" / "three_mass_chain.toml"
+TANKS = ROOT / "discrepancy" / "sources" / "rigs" / "two_tanks" / "campaign.toml"
+READERS = {
+    "scenario": (parse_scenario, SCENARIO, ScenarioError),
+    "wing": (parse_design, ROOT / "fe" / "designs" / "uav_wing.toml", InvalidDesignError),
+    "structure": (parse_structure, structure_files()["bracket"], InvalidDesignError),
+    "binding": (read_binding, binding_files()["uav_wing"], BindingError),
+    "lumped-model": (LumpedDescription.parse, CHAIN, ModelError),
+    "campaign": (parse_campaign, TANKS, CampaignFileError),
+}
+"""The reader of a format, a good file, and the error that it raises."""
 
 
 @pytest.mark.parametrize(
-    ("parse", "path", "place", "wrong", "nearest", "error"),
+    ("name", "place", "wrong", "nearest"),
     [
-        (parse_scenario, scenario_files()["level_turns"], ("mission",), "stepps", "steps", ScenarioError),
-        (parse_scenario, scenario_files()["level_turns"], ("state", 0), "levels_precent", "levels_percent", ScenarioError),
-        (parse_design, ROOT / "fe/designs/uav_wing.toml", ("planform",), "semispan", "semi_span", InvalidDesignError),
-        (parse_structure, structure_files()["bracket"], ("material", 0), "young_modulos", "young_modulus", InvalidDesignError),
-        (parse_binding, binding_files()["uav_wing"], ("binding",), "step_sise", "step_size", BindingError),
-        (LumpedDescription.parse, ROOT / "discrepancy/lumped_models/three_mass_chain.toml", ("output", 0), "quantty", "quantity", ModelError),
-        (parse_campaign, ROOT / "discrepancy/sources/rigs/two_tanks/campaign.toml", ("trial", 0), "held_aut", "held_out", CampaignFileError),
+        ("scenario", ("mission",), "stepps", "steps"),
+        ("scenario", ("state", 0), "levels_precent", "levels_percent"),
+        ("wing", ("planform",), "semispan", "semi_span"),
+        ("structure", ("material", 0), "young_modulos", "young_modulus"),
+        ("binding", ("binding",), "step_sise", "step_size"),
+        ("lumped-model", ("output", 0), "quantty", "quantity"),
+        ("campaign", ("trial", 0), "held_aut", "held_out"),
     ],
-)  # fmt: skip
-def test_a_misspelt_key_is_refused_with_the_nearest_one(parse, path, place, wrong, nearest, error):
+)
+def test_a_misspelt_key_is_refused_with_the_nearest_one(name, place, wrong, nearest):
+    parse, path, error = READERS[name]
     content = content_of(path)
     table = content
     for step in place:
         table = table[step]
     table[wrong] = 1
-    sources = {"where": "the file"} if parse is parse_binding else {"source": "the file"}
     with refused(error, rf"{wrong}.*Did you mean `{nearest}`\?$"):
-        parse(content, **sources)
+        parse(content, "the file")
 
 
 def test_a_misspelt_key_or_word_of_an_effect_is_refused_with_the_nearest_one(tmp_path):
