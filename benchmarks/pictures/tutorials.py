@@ -1,4 +1,4 @@
-"""Pictures of the tutorials that stand on no other page, of what their notebooks fly and estimate."""
+"""Pictures of the tutorials that stand on no other page, of what their notebooks estimate."""
 
 import numpy as np
 
