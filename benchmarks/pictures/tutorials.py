@@ -1,4 +1,8 @@
+<<<<<<< HEAD
 """Pictures that only tutorials show, of what their notebooks fly and estimate."""
+=======
+"""Pictures of the tutorials that stand on no other page, of what their notebooks estimate."""
+>>>>>>> main
 
 import numpy as np
 
@@ -67,9 +71,9 @@ def draw_calibrated_wing() -> Drawing:
         scatter_axes.plot(servo_mass, pitot_mass, ".", ms=3, alpha=0.3, color=PAST)
         scatter_axes.set(xlabel="mass of the servos, g", ylabel="mass of the pitot tube, g")
         png = to_png(figure, RESOLUTION)
-    factor = "young_modulus_factor"
+    modulus = "young_modulus_factor"
     numbers = {
-        "mean": result.mean(factor),
-        "deviation": result.standard_deviation(factor),
+        "mean": result.mean(modulus),
+        "deviation": result.standard_deviation(modulus),
     }
     return Drawing(png, numbers)
