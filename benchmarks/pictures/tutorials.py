@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Pictures that only tutorials show, of what their notebooks fly and estimate."""
-=======
 """Pictures of the tutorials that stand on no other page, of what their notebooks estimate."""
->>>>>>> main
 
 import numpy as np
 
