@@ -2,6 +2,7 @@
 
 import re
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,7 +25,8 @@ def places(page: Path) -> set[str]:
     for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE):
         plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").strip().lower()
         name = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
-        found.add(next(f"{name}{end}" for end in ("", "-1", "-2", "-3") if f"{name}{end}" not in found))
+        numbered_names = (f"{name}-{number}" for number in count(1))
+        found.add(next(place for place in chain([name], numbered_names) if place not in found))
     return found
 
 
