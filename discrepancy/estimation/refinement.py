@@ -102,7 +102,7 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     trials, estimate = _linearise_about_estimate(
         search, hypothesis.candidate, hypothesis.linear_trials, first
     )
-    return _hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
+    return hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
 
 
 def _estimate_about_point_of_search(
@@ -128,7 +128,7 @@ def _estimate_about_point_of_search(
         The more probable estimate; None if the laws are not possible along the motion.
     """
     trials = hypothesis.linear_trials
-    laws, estimator = _laws_and_estimator(search, hypothesis.candidate, trials)
+    laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
     trajectories = tuple(
         Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
         for motion in hypothesis.motions
@@ -189,15 +189,18 @@ def _linearise_about_estimate(
     estimate : MotionEstimate
         The estimate in these trials; the given one if none can be made in them.
     """
-    for _ in range(MOST_LINEARISATIONS):
+    for number in range(MOST_LINEARISATIONS):
         point = search.point_of_unknowns(estimate.shared, estimate.local)
         point_of_trials = trials.trials[0].linearisation_point[: len(point.shared)]
         if np.all(np.abs(point.shared - point_of_trials) < SAME_POINT):
             break
         next_trials = search.column_builder.trials_about(point)
-        laws, estimator = _laws_and_estimator(search, candidate, next_trials)
+        laws, estimator = laws_and_estimator(search, candidate, next_trials)
         start = start_in_other_trials(estimate, trials.trials, next_trials.trials)
-        next_estimate = estimator.estimate_nearby(laws, start)
+        if number == 0:
+            next_estimate = estimator.estimate_nearby(laws, start)
+        else:
+            next_estimate = estimator.polish(laws, start, estimate.speed_window)
         if next_estimate is None:
             break
         trials, estimate = next_trials, next_estimate
@@ -235,10 +238,20 @@ def start_in_other_trials(
     return EstimatorStart(estimate.effect, estimate.shared, tuple(trajectories), estimate.processes)
 
 
-def _laws_and_estimator(
+def laws_and_estimator(
     search: ForceSearch, candidate: Candidate, trials: LinearTrials
 ) -> tuple[EffectLaws, MotionEstimator]:
-    """Return the laws of a hypothesis in some trials, and the estimator of these trials."""
+    """Return the laws of a hypothesis in some trials, and the estimator of these trials.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    candidate : Candidate
+        The effects of the hypothesis.
+    trials : LinearTrials
+        The trials.
+    """
     laws = EffectLaws(
         search.column_builder,
         tuple(trials.trials),
@@ -264,7 +277,7 @@ def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
     )
 
 
-def _hypothesis_of_estimate(
+def hypothesis_of_estimate(
     search: ForceSearch, candidate: Candidate, trials: LinearTrials, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, to which further effects may be added.
@@ -302,6 +315,7 @@ def _hypothesis_of_estimate(
         solution=Solution(estimate.log_evidence, mean, estimate.covariance),
         local=estimate.local,
         motions=motions,
+        speed_window=estimate.speed_window,
     )
 
 

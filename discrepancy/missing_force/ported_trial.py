@@ -26,6 +26,8 @@ LARGEST_SUBSTEP_PHASE = 0.15
 LONGEST_CORRELATION, LEAST_WHITE_SHARE = 2000, 1e-3
 """Largest number of samples over which the correlation of a noise is computed. Least share of its
 variance that is taken as white, so that the filter does not divide by zero."""
+FEWEST_SAMPLES = 200
+"""Number of samples that thinning leaves of a trial at least."""
 HALF_DIFFERENCE = 1e-3
 """Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
 
@@ -117,6 +119,35 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
         gain_unknowns=_gain_unknowns(problem, trial, gains),
         port_motion_derivatives=by_unknowns,
     )
+
+
+def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
+    """Return the largest stride up to a wanted one with which a trial may be thinned.
+
+    The phase of the fastest mode, and that of the motion of each port, changes by at most
+    `LARGEST_SUBSTEP_PHASE` in a substep of the thinned trial. A trial with uneven intervals is not
+    thinned.
+
+    Parameters
+    ----------
+    trial : PortedTrial
+        The trial with all samples.
+    wanted_stride : float
+        The stride with which it would have the wanted number of samples.
+    """
+    lengths, _ = trial.intervals
+    if len(lengths) > 1:
+        return 1
+    substep = float(lengths[0]) / trial.substeps
+    phase_of_modes = substep * float(
+        np.max(np.abs(np.linalg.eigvals(trial.system.generator)), initial=0.0)
+    )
+    # for a sine, the rms rate of the speed over the rms speed is its angular frequency
+    rms_change = np.sqrt(np.mean(np.diff(trial.port_speeds, axis=0) ** 2, axis=0))
+    rms_speed = np.sqrt(np.mean(trial.port_speeds**2, axis=0))
+    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, 1e-300), initial=0.0))
+    longest_stride = LARGEST_SUBSTEP_PHASE / max(phase_of_modes, phase_of_motion, 1e-300)
+    return int(max(1.0, min(wanted_stride, longest_stride, len(trial.time) / FEWEST_SAMPLES)))
 
 
 def _residual_and_derivatives(

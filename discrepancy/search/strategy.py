@@ -15,7 +15,7 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
-from discrepancy.estimation.refinement import refine_hypotheses
+from discrepancy.estimation.ranking import rank_by_missing_force
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
 from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, time_step_error
@@ -327,10 +327,7 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        ranked_hypotheses = force_search.rank_hypotheses(self.effects, self.on_progress)
-        self.force_hypotheses = refine_hypotheses(
-            force_search, ranked_hypotheses, len(self.effects), self.on_progress
-        )
+        self.force_hypotheses = rank_by_missing_force(force_search, self.effects, self.on_progress)
         # fit the most probable sets to the readings, each from its estimate by the missing force
         eligible = []
         for hypothesis in self.force_hypotheses:
