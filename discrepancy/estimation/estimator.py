@@ -49,6 +49,8 @@ NARROWEST_WINDOWS = (0.001, 0.0002)
 body that sticks creeps; with a large missing force the narrow ones lead the iteration astray."""
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
+MOST_WIDE_ITERATIONS = 4
+"""The same with a window of speeds that is narrowed afterwards."""
 CONVERGED_STEP = 0.02
 """Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
 CONVERGED_EVIDENCE = 0.05
@@ -289,7 +291,7 @@ class MotionEstimator:
         current = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            smoothed = self._iterate_gauss_newton(laws, current, speed_window)
+            smoothed = self._iterate_gauss_newton(laws, current, speed_window, MOST_WIDE_ITERATIONS)
             if smoothed is None:
                 return None
             current = start_from_estimate(smoothed)
@@ -493,7 +495,11 @@ class MotionEstimator:
         return processes, largest_evidence
 
     def _iterate_gauss_newton(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+        self,
+        laws: HypothesisLaws,
+        start: EstimatorStart,
+        speed_window: float,
+        most_iterations: int = MOST_ITERATIONS,
     ) -> MotionEstimate | None:
         """Return the estimate under given missing forces, by damped Gauss-Newton steps.
 
@@ -506,6 +512,8 @@ class MotionEstimator:
         speed_window : float
             The half width of the window of speeds over which laws of the speed are averaged,
             divided by the rms speed.
+        most_iterations : int
+            The largest number of linearisations.
 
         Returns
         -------
@@ -518,7 +526,7 @@ class MotionEstimator:
         estimate: MotionEstimate | None = None
         stagnant_iterations = 0
         largest_evidence = -inf
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(most_iterations):
             linear = self.linearise(laws, current, speed_window)
             if linear is None:
                 return estimate
