@@ -49,8 +49,10 @@ NARROWEST_WINDOWS = (0.001, 0.0002)
 body that sticks creeps; with a large missing force the narrow ones lead the iteration astray."""
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
-MOST_WIDE_ITERATIONS = 4
-"""The same with a window of speeds that is narrowed afterwards."""
+MOST_PASSING_ITERATIONS = 4
+"""The same on the way: before the window of speeds is narrowed, or the missing force lowered."""
+MOST_LAST_ITERATIONS = 4
+"""The same where all values are nearly known."""
 CONVERGED_STEP = 0.02
 """Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
 CONVERGED_EVIDENCE = 0.05
@@ -65,6 +67,8 @@ LONGEST_STEP = 2.0
 PATTERN_FACTORS = (3.0, 1.7, 1.3)
 """Factors on size and time of a missing force in the search for its most probable values, in
 turn."""
+LAST_FACTORS = (2.5, 1.5)
+"""The same where size and time are nearly known; each is tried once."""
 MOST_REPETITIONS = 4
 """Largest number of times in a row that one factor is tried, as long as the evidence rises."""
 LARGEST_DECLINE = 12.0
@@ -288,15 +292,38 @@ class MotionEstimator:
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
+        estimate = self.follow_to_small_forces(laws, start)
+        return None if estimate is None else self.tune_processes(laws, estimate)
+
+    def follow_to_small_forces(
+        self, laws: HypothesisLaws, start: EstimatorStart
+    ) -> MotionEstimate | None:
+        """Return an estimate that is followed from large missing forces to small ones.
+
+        The windows of speeds are narrowed first, then the missing forces are lowered.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values and trajectories to begin with.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if the laws are not possible along the trajectories.
+        """
         current = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            smoothed = self._iterate_gauss_newton(laws, current, speed_window, MOST_WIDE_ITERATIONS)
+            smoothed = self._iterate_gauss_newton(
+                laws, current, speed_window, MOST_PASSING_ITERATIONS
+            )
             if smoothed is None:
                 return None
             current = start_from_estimate(smoothed)
-        estimate = self._lower_missing_forces(laws, current)
-        return None if estimate is None else self._tune_processes(laws, estimate)
+        return self._lower_missing_forces(laws, current)
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
@@ -319,16 +346,16 @@ class MotionEstimator:
         estimate = self._lower_missing_forces(laws, start)
         if estimate is None:
             return None
-        estimate = self._tune_processes(laws, estimate)
+        estimate = self.tune_processes(laws, estimate)
         narrowed = self._narrow_windows(laws, estimate)
-        return narrowed if narrowed is estimate else self._tune_processes(laws, narrowed)
+        return narrowed if narrowed is estimate else self.tune_processes(laws, narrowed)
 
     def polish(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are nearly these.
 
-        Only the last factor of the search for the most probable missing forces is tried.
+        The search for the most probable missing forces is short.
 
         Parameters
         ----------
@@ -344,10 +371,12 @@ class MotionEstimator:
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self._iterate_gauss_newton(laws, start, speed_window)
+        estimate = self._iterate_gauss_newton(laws, start, speed_window, MOST_LAST_ITERATIONS)
         if estimate is None:
             return None
-        return self._tune_processes(laws, estimate, PATTERN_FACTORS[-1:])
+        return self.tune_processes(
+            laws, estimate, LAST_FACTORS, repetitions=1, most_iterations=MOST_LAST_ITERATIONS
+        )
 
     def _narrow_windows(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return the estimate with the narrowest window of speeds that makes it more probable.
@@ -398,7 +427,10 @@ class MotionEstimator:
             }
             # the narrowest window of speeds: `estimate` has used the wider ones before
             estimate = self._iterate_gauss_newton(
-                laws, replace(current_start, processes=processes), SPEED_WINDOWS[-1]
+                laws,
+                replace(current_start, processes=processes),
+                SPEED_WINDOWS[-1],
+                MOST_PASSING_ITERATIONS,
             )
             if estimate is None:
                 break
@@ -410,11 +442,13 @@ class MotionEstimator:
             current_start = start_from_estimate(estimate)
         return best_estimate
 
-    def _tune_processes(
+    def tune_processes(
         self,
         laws: HypothesisLaws,
         estimate: MotionEstimate,
         factors: Sequence[float] = PATTERN_FACTORS,
+        repetitions: int = MOST_REPETITIONS,
+        most_iterations: int = MOST_ITERATIONS,
     ) -> MotionEstimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
@@ -429,6 +463,10 @@ class MotionEstimator:
             The estimate with the present sizes and times.
         factors : sequence of float
             The factors on size and time that are tried in turn.
+        repetitions : int
+            The largest number of times in a row that one factor is tried.
+        most_iterations : int
+            The largest number of linearisations of the last estimate.
         """
         start = start_from_estimate(estimate)
         linear = self.linearise(laws, start, estimate.speed_window)
@@ -438,7 +476,7 @@ class MotionEstimator:
         first_evidence = self._evidence_with_processes(linear, processes)
         largest_evidence = first_evidence
         for factor in factors:
-            for _ in range(MOST_REPETITIONS):
+            for _ in range(repetitions):
                 last_evidence = largest_evidence
                 processes, largest_evidence = self._try_factor(
                     linear, processes, largest_evidence, factor
@@ -448,7 +486,7 @@ class MotionEstimator:
         if largest_evidence < first_evidence + LEAST_RISE:
             return estimate
         tuned = self._iterate_gauss_newton(
-            laws, replace(start, processes=processes), estimate.speed_window
+            laws, replace(start, processes=processes), estimate.speed_window, most_iterations
         )
         if tuned is None or tuned.log_evidence <= estimate.log_evidence:
             return estimate

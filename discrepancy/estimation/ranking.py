@@ -18,7 +18,7 @@ from discrepancy.missing_force.trial import PortedTrial
 from .estimator import SPEED_WINDOWS, EstimatorStart
 from .linearised import Trajectory
 from .refinement import (
-    estimate_hypothesis,
+    estimate_extended_hypothesis,
     hypothesis_of_estimate,
     laws_and_estimator,
     refine_hypotheses,
@@ -34,7 +34,7 @@ MOST_REFINED_SETS = 2
 LEADING_RANGE = 30.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
 samples the difference would be larger by about the factor of the thinning."""
-MOST_LEADING = 5
+MOST_LEADING = 3
 """Largest number of hypotheses with effects that are estimated in all samples."""
 
 
@@ -121,7 +121,7 @@ def _rank_in_thinned_records(
         refined = []
         for hypothesis in extended[:MOST_REFINED_SETS]:
             on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-            estimated = estimate_hypothesis(search, hypothesis)
+            estimated = estimate_extended_hypothesis(search, hypothesis, best)
             refined.append(hypothesis if estimated is None else estimated)
         hypotheses += refined
         best_of_sets = max(refined, key=score, default=best)

@@ -18,7 +18,7 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
 from .effects import HALF_DIFFERENCE, EffectLaws
-from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
+from .estimator import SPEED_WINDOWS, EstimatorStart, MotionEstimate, MotionEstimator
 from .linearised import SmoothedTrial, Trajectory
 
 MOST_REFINED = 4
@@ -105,6 +105,45 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     return hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
 
 
+def estimate_extended_hypothesis(
+    search: ForceSearch, hypothesis: ForceHypothesis, base: ForceHypothesis
+) -> ForceHypothesis | None:
+    """Return a hypothesis that adds an effect to an estimated one, estimated with the motion.
+
+    The estimate begins with the motion and the small missing forces of the base.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypothesis : ForceHypothesis
+        The hypothesis with one more effect, as the search has fitted it.
+    base : ForceHypothesis
+        The hypothesis without that effect, estimated with the motion.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if its laws are not possible along the motion.
+    """
+    laws, estimator = laws_and_estimator(search, hypothesis.candidate, base.linear_trials)
+    start = EstimatorStart(
+        hypothesis.effect, hypothesis.shared, _trajectories(base), base.processes
+    )
+    estimate = estimator.polish(laws, start, base.speed_window or SPEED_WINDOWS[-1])
+    if estimate is None:
+        return None
+    return hypothesis_of_estimate(search, hypothesis.candidate, base.linear_trials, estimate)
+
+
+def _trajectories(hypothesis: ForceHypothesis) -> tuple[Trajectory, ...]:
+    """Return the motion of each trial of a hypothesis as a trajectory of the estimator."""
+    return tuple(
+        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
+        for motion in hypothesis.motions
+    )
+
+
 def _estimate_about_point_of_search(
     search: ForceSearch, hypothesis: ForceHypothesis
 ) -> MotionEstimate | None:
@@ -129,10 +168,7 @@ def _estimate_about_point_of_search(
     """
     trials = hypothesis.linear_trials
     laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
-    trajectories = tuple(
-        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
-        for motion in hypothesis.motions
-    )
+    trajectories = _trajectories(hypothesis)
     processes = {
         port: replace(
             process,
@@ -156,10 +192,13 @@ def _estimate_about_point_of_search(
     estimates = []
     for beginning in beginnings:
         start = EstimatorStart(hypothesis.effect, hypothesis.shared, trajectories, beginning)
-        estimate = estimator.estimate(laws, start)
+        estimate = estimator.follow_to_small_forces(laws, start)
         if estimate is not None:
             estimates.append(estimate)
-    return max(estimates, key=lambda estimate: estimate.log_evidence, default=None)
+    if not estimates:
+        return None
+    best = max(estimates, key=lambda estimate: estimate.log_evidence)
+    return estimator.tune_processes(laws, best)
 
 
 def _linearise_about_estimate(

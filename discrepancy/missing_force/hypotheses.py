@@ -34,7 +34,7 @@ from fe.runtime.sensors import clock_of
 
 from .filtered import Process
 from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
-from .ported_trial import ported_trial, thinning_stride
+from .ported_trial import ported_trial, thin_trial
 from .process_search import Processes
 from .trial import PortedTrial, TrialColumn
 
@@ -258,7 +258,7 @@ class ColumnBuilder:
         trials = []
         for number in self.trial_indices:
             trial = ported_trial(self.problem, number, point)
-            trials.append(trial.thinned(thinning_stride(trial, self._wanted_stride)))
+            trials.append(thin_trial(trial, self._wanted_stride))
         return LinearTrials(trials, self.problem.shared.precision)
 
     def trials_along_motions(

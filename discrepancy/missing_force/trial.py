@@ -201,29 +201,32 @@ class PortedTrial:
     port_motion_derivatives: Mapping[int, FloatArray] = field(default_factory=dict)
     stride: int = 1
 
-    def thinned(self, stride: int) -> "PortedTrial":
+    def thinned(self, stride: int, substeps: int) -> "PortedTrial":
         """Return the trial with every `stride`-th sample, at equal intervals.
 
         The samples that are left out are not averaged: the likelihood of the others stays exact.
-        Every `stride`-th fine stamp remains, so that the number of substeps stays the same.
 
         Parameters
         ----------
         stride : int
             The number of samples from one that remains to the next.
+        substeps : int
+            The number of substeps in an interval of the thinned trial. It divides `stride` times
+            the number of substeps of this trial, as the fine stamps are some of this trial's.
         """
-        if stride == 1:
-            return self
         time = self.time[::stride]
-        stamp_count = (len(time) - 1) * self.substeps + 1
+        stamp_count = (len(time) - 1) * substeps + 1
+        stamp_stride = stride * self.substeps // substeps
+        assert stamp_stride * substeps == stride * self.substeps
 
         def at_fine_stamps(series: FloatArray) -> FloatArray:
             # the stamps are the last axis but one
-            return series[..., ::stride, :][..., :stamp_count, :].copy()
+            return series[..., ::stamp_stride, :][..., :stamp_count, :].copy()
 
         return replace(
             self,
             time=time,
+            substeps=substeps,
             residual=self.residual[::stride].copy(),
             used=self.used[::stride].copy(),
             shared_derivatives=self.shared_derivatives[:, ::stride].copy(),

@@ -49,7 +49,7 @@ def test_values_are_true_though_the_search_is_linear_about_others(search: ForceS
 
 def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -> None:
     trial = search.hypothesis_of_all_ports.linear_trials.trials[0]
-    thinned = trial.thinned(3)
+    thinned = trial.thinned(3, trial.substeps)
     np.testing.assert_array_equal(thinned.residual, trial.residual[::3])
     np.testing.assert_allclose(thinned.fine_time, trial.fine_time[::3], rtol=1e-12)
     slow_force = np.sin(5.0 * trial.fine_time)
