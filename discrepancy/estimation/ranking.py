@@ -15,7 +15,8 @@ from discrepancy.missing_force.linear_trials import TrialMotion
 from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
-from .estimator import SPEED_WINDOWS, EstimatorStart
+from .estimator import SPEED_WINDOWS
+from .gauss_newton import EstimatorStart
 from .linearised import Trajectory
 from .refinement import (
     estimate_extended_hypothesis,

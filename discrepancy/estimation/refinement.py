@@ -18,7 +18,8 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
 from .effects import HALF_DIFFERENCE, EffectLaws
-from .estimator import SPEED_WINDOWS, EstimatorStart, MotionEstimate, MotionEstimator
+from .estimator import SPEED_WINDOWS, MotionEstimator
+from .gauss_newton import EstimatorStart, MotionEstimate
 from .linearised import SmoothedTrial, Trajectory
 
 MOST_REFINED = 4
