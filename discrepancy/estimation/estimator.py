@@ -40,6 +40,8 @@ MOST_LAST_ITERATIONS = 4
 PATTERN_FACTORS = (3.0, 1.7, 1.3)
 """Factors on size and time of a missing force in the search for its most probable values, in
 turn."""
+COARSE_FACTORS = (3.0,)
+"""These factors where the trials are linearised again, so that size and time will change."""
 LAST_FACTORS = (2.5, 1.5)
 """These factors where size and time are nearly known; each is tried once."""
 MOST_REPETITIONS = 4
@@ -120,9 +122,8 @@ class MotionEstimator(GaussNewton):
         estimate = self._lower_missing_forces(laws, start)
         if estimate is None:
             return None
-        estimate = self.tune_processes(laws, estimate)
-        narrowed = self._narrow_windows(laws, estimate)
-        return narrowed if narrowed is estimate else self.tune_processes(laws, narrowed)
+        estimate = self.tune_processes(laws, estimate, COARSE_FACTORS)
+        return self.tune_processes(laws, self._narrow_windows(laws, estimate))
 
     def polish(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float

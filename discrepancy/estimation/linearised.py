@@ -632,7 +632,7 @@ def _change_over_substeps(
     """
     if len(by_input) == 1:  # nearly all records: no matrix needs to be copied for each substep
         return np.asarray(rates @ by_input[0].T)
-    return np.einsum("jab,jb->ja", by_input[interval_of_substep], rates)
+    return np.asarray(np.einsum("jab,jb->ja", by_input[interval_of_substep], rates))
 
 
 def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -18,7 +18,7 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
 from .effects import HALF_DIFFERENCE, EffectLaws
-from .estimator import SPEED_WINDOWS, MotionEstimator
+from .estimator import COARSE_FACTORS, SPEED_WINDOWS, MotionEstimator
 from .gauss_newton import EstimatorStart, MotionEstimate
 from .linearised import SmoothedTrial, Trajectory
 
@@ -199,7 +199,7 @@ def _estimate_about_point_of_search(
     if not estimates:
         return None
     best = max(estimates, key=lambda estimate: estimate.log_evidence)
-    return estimator.tune_processes(laws, best)
+    return estimator.tune_processes(laws, best, COARSE_FACTORS)
 
 
 def _linearise_about_estimate(
@@ -232,9 +232,10 @@ def _linearise_about_estimate(
     for number in range(MOST_LINEARISATIONS):
         point = search.point_of_unknowns(estimate.shared, estimate.local)
         point_of_trials = trials.trials[0].linearisation_point[: len(point.shared)]
-        if np.all(np.abs(point.shared - point_of_trials) < SAME_POINT):
+        is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))
+        if is_same_point and number > 0:
             break
-        next_trials = search.column_builder.trials_about(point)
+        next_trials = trials if is_same_point else search.column_builder.trials_about(point)
         laws, estimator = laws_and_estimator(search, candidate, next_trials)
         start = start_in_other_trials(estimate, trials.trials, next_trials.trials)
         if number == 0:
