@@ -372,7 +372,10 @@ class Search(FittedCandidates):
         singles = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
         if not singles:
             return
-        (leading,) = max(singles, key=self.score).candidate.terms
+        leading_fit = max(singles, key=self.score)
+        if self._is_in_optimum_of_estimate(leading_fit):
+            return
+        (leading,) = leading_fit.candidate.terms
         for hypothesis in canonical_relatives(leading, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
@@ -384,6 +387,25 @@ class Search(FittedCandidates):
                 self.record_fit(fit, exact=True)
                 if check_absolute_fit(self.problem, fit).passed:
                     return
+
+    def _is_in_optimum_of_estimate(self, fit: CandidateFit) -> bool:
+        """Return whether a simulation is at least as probable as its law with a missing force.
+
+        The law was then estimated together with the motion, and followed from a large missing force
+        to a small one. A simulation that is as probable is the limit of that estimate, in which the
+        missing force vanishes.
+
+        Parameters
+        ----------
+        fit : CandidateFit
+            The simulation.
+        """
+        return any(
+            hypothesis.candidate.key == fit.candidate.key
+            and hypothesis.speed_window is not None
+            and self.score_under_recorded_noise(fit) >= self.score(hypothesis)
+            for hypothesis in self.force_hypotheses
+        )
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises."""
