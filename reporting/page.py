@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 from markupsafe import Markup
 
 from reporting.errors import InvalidFigureError
 from reporting.templates import (
     evaluated,
+    evaluated_entries,
     fill_template,
     html_environment,
     rendered,
@@ -101,20 +102,74 @@ class ReportFigure(NamedTuple):
     caption: str
 
 
-class RenderedBlock(NamedTuple):
-    """A block of a page or of printed output, filled with values.
+class HeadingDescription(TypedDict, total=False):
+    """A column of a table in a file of words; see `Words`."""
+
+    text: str
+    number: str
+    unit: str
+    cell: str
+    when: str
+
+
+class TableDescription(TypedDict, total=False):
+    """A table in a file of words; see `Words`."""
+
+    title: str
+    caption: str
+    columns: Sequence[str | HeadingDescription]
+    rows: Sequence[Sequence[str]]
+
+
+class BlockDescription(TypedDict, total=False):
+    """A block in a file of words; see `Words.rendered_blocks`."""
+
+    say: str
+    notice: str
+    table: str
+    figure: str
+    highlights: Sequence[tuple[str, str]]
+    of: str
+    more: str
+    when: str
+
+
+class TextBlock(NamedTuple):
+    """A text of a page or of printed output.
 
     Attributes
     ----------
-    kind : {"say", "notice", "table", "figure", "highlights"}
-        What the block is.
-    content : object
-        A text (say, notice), the name of a table and the `Table`, the name of a figure, or pairs of
-        a value and its meaning (highlights).
+    text : str
+        The text.
+    is_notice : bool
+        Whether the reader must not overlook it.
     """
 
-    kind: str
-    content: Any
+    text: str
+    is_notice: bool
+
+
+class TableBlock(NamedTuple):
+    """A table of a page or of printed output, with its name in the file of words."""
+
+    name: str
+    table: Table
+
+
+class FigureBlock(NamedTuple):
+    """A figure of a page, by its name among the figures."""
+
+    name: str
+
+
+class HighlightsBlock(NamedTuple):
+    """Pairs of a value and its meaning, of a page."""
+
+    pairs: Sequence[tuple[str, str]]
+
+
+RenderedBlock = TextBlock | TableBlock | FigureBlock | HighlightsBlock
+"""A block of a page or of printed output, filled with values."""
 
 
 class Words:
@@ -143,7 +198,7 @@ class Words:
     """
 
     def __init__(self, package: str, name: str = "words.toml", **shared: object) -> None:
-        self._shared: dict[str, Any] = shared
+        self._shared = shared
         file = resources.files(package).joinpath(name)
         self.content = tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -152,26 +207,34 @@ class Words:
         return fill_template(self.content["said"][name], **self._shared | values)
 
     def table(
-        self, name: str, rows: Sequence[Any], /, **values: Any
-    ) -> tuple[list[PageColumn], list[Any]]:
+        self,
+        name: str,
+        rows: Iterable[object],
+        /,
+        *,
+        more: Iterable[PageColumn | str] = (),
+        **values: object,
+    ) -> tuple[list[PageColumn], list[Sequence[str]]]:
         """Return the columns of a table and the cells of its rows.
 
         Parameters
         ----------
         name : str
             The name of the table.
-        rows : sequence
+        rows : iterable
             The cells of each row, or records from which the file makes cells.
+        more : iterable of PageColumn or str
+            Further columns; a text is the heading of a column of numbers.
         **values : object
-            The values of the templates; `more` are further columns.
+            The values of the templates.
         """
-        description = self.content["tables"][name]
+        description: TableDescription = self.content["tables"][name]
         shown_headings = _shown_headings(description["columns"], values)
         columns = [_column_of_heading(heading, values) for heading in shown_headings]
-        for extra in values.get("more", ()):
+        for extra in more:
             columns.append(extra if isinstance(extra, PageColumn) else number_column(extra))
         all_values = values | self._shared
-        cells: list[Any] = []
+        cells: list[Sequence[str]] = []
         for template_row in description.get("rows", ()):
             filled_row = [fill_template(cell, **all_values) for cell in template_row]
             if any(filled_row[1:]):
@@ -179,23 +242,26 @@ class Words:
         if shown_headings and "cell" in shown_headings[0]:  # a table may have no columns but `more`
             cells += _cells_of_records(shown_headings, rows, all_values)
         else:
-            cells += rows
+            cells += [_cells_of_row(row) for row in rows]
         if cells:
             columns = columns[: len(cells[0])]
         return columns, cells
 
     def words(self, kind: str, name: str, /, **values: object) -> dict[str, str]:
         """Return the title and the caption of one of the `figures` or `tables`."""
-        description = self.content[kind][name]
+        description: TableDescription = self.content[kind][name]
         all_values = self._shared | values
-        return {key: fill_template(description[key], **all_values) for key in ("title", "caption")}
+        return {
+            "title": fill_template(description["title"], **all_values),
+            "caption": fill_template(description["caption"], **all_values),
+        }
 
-    def figure(self, name: str, figure: Any, /, **values: object) -> ReportFigure:
+    def figure(self, name: str, figure: "Figure", /, **values: object) -> ReportFigure:
         """Return a figure with its title and caption."""
         return ReportFigure(name, figure, **self.words("figures", name, **values))
 
     def rendered_blocks(
-        self, blocks: Iterable[Mapping[str, Any]], /, **values: Any
+        self, blocks: Iterable[BlockDescription], /, **values: object
     ) -> Iterator[RenderedBlock]:
         """Yield blocks filled with values; blocks without content are left out.
 
@@ -216,25 +282,36 @@ class Words:
             if "table" in block:
                 yield from self._table_block(block, values)
             elif "figure" in block:
-                if block["figure"] in values["figures"]:
-                    yield RenderedBlock("figure", block["figure"])
+                figures = values["figures"]
+                if isinstance(figures, Mapping) and block["figure"] in figures:
+                    yield FigureBlock(block["figure"])
             elif "highlights" in block:
-                yield RenderedBlock("highlights", _highlights(block["highlights"], values))
+                yield HighlightsBlock(_highlights(block["highlights"], values))
             else:
                 yield from _text_blocks(block, values)
 
     def _table_block(
-        self, block: Mapping[str, Any], values: Mapping[str, Any]
-    ) -> Iterator[RenderedBlock]:
+        self, block: BlockDescription, values: Mapping[str, object]
+    ) -> Iterator[TableBlock]:
         """Yield a table of the file as a block, unless it has no rows."""
         name = block["table"]
-        rows = evaluated(block["of"], **values) if "of" in block else None
-        more = evaluated(block.get("more", "[]"), **values)
-        columns, cells = self.table(name, rows or (), **{**values, "more": more})
+        rows: Iterable[object] = evaluated_entries(block["of"], **values) if "of" in block else ()
+        more = evaluated_entries(block.get("more", "[]"), **values)
+        columns, cells = self.table(
+            name, rows, **values, more=[_further_column(column) for column in more]
+        )
         if cells:
-            yield RenderedBlock("table", (name, Table(columns, cells)))
+            yield TableBlock(name, Table(columns, cells))
 
-    def fill(self, page: "Page", drawings: Mapping[str, bytes], /, **values: Any) -> None:
+    def fill(
+        self,
+        page: "Page",
+        drawings: Mapping[str, bytes],
+        /,
+        *,
+        figures: Mapping[str, ReportFigure],
+        **values: object,
+    ) -> None:
         """Add the sections of the file to a page.
 
         Parameters
@@ -242,45 +319,66 @@ class Words:
         page : Page
             The page.
         drawings : mapping of str to bytes
-            The SVG of each of the value `figures`.
+            The SVG of each figure.
+        figures : mapping of str to ReportFigure
+            The figures by name, also a value of the templates.
         **values : object
             The values of the templates.
         """
+        all_values = {**values, "figures": figures}
         for section in self.content["page"]:
-            if not evaluated(section.get("when", "true"), **values):
+            if not evaluated(section.get("when", "true"), **all_values):
                 continue
-            page.add_section(fill_template(section["title"], **values))
-            for kind, content in self.rendered_blocks(section["blocks"], **values):
-                if kind == "figure":
-                    figure = values["figures"][content]
-                    page.add_figure(drawings[content], figure.caption, title=figure.title)
-                elif kind == "table":
-                    name, table = content
-                    page.add_table(table, **self.words("tables", name, **values))
-                elif kind == "highlights":
-                    page.add_highlights(content)
-                elif kind == "notice":
-                    page.add_notice(in_one_line(content))
+            page.add_section(fill_template(section["title"], **all_values))
+            for block in self.rendered_blocks(section["blocks"], **all_values):
+                if isinstance(block, FigureBlock):
+                    figure = figures[block.name]
+                    page.add_figure(drawings[block.name], figure.caption, title=figure.title)
+                elif isinstance(block, TableBlock):
+                    page.add_table(block.table, **self.words("tables", block.name, **all_values))
+                elif isinstance(block, HighlightsBlock):
+                    page.add_highlights(block.pairs)
+                elif block.is_notice:
+                    page.add_notice(in_one_line(block.text))
                 else:
-                    page.add_paragraph(in_one_line(content))
+                    page.add_paragraph(in_one_line(block.text))
 
     def add_table(
-        self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any
+        self,
+        page: "Page",
+        name: str,
+        rows: Iterable[object] = (),
+        /,
+        *,
+        more: Iterable[PageColumn | str] = (),
+        **values: object,
     ) -> None:
         """Add a table with its title and caption to a page, unless it has no rows; see `table`."""
-        columns, cells = self.table(name, rows, **values)
+        columns, cells = self.table(name, rows, more=more, **values)
         if cells:
             page.add_table(Table(columns, cells), **self.words("tables", name, **values))
 
 
+def _cells_of_row(row: object) -> Sequence[str]:
+    """Return the cells of a row that is given as cells."""
+    if not isinstance(row, tuple | list):
+        raise TypeError(f"a row of a table must be a sequence of cells, not {row!r}.")
+    return row
+
+
+def _further_column(column: object) -> PageColumn | str:
+    """Return a further column of a table, as the file of words states it."""
+    return column if isinstance(column, PageColumn) else str(column)
+
+
 def _shown_headings(
-    headings: Iterable[str | dict[str, Any]], values: Mapping[str, object]
-) -> list[dict[str, Any]]:
+    headings: Iterable[str | HeadingDescription], values: Mapping[str, object]
+) -> list[HeadingDescription]:
     """Return the headings of a table that are shown, as tables of TOML.
 
     A heading with the key `when` is left out if the value of that name is false.
     """
-    shown_headings = []
+    shown_headings: list[HeadingDescription] = []
     for heading in headings:
         if isinstance(heading, str):
             heading = {"text": heading}
@@ -289,14 +387,14 @@ def _shown_headings(
     return shown_headings
 
 
-def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) -> PageColumn:
+def _column_of_heading(heading: HeadingDescription, values: Mapping[str, object]) -> PageColumn:
     """Return the column that a heading describes, with its name filled in."""
     name = fill_template(heading.get("text") or heading["number"], **values)
     return PageColumn(name, heading.get("unit", ""), numeric="number" in heading)
 
 
 def _cells_of_records(
-    headings: Sequence[dict[str, Any]], records: Sequence[Any], values: Mapping[str, object]
+    headings: Sequence[HeadingDescription], records: Iterable[object], values: Mapping[str, object]
 ) -> list[list[str]]:
     """Return the cells of a table, one row for each record, from the templates of its headings."""
     rows = []
@@ -318,23 +416,24 @@ def _highlights(
     return highlights
 
 
-def _text_blocks(block: Mapping[str, Any], values: Mapping[str, object]) -> Iterator[RenderedBlock]:
+def _text_blocks(block: BlockDescription, values: Mapping[str, object]) -> Iterator[TextBlock]:
     """Yield the text of a block once, or once for each entry of its expression `of`."""
-    kind = "notice" if "notice" in block else "say"
-    rows = evaluated(block["of"], **values) if "of" in block else [None]
-    if rows is None:
-        rows = [None]
+    is_notice = "notice" in block
+    template = block["notice"] if "notice" in block else block["say"]
+    rows: Iterable[object] = [None]
+    if "of" in block and evaluated(block["of"], **values) is not None:
+        rows = evaluated_entries(block["of"], **values)
     for row in rows:
-        text = rendered(block[kind], **{**values, "row": row})
+        text = rendered(template, **{**values, "row": row})
         if text.strip():
-            yield RenderedBlock(kind, text)
+            yield TextBlock(text, is_notice)
 
 
 class _PageBlock(NamedTuple):
     """A block of a page, as `page.html` takes it."""
 
     kind: str
-    content: dict[str, Any]
+    content: dict[str, object]
 
 
 class Page:
@@ -354,7 +453,7 @@ class Page:
         self._head = {"title": title, "subtitle": subtitle, "footer": footer}
         self._blocks: list[_PageBlock] = []
 
-    def _add(self, kind: str, **content: Any) -> None:
+    def _add(self, kind: str, **content: object) -> None:
         """Append a block of a kind with its content."""
         self._blocks.append(_PageBlock(kind, content))
 
@@ -418,7 +517,7 @@ class Page:
     def render(self) -> str:
         """Return the page as one string of HTML."""
         has_values_in_figures = any(
-            " data-axes=" in block.content["drawing"]
+            " data-axes=" in str(block.content["drawing"])
             for block in self._blocks
             if block.kind == "figure"
         )

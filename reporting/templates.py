@@ -1,9 +1,8 @@
 """Jinja2 templates, for plain text and for pages in HTML."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
-from typing import Any
 
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
@@ -24,9 +23,19 @@ def rendered(template: str, /, **values: object) -> str:
     return _text_template(template).render(**values)
 
 
-def evaluated(expression: str, /, **values: object) -> Any:
+def evaluated(expression: str, /, **values: object) -> object:
     """Return the value of a Jinja2 expression; it is None where a name has no value."""
     return _text_environment().compile_expression(expression)(**values)
+
+
+def evaluated_entries(expression: str, /, **values: object) -> list[object]:
+    """Return the entries of the value of a Jinja2 expression; none where a name has no value."""
+    entries = evaluated(expression, **values)
+    if entries is None:
+        return []
+    if not isinstance(entries, Iterable):
+        raise TypeError(f"the expression {expression!r} must have entries, but is {entries!r}.")
+    return list(entries)
 
 
 @cache

@@ -6,7 +6,7 @@ class.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -194,7 +194,7 @@ class Calibration:
     channels: tuple[ChannelFit, ...]
     source: str
     seed: int
-    provenance: Mapping[str, Any]
+    provenance: Mapping[str, object]
     design_hash: str = ""
     quantities: tuple[CalibratedFigure, ...] = ()
     readings: tuple[FigureReading, ...] = ()

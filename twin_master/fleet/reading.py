@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonRecord
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.store import (
     ENDED,
@@ -257,9 +258,7 @@ class TwinsOfScenario(NamedTuple):
     knowledge: Knowledge
 
 
-def flown_twins(
-    folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
-) -> Iterator[TwinsOfScenario]:
+def flown_twins(folder: Path, record: JsonRecord, group: "xr.Dataset") -> Iterator[TwinsOfScenario]:
     """Yield the twins of a group that have flown, scenario by scenario.
 
     Parameters
@@ -287,7 +286,7 @@ def flown_twins(
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
-def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
+def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.Dataset") -> Float:
     """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters

@@ -83,7 +83,7 @@ def _schema() -> dict[str, _Variable]:
     return variables
 
 
-def flown_rows(status: NDArray[Any]) -> Index:
+def flown_rows(status: NDArray[np.generic]) -> Index:
     """Return the rows of the twins that flew to the end of the mission or of their assets."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
@@ -122,7 +122,7 @@ def stored_variables(
     variance = np.matmul(flights.filtered, coordinates**2) - mean**2
     fallbacks = fallbacks_of(knowledge, flights)
     notices = _notices(flights)
-    values: dict[str, Any] = {
+    values: dict[str, object] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
         "observed": flights.observation_rows,

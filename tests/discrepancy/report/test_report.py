@@ -53,6 +53,7 @@ from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
 from reporting.folders import lock_folder
+from reporting.page import TextBlock
 from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import FEW, INPUTS, ORIGIN, drag_found, model_of
@@ -186,8 +187,9 @@ def test_what_can_be_decided(drag, able):
             WORDS.content["printed"]["check"], group_lines=group_lines, campaign_needs=campaign_needs, **told
         )
     )
-    assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
-    confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
+    assert TextBlock("Not testable: washout. The campaign has no flight trial to fit.", False) in said
+    texts = [block.text for block in said if isinstance(block, TextBlock) and not block.is_notice]
+    confused = [text for text in texts if text.startswith("Confused: ")]
     assert len(confused) == sum(bool(confused_effects(able, name)) for name in able.identifiers)
     for line in confused:
         assert all(other in line for other in confused_effects(able, line.split()[1]))
