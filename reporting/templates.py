@@ -1,7 +1,7 @@
 """Jinja2 templates, for plain text and for pages in HTML."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache
 
 from jinja2 import Environment, StrictUndefined, Template
@@ -15,27 +15,7 @@ _UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
 def fill_template(template: str, /, **values: object) -> str:
     """Return a Jinja2 template filled with values, as one line."""
-    return words.in_one_line(rendered(template, **values))
-
-
-def rendered(template: str, /, **values: object) -> str:
-    """Return a Jinja2 template filled with values, with its line breaks."""
-    return _text_template(template).render(**values)
-
-
-def evaluated(expression: str, /, **values: object) -> object:
-    """Return the value of a Jinja2 expression; it is None where a name has no value."""
-    return _text_environment().compile_expression(expression)(**values)
-
-
-def evaluated_entries(expression: str, /, **values: object) -> list[object]:
-    """Return the entries of the value of a Jinja2 expression; none where a name has no value."""
-    entries = evaluated(expression, **values)
-    if entries is None:
-        return []
-    if not isinstance(entries, Iterable):
-        raise TypeError(f"the expression {expression!r} must have entries, but is {entries!r}.")
-    return list(entries)
+    return words.in_one_line(_text_template(template).render(**values))
 
 
 @cache

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from reporting.page import Words
+    from reporting.page import Table as TextTable
     from reporting.progress import Progress
 
 _Command = Any  # Typer does not export the classes of its commands and options.
@@ -76,25 +76,13 @@ def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
         typer.secho(text, fg=fg, bold=bold)
 
 
-def show(command: str, words: "Words", **values: object) -> None:
-    """Print the result of a command.
-
-    Parameters
-    ----------
-    command : str
-        The key of ``[printed]`` that holds the blocks to print, see `Words.rendered_blocks`.
-    words : Words
-        The file of words.
-    **values : object
-        The values of the templates.
-    """
-    from reporting.page import TableBlock, TextBlock
-
-    for block in words.rendered_blocks(words.content["printed"][command], **values):
-        if isinstance(block, TableBlock):
-            print_table([column.name for column in block.table.columns], block.table.rows)
-        elif isinstance(block, TextBlock):
-            say(block.text, fg="yellow" if block.is_notice else None)
+def show(blocks: "Iterable[str | TextTable]") -> None:
+    """Print the result of a command: its lines and tables, one after the other."""
+    for block in blocks:
+        if isinstance(block, str):
+            say(block)
+        else:
+            print_table([column.name for column in block.columns], block.rows)
 
 
 def print_table(
