@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonRecord
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.store import (
     ENDED,
@@ -272,7 +273,7 @@ class TwinsOfScenario(NamedTuple):
 
 
 def flown_twins(
-    folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Iterator[TwinsOfScenario]:
     """Yield the twins of a group that have flown, scenario by scenario.
 
@@ -301,7 +302,7 @@ def flown_twins(
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
-def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.DataTree") -> Float:
+def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree") -> Float:
     """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters

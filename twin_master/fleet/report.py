@@ -9,12 +9,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError, TwinMasterError
@@ -104,7 +105,7 @@ def fleet_page(folder: Path, most_assets: int) -> str:
     return page.render()
 
 
-def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
+def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
     """Return the size of a fleet, its seed, and whether it is watched or flown."""
     group_count = counted(len(fleet["groups"]), "group")
     if is_watched:  # the configuration of a watched fleet has no list of assets
@@ -114,7 +115,7 @@ def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
 
 
 def _add_flown_fleet(
-    page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, records: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
@@ -151,7 +152,7 @@ def _add_flown_fleet(
 
 
 def _leaving_or_explanation(
-    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Float | None:
     """Return the probability that each flown twin of a group changes its control.
 
@@ -222,7 +223,7 @@ def _damage_sentence(standings: Sequence[Standing]) -> str:
 
 
 def _add_watched_fleet(
-    page: Page, folder: Path, groups: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, groups: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a fleet that is watched, given the records of its groups."""
     standing = read_standing(folder)
