@@ -64,32 +64,38 @@ def well_behaved(spring_mass) -> Iterator[FmiAsset]:
         yield asset
 
 
+@pytest.fixture(scope="module", params=[True, False], ids=["worker", "in process"])
+def misbehaving(request, spring_mass) -> Iterator[FmiAsset]:
+    """A spring whose input may let it misbehave; each test resets it."""
+    with FmiAsset(spring_mass, SPRING_BINDING, isolated=request.param) as asset:
+        yield asset
+
+
 @pytest.mark.parametrize("bad_step", [0, 1, 9])
 @pytest.mark.parametrize(("behaviour", "kind", "sentence"), INPUTS["wrong"])
 def test_a_step_that_goes_wrong_ends_a_run_there(
-    spring_mass, well_behaved, isolated, behaviour, kind, sentence, bad_step, monkeypatch
+    misbehaving, well_behaved, behaviour, kind, sentence, bad_step, monkeypatch
 ):
     """Whatever blocks it is made in; as single steps end there."""
     three_steps = 3 * 6 * 8
     monkeypatch.setattr(stepped_fmu, "_BLOCK_BYTES", three_steps)
     misbehaviour = np.where(np.arange(10) == bad_step, behaviour, 0)
     is_made = behaviour == NOT_A_NUMBER  # the step, before its result is refused
-    well_behaved.reset()
-    well_behaved.step({"push": 0.3}, load={"misbehaviour": 0})
+    for asset in (misbehaving, well_behaved):
+        asset.reset()
+        asset.step({"push": 0.3}, load={"misbehaviour": 0})
     for push in PUSH[:bad_step]:
         well_behaved.step({"push": push})
 
-    with FmiAsset(spring_mass, SPRING_BINDING, isolated=isolated) as asset:
-        asset.step({"push": 0.3}, load={"misbehaviour": 0})
-        with pytest.raises(getattr(errors, kind), match=sentence):
-            asset.simulate({"push": PUSH}, load={"misbehaviour": misbehaviour})
+    with pytest.raises(getattr(errors, kind), match=sentence):
+        misbehaving.simulate({"push": PUSH}, load={"misbehaviour": misbehaviour})
 
-        assert asset.step_index == bad_step + (2 if is_made else 1)
-        if behaviour == DISCARD:
-            assert_same_position(asset, well_behaved)
-        elif behaviour == RAISE:
-            with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
-                asset.simulate(steps=2)
+    assert misbehaving.step_index == bad_step + (2 if is_made else 1)
+    if behaviour == DISCARD:
+        assert_same_position(misbehaving, well_behaved)
+    elif behaviour == RAISE:
+        with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
+            misbehaving.simulate(steps=2)
 
 
 def assert_same_position(asset: FmiAsset, other: FmiAsset) -> None:

@@ -14,15 +14,25 @@ NAMES = "abcd"
 """Components, each with the outputs x and y and the inputs u and v."""
 ORDERS = [*permutations(NAMES)]
 
+
+def connect_all(ends: list[tuple[str, str, str, str]]) -> list[Connection]:
+    """Return connections, given component and variable of each source and target."""
+    return [
+        Connection(Endpoint(source, output), Endpoint(target, variable))
+        for source, output, target, variable in ends
+    ]
+
+
 connection_lists = st.lists(
-    st.builds(
-        Connection,
-        st.builds(Endpoint, st.sampled_from(NAMES), st.sampled_from("xy")),
-        st.builds(Endpoint, st.sampled_from(NAMES), st.sampled_from("uv")),
+    st.tuples(
+        st.sampled_from(NAMES),
+        st.sampled_from("xy"),
+        st.sampled_from(NAMES),
+        st.sampled_from("uv"),
     ),
     max_size=6,
     unique=True,
-)
+).map(connect_all)
 feedthroughs = st.fixed_dictionaries(
     {
         name: st.fixed_dictionaries({output: st.sets(st.sampled_from("uv")) for output in "xy"})
