@@ -66,7 +66,7 @@ def test_shells_are_calculixs_own(tmp_path):
         np.testing.assert_allclose(np.sqrt(squares) / (2.0 * np.pi), wanted, rtol=1e-6)
 
 
-# ------------------------------------------------------------------ a chain of which everything is known
+# ---------------------------------------------------------------- a chain in closed form
 #
 # Ground, 200 N/mm, node 4, 100 N/mm, node 7, 50 N/mm, node 9, along x; masses of 2, 1 and 0.5 kg.
 
@@ -77,7 +77,7 @@ FILES = {"k.mtx": STIFFNESS, "m.mtx": MASS, "middle.mtx": MIDDLE, "rows.dof": "4
 
 
 def write_chain(folder: Path, changes: dict[str, FloatArray | str] | None = None) -> Path:
-    """The chain in MatrixMarket files, with whole files or texts in its structure file exchanged."""
+    """The chain in MatrixMarket files; files and texts of its structure file can be exchanged."""
     changes = changes or {}
     for name, content in (FILES | {name: changes[name] for name in FILES.keys() & changes}).items():
         if isinstance(content, str):
@@ -97,7 +97,7 @@ def chain(tmp_path: Path):
 
 
 def test_a_chain_answers_as_by_hand(chain):
-    """Forces over springs: extensions add up; e = 2 is nominal, z1 takes from the middle spring alone."""
+    """Extensions of springs add up; e = 2 is nominal, z1 takes from the middle spring alone."""
     structure = chain()
     found = static_responses(structure)
     assert found["push"].output == pytest.approx([-1e-3 * (1 / 200 + 1 / 100 + 1 / 50)], rel=1e-12)
@@ -119,10 +119,15 @@ def test_a_chain_answers_as_by_hand(chain):
     )
 
 
-FORMATS = {  # in `inputs/chain` one of each two entries that mirror each other stands, on either side
-    "npz": "{0}.npz", "arrays": "{0}_all.npz:{0}", "table": "{0}.sti", "symmetric market": "half_{0}.mtx",
-    "abaqus": "{0}_STIF1.mtx", "dmig": "all.pch:{1}AAX",
-}  # fmt: skip
+# In `inputs/chain` stands one of each two entries that mirror each other, on either side.
+FORMATS = {
+    "npz": "{0}.npz",
+    "arrays": "{0}_all.npz:{0}",
+    "table": "{0}.sti",
+    "symmetric market": "half_{0}.mtx",
+    "abaqus": "{0}_STIF1.mtx",
+    "dmig": "all.pch:{1}AAX",
+}
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -143,7 +148,7 @@ def test_every_format_is_the_same_structure(kind, chain, tmp_path):
 
 
 def test_other_ways_to_say_the_same(chain, tmp_path):
-    """A whole as a sum, a part as a difference, vectors in the order of the rows or by node and component."""
+    """A whole as a sum, a part as a difference, vectors by rows or by node and component."""
     wanted = chain()
     for name, matrix in (("rest", STIFFNESS - MIDDLE), ("soft", STIFFNESS - 0.75 * MIDDLE)):
         io.mmwrite(tmp_path / f"{name}.mtx", sparse.coo_array(matrix))
@@ -151,14 +156,16 @@ def test_other_ways_to_say_the_same(chain, tmp_path):
     (tmp_path / "gauge.csv").write_text("4, 1, -0.05\n7, 1, 0.05\n")
     np.save(tmp_path / "end.npy", np.array([0.0, 0.0, -1.0]))
     io.mmwrite(tmp_path / "pump.mtx", sparse.coo_array(np.diag([0.0, 1e-3, 0.0])))
-    found = chain({
-        '"k.mtx"': '["rest.mtx", "middle.mtx"]',
-        'matrix = "middle.mtx"': 'changed = "soft.mtx"\ntimes = 0.25',
-        "node = 9\nforce = [1, 0, 0]": 'vector = "push.txt"',
-        "nodes = [4, 7]\ndirection = [1, 0, 0]\nlength = 20": 'vector = "gauge.csv"',
-        "node = 9\ndirection = [-3, 0, 0]": 'vector = "end.npy"',
-        "node = 7\nmass": 'matrix = "pump.mtx"\nmass',
-    })  # fmt: skip
+    found = chain(
+        {
+            '"k.mtx"': '["rest.mtx", "middle.mtx"]',
+            'matrix = "middle.mtx"': 'changed = "soft.mtx"\ntimes = 0.25',
+            "node = 9\nforce = [1, 0, 0]": 'vector = "push.txt"',
+            "nodes = [4, 7]\ndirection = [1, 0, 0]\nlength = 20": 'vector = "gauge.csv"',
+            "node = 9\ndirection = [-3, 0, 0]": 'vector = "end.npy"',
+            "node = 7\nmass": 'matrix = "pump.mtx"\nmass',
+        }
+    )
     values = {"e": 1.9, "z1": 0.3}
     ours, theirs = (
         structure.system_at(values).stiffness.toarray() for structure in (found, wanted)
@@ -174,7 +181,7 @@ def test_other_ways_to_say_the_same(chain, tmp_path):
 
 
 def test_a_support_holds_what_the_matrices_leave_free(chain):
-    """A free chain is told which motion is free; held at its first node it is a spring and a mass."""
+    """A free chain is told which motion is free; one that is held is a spring and a mass."""
     free: dict[str, FloatArray | str] = {"k.mtx": STIFFNESS - np.diag([200.0, 0.0, 0.0])}
     words = r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
     with refused(FiniteElementError, words):

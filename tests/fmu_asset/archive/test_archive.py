@@ -1,4 +1,4 @@
-"""Files that are no FMU, broken, dangerous or of another kind: a clear sentence each; what checks say."""
+"""Files that are no FMU, broken, dangerous or of another kind; what checks say."""
 
 import re
 import stat
@@ -164,7 +164,7 @@ def test_a_binary_of_another_name_is_told_by_its_name(foreign_fmu, tmp_path) -> 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_damaged_file_is_refused_or_read(fmu, tmp_path_factory, data) -> None:
-    """Cut anywhere or with any byte changed, the file gives an FmuError or a description, nothing else."""
+    """A file that is cut or has a changed byte gives an FmuError or a description, nothing else."""
     content = bytearray(fmu.read_bytes())
     if data.draw(st.booleans()):
         content = content[: data.draw(st.integers(0, len(content) - 1))]
@@ -181,7 +181,7 @@ def test_a_damaged_file_is_refused_or_read(fmu, tmp_path_factory, data) -> None:
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_a_description_with_one_odd_attribute(foreign_fmu, tmp_path_factory, data) -> None:
-    """Whatever one attribute says, or if it is missing: a description and a draft, or one sentence."""
+    """Whatever one attribute says, there is a description and a draft, or one sentence."""
     model = data.draw(st.sampled_from(["lag1", "room2", "array3", "swing3", "ball2"]))
     contents = members(foreign_fmu(model))
     text = contents[DESCRIPTION].decode()
@@ -244,7 +244,7 @@ def test_one_fault_is_one_problem(foreign_fmu, what, check, sentence) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_eighty_instances_in_one_process(foreign_fmu) -> None:
-    """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""
+    """The process does not grow while instances come and go; a leak of 256 KiB is found."""
     for what, cycles, verdict, sentence in (
         ((), 80, "ok", ""),
         (("LEAK_IN_FREE",), 60, "problem", "it leaks"),
