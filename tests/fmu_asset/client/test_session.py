@@ -5,7 +5,7 @@ A start is a start: a reset that does nothing is not believed.
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,10 +35,9 @@ def test_what_does_not_fit_the_fmu_is_one_sentence(
     fmu, foreign_fmu, name, changes, tables, kind, sentence
 ):
     path = fmu if name == "uav_wing" else foreign_fmu.changed(name, "other", *changes)
-    binding = changed(BINDINGS[name], **tables)
 
     with pytest.raises(getattr(errors, kind), match=sentence):
-        FmiAsset(path, binding)
+        FmiAsset(path, changed(BINDINGS[name], **tables))
 
 
 @pytest.mark.parametrize(("parameters", "kind", "sentence"), INPUTS["parameters"])
@@ -465,59 +464,68 @@ ENDING_MODELS = {
 """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
 
 
-@pytest.fixture(params=ENDING_MODELS)
-def open_ending(request, foreign_fmu, isolated) -> Callable[[], FmiAsset]:
-    """A function that opens the FMU of an ending model."""
+@dataclass(frozen=True)
+class EndingAsset:
+    """An asset whose FMU ends its simulation; each test resets it."""
+
+    model: EndingModel
+    asset: FmiAsset
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["worker", "in process"])
+def ending_in_worker(request) -> bool:
+    return bool(request.param)
+
+
+@pytest.fixture(scope="module", params=ENDING_MODELS)
+def ending(request, foreign_fmu, ending_in_worker) -> Iterator[EndingAsset]:
     model = ENDING_MODELS[request.param]
     roles = {"control": {"u": ("u", "m/s")}} if request.param == "hostile2" else {}
     binding = bound(model.step_size, {"y": (model.output, model.unit)}, **roles)
     path = foreign_fmu(request.param, "ENDS")
-    return lambda: FmiAsset(path, binding, isolated=isolated)
+    with FmiAsset(path, binding, isolated=ending_in_worker) as asset:
+        yield EndingAsset(model, asset)
 
 
-@pytest.fixture
-def ending(request) -> EndingModel:
-    return ENDING_MODELS[request.node.callspec.params["open_ending"]]
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(ending):
+    model = ending.model
+    steps = model.step_size * np.arange(1, model.whole_steps + 1)
+    ending.asset.reset()
+
+    history = ending.asset.simulate(steps=50)
+
+    assert f"ended at t = {model.end:g} s" in history.ended
+    np.testing.assert_allclose(history.time, [*steps, model.end], rtol=1e-6)
+    assert history.values[-1, 0] == pytest.approx(model.last_value, abs=1e-5)
 
 
-def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(open_ending, ending):
-    steps = ending.step_size * np.arange(1, ending.whole_steps + 1)
+def test_an_fmu_that_has_ended_its_simulation_can_be_reset(ending):
+    ending.asset.reset()
+    history = ending.asset.simulate(steps=50)
+    with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
+        ending.asset.step()
 
-    with open_ending() as asset:
-        history = asset.simulate(steps=50)
+    ending.asset.reset()
+    ending.asset.step()
+    remaining = ending.asset.simulate(steps=50)
 
-    assert f"ended at t = {ending.end:g} s" in history.ended
-    np.testing.assert_allclose(history.time, [*steps, ending.end], rtol=1e-6)
-    assert history.values[-1, 0] == pytest.approx(ending.last_value, abs=1e-5)
+    np.testing.assert_allclose(remaining.time, history.time[1:], rtol=1e-12)
 
 
-def test_an_fmu_that_has_ended_its_simulation_can_be_reset(open_ending):
-    with open_ending() as asset:
-        history = asset.simulate(steps=50)
-        with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
-            asset.step()
+def test_an_fmu_ends_its_simulation_in_single_steps_as_in_a_run(ending):
+    asset = ending.asset
+    asset.reset()
+    (values_of_run,) = asset.simulate(steps=50).values.T
+    asset.reset()
 
-        asset.reset()
+    values = [asset.step().values[0] for _ in range(ending.model.whole_steps)]
+    sentence = "asked to end the simulation in the step"
+    with pytest.raises(errors.FmuEndedError, match=sentence) as caught:
         asset.step()
-        remaining = asset.simulate(steps=50).time
+    values.append(asset.observe().values[0])
 
-    np.testing.assert_allclose(remaining, history.time[1:], rtol=1e-12)
-
-
-def test_an_fmu_ends_its_simulation_in_single_steps_as_in_a_run(open_ending, ending):
-    with open_ending() as asset:
-        values_of_run = asset.simulate(steps=50).values[:, 0].tolist()
-        asset.reset()
-
-        values = [asset.step().values[0] for _ in range(ending.whole_steps)]
-        with pytest.raises(
-            errors.FmuEndedError, match="asked to end the simulation in the step"
-        ) as caught:
-            asset.step()
-        values.append(asset.observe().values[0])
-
-    assert values == values_of_run
-    assert caught.value.time == pytest.approx(ending.end, rel=1e-6)
+    assert values == values_of_run.tolist()
+    assert caught.value.time == pytest.approx(ending.model.end, rel=1e-6)
 
 
 # ---------------------------------------------------------------------- ports

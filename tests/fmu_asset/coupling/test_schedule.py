@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from fmu_asset.coupling.schedule import algebraic_loops, schedule, strong_components
+from fmu_asset.coupling.schedule import Schedule, algebraic_loops, schedule, strong_components
 from fmu_asset.coupling.structure import Connection, Endpoint
 
 NAMES = "abcd"
@@ -67,22 +67,24 @@ def depends_directly(connection: Connection, feedthrough) -> bool:
 @settings(max_examples=300)
 @given(connection_lists, feedthroughs)
 def test_the_order_puts_components_behind_what_they_depend_on_directly(connections, feedthrough):
-    """If there is such an order; each component stands once in the order and in the groups."""
+    """If there is such an order; connections against the order are held."""
     direct = [each for each in connections if depends_directly(each, feedthrough)]
 
     plan = schedule(NAMES, connections, feedthrough)
 
+    assert plan.order in (orders_that_keep(pairs_of(direct)) or ORDERS)
+    assert_complete(plan)
+    assert_held(plan, connections)
+
+
+def assert_complete(plan: Schedule) -> None:
+    """Assert that each component stands once in the order and in the groups."""
     assert sorted(plan.order) == sorted(NAMES)
     assert plan.order == tuple(name for group in plan.groups for name in group)
-    assert plan.order in (orders_that_keep(pairs_of(direct)) or ORDERS)
 
 
-@settings(max_examples=300)
-@given(connection_lists, feedthroughs)
-def test_connections_against_the_order_are_held(connections, feedthrough):
-    """There are none if some order follows all connections."""
-    plan = schedule(NAMES, connections, feedthrough)
-
+def assert_held(plan: Schedule, connections: list[Connection]) -> None:
+    """Assert that connections against the order are held; none if some order follows all."""
     rank = {name: number for number, name in enumerate(plan.order)}
     against_order = {
         each for each in connections if rank[each.source.component] >= rank[each.target.component]
