@@ -56,6 +56,7 @@ OUTPUTS = [name for name, _ in CHANNELS]
 GAUGES = slice(24)
 """Columns of the strains; the displacements of the tip and of the load point follow."""
 DISPLACEMENTS = slice(24, 26)
+ALL_OUTPUTS = slice(26)
 
 
 def patch_file(effects: Mapping[str, Sequence[Any]] = SENSOR_EFFECTS) -> bytes:
@@ -366,7 +367,7 @@ class Flown:
     parameters: dict[str, float]
     course: dict[str, Any]
     health: FloatArray
-    columns: slice = slice(26)
+    columns: slice
     shows_start: bool = False
 
     @property
@@ -391,6 +392,7 @@ def ringdown(patch: ModelPatch, naming_side: WingModel) -> Flown:
         parameters={"response": 2.0, "release": 0.03},
         course={"steps": 30},
         health=health,
+        columns=ALL_OUTPUTS,
         shows_start=True,
     )
 
@@ -407,6 +409,7 @@ def static_test() -> Flown:
         parameters={},
         course={"load": {"tip_force": FORCES, "temperature": temperature}},
         health=np.zeros((1, 2)),
+        columns=ALL_OUTPUTS,
     )
 
 
