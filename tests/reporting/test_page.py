@@ -10,6 +10,13 @@ import pytest
 from reporting import figures
 from reporting.errors import InvalidFigureError
 from reporting.page import Page, PageColumn, Table, Words, script_source
+from reporting.record_table import (
+    TitledTable,
+    add_titled_table,
+    number_cells,
+    table_of_records,
+    text_cells,
+)
 
 VOID_TAGS = {"meta", "br", "link", "img"}
 
@@ -199,42 +206,43 @@ def test_a_row_with_too_few_cells_is_refused():
         Table((PageColumn("a"), PageColumn("b")), [("1", "2"), ("3",)])
 
 
-# ---------------------------------------------------------------- tables of words
+# ---------------------------------------------------------------- tables of records and words
 
 
-@pytest.fixture
-def words():
-    """A table with a column of names, a column of numbers, and one for long pages only."""
-    words = Words("twin_master.report", half=0.5)
-    columns = [
-        {"text": "name", "cell": "{{ row }}"},
-        {"number": "{{ what }}", "unit": "m", "cell": "{{ half }}"},
-        {"text": "more", "cell": "x", "when": "long"},
-    ]
-    rows = [["{{ what }}", "1"], ["none", ""]]
+def test_a_table_of_records_has_a_row_for_each_and_units_of_numbers():
+    columns = [text_cells("name", lambda length: f"rod {length}"), number_cells("length", str, "m")]
+
+    table = table_of_records(columns, [1, 2])
+
+    assert table.columns == [PageColumn("name"), PageColumn("length", "m", numeric=True)]
+    assert table.rows == [["rod 1", "1"], ["rod 2", "2"]]
+
+
+def test_a_table_without_rows_is_left_out_of_a_page():
+    page = Page("Empty table")
+
+    add_titled_table(page, TitledTable(Table([PageColumn("name")], []), "Rods", "None was found."))
+
+    assert "Rods" not in page.render()
+
+
+def test_words_fill_the_fields_of_headings_and_captions():
+    words = Words("twin_master.report")
     words.content = {
         "tables": {
-            "columns": {"columns": columns},
-            "rows": {"columns": ["item", "value"], "rows": rows},
+            "rods": {
+                "title": "Rods of {{ asset }}",
+                "caption": "Measured.",
+                "columns": ["name", {"number": "{{ what }}", "unit": "m"}],
+            }
         }
     }
-    return words
+    page = Page("Rods")
 
+    words.add_table(
+        page, "rods", [["a", "0.5", "x"]], more=[PageColumn("mark")], asset="frame", what="length"
+    )
 
-def test_words_give_cells_and_units(words):
-    columns, rows = words.table("columns", ["a"], what="length", long=False)
-
-    assert columns == [PageColumn("name"), PageColumn("length", "m", numeric=True)]
-    assert rows == [["a", "0.5"]]
-
-
-def test_words_give_columns_under_a_condition(words):
-    _, rows = words.table("columns", ["a"], what="length", long=True)
-
-    assert rows == [["a", "0.5", "x"]]
-
-
-def test_words_give_rows_before_those_of_a_call_and_leave_out_empty_ones(words):
-    _, rows = words.table("rows", [["b", "2"]], what="length")
-
-    assert rows == [["length", "1"], ["b", "2"]]
+    text = page.render()
+    assert "Rods of frame" in text
+    assert re.findall(r"<th[^>]*>([^<]+)<", text) == ["name", "length", "mark"]
