@@ -42,7 +42,8 @@ def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float)
     """
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 0.0, 1.0)
     a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
-    polynomial = a0 * np.sqrt(xi) + xi * (a1 + xi * (a2 + xi * (a3 + xi * a4)))
+    cubic = a1 + xi * (a2 + xi * (a3 + xi * a4))
+    polynomial = a0 * np.sqrt(xi) + xi * cubic
     return np.asarray(5.0 * thickness_ratio * polynomial)
 
 
@@ -50,7 +51,9 @@ def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> Float
     """Return the slope of the upper surface, the derivative of `four_digit_half_thickness`."""
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 1e-6, 1.0)
     a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
-    derivative = 0.5 * a0 / np.sqrt(xi) + a1 + xi * (2.0 * a2 + xi * (3.0 * a3 + 4.0 * xi * a4))
+    slope_of_root = 0.5 * a0 / np.sqrt(xi)
+    quadratic = 2.0 * a2 + xi * (3.0 * a3 + 4.0 * xi * a4)
+    derivative = slope_of_root + a1 + xi * quadratic
     return np.asarray(5.0 * thickness_ratio * derivative)
 
 
@@ -77,7 +80,8 @@ class Planform(DesignSection):
 
     def chord(self, station: _Numbers) -> _Numbers:
         """Return the chord (...,) [m] at fractions (...,) of the semi-span."""
-        return self.root_chord + (self.tip_chord - self.root_chord) * station
+        taper = self.tip_chord - self.root_chord
+        return self.root_chord + taper * station
 
 
 class Airfoil(DesignSection):
@@ -364,8 +368,10 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
         Lift per length over total lift [1/m].
     """
     eta = np.asarray(station, dtype=float)
-    trapezoid = 2.0 * planform.chord(eta) / (planform.root_chord + planform.tip_chord)
-    ellipse = 4.0 / np.pi * np.sqrt(np.clip(1.0 - eta**2, 0.0, None))
+    chord_sum = planform.root_chord + planform.tip_chord
+    trapezoid = 2.0 * planform.chord(eta) / chord_sum
+    circle = np.sqrt(np.clip(1.0 - eta**2, 0.0, None))
+    ellipse = 4.0 / np.pi * circle
     return np.asarray(0.5 * (trapezoid + ellipse) / planform.semi_span)
 
 
@@ -395,13 +401,18 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
     n = 2.0 * np.arange(terms) + 1.0
     chord = planform.chord(np.cos(theta))
     mu = chord * 2.0 * np.pi / (8.0 * planform.semi_span)
-    sine = np.sin(np.outer(theta, n))
-    system = sine * (n * mu[:, None] + np.sin(theta)[:, None])
-    amplitude = np.linalg.solve(system, mu * np.sin(theta))
+    sine_of_theta = np.sin(theta)
+    harmonics = np.sin(np.outer(theta, n))
+    system = harmonics * (n * mu[:, np.newaxis] + sine_of_theta[:, np.newaxis])
+    amplitude = np.linalg.solve(system, mu * sine_of_theta)
     # Only n = 1 contributes to the integral over the half-wing, A_1 pi/4 times the semi-span.
-    scale = 1.0 / (amplitude[0] * np.pi / 4.0 * planform.semi_span)
-    angle = np.arccos(np.clip(np.asarray(station, dtype=float), 0.0, 1.0))
-    return np.asarray(scale * np.tensordot(np.sin(angle[..., None] * n), amplitude, axes=1))
+    integral = amplitude[0] * np.pi / 4.0 * planform.semi_span
+    # the circulation at the stations
+    fraction = np.clip(np.asarray(station, dtype=float), 0.0, 1.0)
+    angle = np.arccos(fraction)
+    harmonics_at_stations = np.sin(angle[..., np.newaxis] * n)
+    circulation = np.tensordot(harmonics_at_stations, amplitude, axes=1)
+    return np.asarray(1.0 / integral * circulation)
 
 
 DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}

@@ -121,7 +121,9 @@ def _add_flown_fleet(
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
     figures = {name: group_figures(group) for name, group in groups.items()}
-    WORDS.add_table(page, "fared", figure_rows(figures), more=list(figures))
+    WORDS.add_table(
+        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
+    )
     status = np.concatenate([group["status"].values for group in groups.values()])
     failures = endings_of(folder).failures
     if failures:
