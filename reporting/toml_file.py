@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self, TypeAlias, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from reporting.choices import did_you_mean
+from reporting.choices import nearest_word
 from reporting.known_keys import known_keys
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 from reporting.words import counted, is_or_are, listing, small
@@ -385,9 +385,11 @@ def _unknown_keys_message(
     if len(keys) > 1:
         return f"{listing(keys)} are not keys of {what}; remove them or correct their spelling"
     *table_location, key = faults[0]["loc"]
-    question = did_you_mean(str(key), known_keys(model, tuple(table_location)))
-    if question:
-        return f"{keys[0]} is not a key of {what}.{question}"
+    # A key that a record has, but no file, is known; it must not be proposed in its own place.
+    other_keys = {*known_keys(model, tuple(table_location))} - {key}
+    nearest_key = nearest_word(str(key), sorted(other_keys))
+    if nearest_key is not None:
+        return f"{keys[0]} is not a key of {what}; the nearest is `{nearest_key}`"
     return f"{keys[0]} is not a key of {what}; remove it or correct its spelling"
 
 
@@ -416,8 +418,8 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
     message = f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
     if kind in _WORD_TYPES and isinstance(fault["input"], str):
         words = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
-        question = did_you_mean(fault["input"], words)
-        return f"{message}.{question}" if question else message
+        word = nearest_word(fault["input"], words)
+        return message if word is None else f"{message}; the nearest is {word!r}"
     return message
 
 

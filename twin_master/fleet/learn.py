@@ -38,7 +38,7 @@ from twin_master.fleet.posterior import (
 )
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.store import open_group
-from twin_master.fleet.store_layout import observation_rows
+from twin_master.fleet.store_layout import observation_rows, stored_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
@@ -330,7 +330,7 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
 def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
     observed = observation_rows(group, flown[0].knowledge.scenario)
-    control = group["observed/control_index"].values.astype(np.int64)
+    control = stored_values(group, "observed/control_index").astype(np.int64)
     # Steps that were not flown have the control -1. They have no observations, so that the
     # evidence does not depend on their control: the first control takes its place.
     control = np.maximum(control, 0)
@@ -341,7 +341,7 @@ def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> lis
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
     """Return the controls under which a twin in the rows has flown a step that is not its last."""
-    control = group["observed/control_index"].values.astype(np.int64)[rows]
+    control = stored_values(group, "observed/control_index").astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
 

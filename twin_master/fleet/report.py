@@ -31,7 +31,7 @@ from twin_master.fleet.reading import (
 )
 from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
 from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows, open_group
-from twin_master.fleet.store_layout import NOTICE_KINDS
+from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
 from twin_master.fleet.watched_asset import counts_of, read_standing
 from twin_master.report.reading import PrintedFactor, printed_factors
 
@@ -125,7 +125,7 @@ def _add_flown_fleet(
     WORDS.add_table(
         page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
     )
-    status = np.concatenate([group["status"].values for group in groups.values()])
+    status = np.concatenate([stored_values(group, "status") for group in groups.values()])
     failures = endings_of(folder).failures
     if failures:
         page.add_notice(
@@ -145,7 +145,7 @@ def _add_flown_fleet(
         leaving = _leaving_or_explanation(page, folder, record, group)
         if leaving is not None:
             standing = replace(standing, leaving=leaving)
-        failed = int(np.sum(group["status"].values == FAILED))
+        failed = int(np.sum(stored_values(group, "status") == FAILED))
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
         _add_attention_table(page, standing, most_assets)
@@ -164,7 +164,7 @@ def _leaving_or_explanation(
     except TwinMasterError as error:
         page.add_paragraph(in_one_line(f"Who leaves its control soon is not known: {error}"))
         return None
-    return probabilities[flown_rows(group["status"].values)]
+    return probabilities[flown_rows(stored_values(group, "status"))]
 
 
 def _opening(standings: Sequence[Standing], groups: "Sequence[xr.DataTree]") -> str:
@@ -184,7 +184,7 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the number of assets with an alarm and the first step of one; empty without alarms."""
     alarm_column = NOTICE_KINDS.index("alarm")
     first_alarm = np.concatenate(
-        [group["notice/first_step"].values[:, alarm_column] for group in groups]
+        [stored_values(group, "notice/first_step")[:, alarm_column] for group in groups]
     )
     steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
     if not len(steps):
@@ -194,7 +194,7 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
 
 def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
-    delay = np.concatenate([group["delay"].values for group in groups])
+    delay = np.concatenate([stored_values(group, "delay") for group in groups])
     called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
     if not len(called_for_delays):
         return ""
@@ -291,10 +291,10 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
     """Add the figure of the assets' states over time, if any step has an estimated state."""
-    flown = flown_rows(group["status"].values)
+    flown = flown_rows(stored_values(group, "status"))
     mean = believed_means(group)[flown]
     if standing.names and not np.isnan(mean).all():
-        figure = course_figure(standing.scenario, mean, group["truth/state"].values[flown])
+        figure = course_figure(standing.scenario, mean, stored_values(group, "truth/state")[flown])
         page.add_report_figure(WORDS.figure("course", figure))
 
 

@@ -12,6 +12,7 @@ from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject, JsonRecord
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
 from twin_master.fleet.store import flown_rows
+from twin_master.fleet.store_layout import stored_values
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -82,10 +83,10 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
     """
     # All scenarios of a group come from one scenario file, with equal states and controls.
     scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = flown_rows(group["status"].values)
+    flown = flown_rows(stored_values(group, "status"))
     last_step = last_steps(group)[flown]
     at_last_step = (flown, last_step)
-    last_control = group["observed/control_index"].values[at_last_step]
+    last_control = stored_values(group, "observed/control_index")[at_last_step]
     names = [name for name, _seed, _scenario_number in record["members"]]
     return Standing(
         group=record["name"],
@@ -93,7 +94,7 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
         names=[names[row] for row in flown],
         step=last_step,
         mean=believed_means(group)[at_last_step],
-        deviation=group["filtered/standard_deviation"].values[at_last_step],
+        deviation=stored_values(group, "filtered/standard_deviation")[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm")[flown],
         leaving=np.full(len(flown), np.nan),
