@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from discrepancy.campaign.reading import read_campaign as read_campaign
     from discrepancy.files.verdict import read_verdict as read_verdict
     from discrepancy.model_choice import load_model as load_model
+    from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
     from discrepancy.workflow import investigate as investigate
     from fe.reduction.model_cache import reduced_model as reduced_model
     from fe.structure.affine import natural_frequencies as natural_frequencies
@@ -33,6 +34,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
     from twin_master.fleet.flight import fly_fleet as fly_fleet
     from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
+    from twin_master.fleet.plan import ensemble as ensemble
     from twin_master.fleet.reading import open_fleet as open_fleet
     from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin as prepare_twin
@@ -60,6 +62,7 @@ _HOMES = {
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict",
     "load_model": "discrepancy.model_choice",
+    "calibrate_parameters": "discrepancy.parameters.calibration",
     "investigate": "discrepancy.workflow",
     "reduced_model": "fe.reduction.model_cache",
     "natural_frequencies": "fe.structure.affine",
@@ -75,6 +78,7 @@ _HOMES = {
     "ScenarioEnvironment": "twin_master.environment",
     "fly_fleet": "twin_master.fleet.flight",
     "learn_from_fleet": "twin_master.fleet.learn",
+    "ensemble": "twin_master.fleet.plan",
     "open_fleet": "twin_master.fleet.reading",
     "WatchfulEstimator": "twin_master.learning.monitor",
     "prepare_twin": "twin_master.mission.preparation",
@@ -100,7 +104,8 @@ __all__ = list(_HOMES)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    """Return the public names, so that completion in a notebook offers nothing else."""
+    return sorted(__all__)
 
 
 if not TYPE_CHECKING:  # so that type checkers report names that do not exist
