@@ -106,11 +106,11 @@ class RenderedBlock(NamedTuple):
 
     Attributes
     ----------
-    kind : {"say", "notice", "table", "figure", "highlights"}
+    kind : {"say", "card", "notice", "table", "figure", "highlights", "fold", "end of fold"}
         What the block is.
     content : object
-        A text (say, notice), the name of a table and the `Table`, the name of a figure, or pairs of
-        a value and its meaning (highlights).
+        A text (say, card, notice, and the title of a fold), the name of a table and the `Table`,
+        the name of a figure, or pairs of a value and its meaning (highlights).
     """
 
     kind: str
@@ -205,6 +205,8 @@ class Words:
           the `row`;
         - `table`: the name of a table of this file, with the rows `of` and the columns `more`;
         - `figure`: the name of one of the value `figures`;
+        - `card`: the one sentence that a reader must know;
+        - `fold`: the title of `blocks` that are shown on demand;
         - `highlights`: pairs of a value and its meaning;
 
         and perhaps `when`, an expression: the block is left out where that is false.
@@ -220,6 +222,12 @@ class Words:
                     yield RenderedBlock("figure", block["figure"])
             elif "highlights" in block:
                 yield RenderedBlock("highlights", _highlights(block["highlights"], values))
+            elif "fold" in block:
+                inner_blocks = list(self.rendered_blocks(block["blocks"], **values))
+                if inner_blocks:
+                    yield RenderedBlock("fold", fill_template(block["fold"], **values))
+                    yield from inner_blocks
+                    yield RenderedBlock("end of fold", "")
             else:
                 yield from _text_blocks(block, values)
 
@@ -261,6 +269,12 @@ class Words:
                     page.add_highlights(content)
                 elif kind == "notice":
                     page.add_notice(in_one_line(content))
+                elif kind == "card":
+                    page.add_card(in_one_line(content))
+                elif kind == "fold":
+                    page.begin_fold(content)
+                elif kind == "end of fold":
+                    page.end_fold()
                 else:
                     page.add_paragraph(in_one_line(content))
 
@@ -320,7 +334,7 @@ def _highlights(
 
 def _text_blocks(block: Mapping[str, Any], values: Mapping[str, object]) -> Iterator[RenderedBlock]:
     """Yield the text of a block once, or once for each entry of its expression `of`."""
-    kind = "notice" if "notice" in block else "say"
+    kind = next(kind for kind in ("notice", "card", "say") if kind in block)
     rows = evaluated(block["of"], **values) if "of" in block else [None]
     if rows is None:
         rows = [None]
@@ -374,6 +388,18 @@ class Page:
         """Add a paragraph that the reader must not overlook."""
         self._add("notice", text=text)
 
+    def add_card(self, text: str) -> None:
+        """Add the one sentence of the page that a reader must know, in large print."""
+        self._add("card", text=text)
+
+    def begin_fold(self, title: str) -> None:
+        """Begin a part that the reader unfolds on demand; `end_fold` ends it."""
+        self._add("fold", title=title)
+
+    def end_fold(self) -> None:
+        """End the part that `begin_fold` has begun."""
+        self._add("end of fold")
+
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
         """Add a row of a few values in large print, each with its meaning."""
         self._add("highlights", items=items)
@@ -399,8 +425,16 @@ class Page:
         from reporting.figures import inline_svg
 
         number = self._next_number("figure")
-        drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
-        self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+        drawing = inline_svg(svg, prefix=f"f{number}", description=title)
+        self._add(
+            "figure",
+            number=number,
+            drawing=Markup(drawing.full),
+            tiles=[Markup(tile) for tile in drawing.tiles],
+            is_wide=drawing.is_wide,
+            title=title,
+            caption=caption,
+        )
         return number
 
     def add_report_figure(self, figure: ReportFigure) -> int:

@@ -295,15 +295,17 @@ def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
 
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
+    from twin_master.store.printed_figures import printed_figures
+
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    for figure in outcome.figures:
-        reference = printed_value(figure.reference, figure.unit)
+    for figure, printed in zip(outcome.figures, printed_figures(outcome.figures), strict=True):
+        reference = f"{printed.reference} {figure.unit}".strip() if printed.reference else ""
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
-        value = printed_value(figure.value, figure.unit, missing="none")
+        value = "none" if figure.value is None else f"{printed.value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
-    terminal.print_table(["figure", "this run", "reference"], rows + _timing_rows(outcome))
+    terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
     terminal.say(f"The twin {outcome.control}.")
     if outcome.origin.differ:
         terminal.say(

@@ -454,7 +454,7 @@ def _print_figures(figures: Figures) -> None:
 
     rows = figure_rows(figures)
     if rows:
-        terminal.print_table(["figure (SI)", *figures], rows)
+        terminal.print_table(["result", *figures], rows)
 
 
 _POLLING_INTERVAL = 0.05

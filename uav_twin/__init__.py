@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from discrepancy.files.verdict import read_verdict as read_verdict
     from discrepancy.model_choice import load_model as load_model
     from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
+    from discrepancy.pictures import plot_missing_force as plot_missing_force
     from discrepancy.workflow import investigate as investigate
     from fe.reduction.model_cache import reduced_model as reduced_model
     from fe.structure.affine import natural_frequencies as natural_frequencies
@@ -46,6 +47,8 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.network.planner import value_iteration as value_iteration
     from twin_master.network.sensor_model import GaussianSensorModel as GaussianSensorModel
     from twin_master.network.twin import Twin as Twin
+    from twin_master.pictures import plot_belief as plot_belief
+    from twin_master.pictures import plot_residuals as plot_residuals
     from twin_master.report.page import report_figures as report_figures
     from twin_master.report.page import write_report as write_report
     from twin_master.scenario.reading import load_scenario as load_scenario
@@ -63,6 +66,7 @@ _HOMES = {
     "read_verdict": "discrepancy.files.verdict",
     "load_model": "discrepancy.model_choice",
     "calibrate_parameters": "discrepancy.parameters.calibration",
+    "plot_missing_force": "discrepancy.pictures",
     "investigate": "discrepancy.workflow",
     "reduced_model": "fe.reduction.model_cache",
     "natural_frequencies": "fe.structure.affine",
@@ -90,6 +94,8 @@ _HOMES = {
     "value_iteration": "twin_master.network.planner",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "Twin": "twin_master.network.twin",
+    "plot_belief": "twin_master.pictures",
+    "plot_residuals": "twin_master.pictures",
     "report_figures": "twin_master.report.page",
     "write_report": "twin_master.report.page",
     "load_scenario": "twin_master.scenario.reading",

@@ -139,10 +139,6 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         page.add_notice(sentence)
     if not result.findings:
         page.add_paragraph(WORDS.say("agreed"))
-    procedure = PROCEDURES[result.procedure]
-    WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
-    for line in correlation_lines(result):
-        page.add_paragraph(f"{line}.")
     parameter_columns, titles = drawn_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
@@ -150,15 +146,21 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     add_figure(page, WORDS.figure("posterior", posterior_figure), folder)
     both_figure = corner_figure(titles, [posterior_set, prior_set])
     add_figure(page, WORDS.figure("prior_and_posterior", both_figure), folder)
+    procedure = PROCEDURES[result.procedure]
+    WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
+    for line in correlation_lines(result):
+        page.add_paragraph(f"{line}.")
     page.add_section("What is left of the readings")
-    WORDS.add_table(page, "readings", result.readings, result=result)
     if result.readings:
         add_figure(page, WORDS.figure("readings", readings_figure(result)), folder)
+    WORDS.add_table(page, "readings", result.readings, result=result)
     WORDS.add_table(page, "channels", result.channels)
     return page
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
     """Add the last section, the origin of the calibration, to its page, and write the page."""
+    page.begin_fold("Where the calibration comes from")
     WORDS.add_table(page, "origin", result=result)
+    page.end_fold()
     atomic_write_text(folder / REPORT_NAME, page.render())

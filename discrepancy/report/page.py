@@ -8,7 +8,13 @@ from math import isfinite, nan
 from typing import Any
 
 from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
+from discrepancy.judgement.closed_share import NOMINAL_UNIT
+from discrepancy.judgement.conclusion import (
+    calibrated_parameters,
+    effects_text,
+    named_effects,
+    probability_text,
+)
 from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.report import text as words
 from discrepancy.report.decidability_text import (
@@ -23,7 +29,7 @@ from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.templates import fill_template
-from reporting.words import listing, plus_minus
+from reporting.words import capital, listing, plus_minus
 
 MOST_SHOWN_HYPOTHESES = 8
 """Most hypotheses in the table of evidence."""
@@ -130,14 +136,12 @@ def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]
     for title, template in WORDS.content["scores"].items():
         rows.append([title, *(fill_cell(template, score=score) for score in scores.values())])
     # rms of the residuals of each channel, in the unit in which it is drawn
-    channels = {} if investigation.before is None else investigation.before.channels
     names = dict.fromkeys(name for score in scores.values() for name in score.rms)
     for name in names:
-        factor, unit = 1.0, ""
-        if name in channels:
-            factor, unit = UNITS[channels[name].quantity].drawn
+        factor, unit = UNITS[investigation.campaign.channels[name].quantity].drawn
         cells = [words.number(factor * score.rms.get(name, nan)) for score in scores.values()]
-        rows.append([f"rms of {name}, {unit}", *cells])
+        shown_unit = "in its own unit" if unit == NOMINAL_UNIT else unit
+        rows.append([f"rms residual of {name.replace('_', ' ')} ({shown_unit})", *cells])
     return list(scores), rows
 
 
@@ -181,6 +185,29 @@ def missing_effects_text(verdict: Verdict) -> str:
     return listing(filter(None, phrases)) or "no name"
 
 
+def verdict_card(verdict: Verdict) -> str:
+    """Return the verdict in one line: what is missing, where, how large, and how sure that is.
+
+    The size is the missing force at its port or, if there is no such force, the first parameter of
+    a named effect with its 90 % interval.
+    """
+    opening = str(WORDS.content["opening"][verdict.kind])
+    clauses = [f"{capital(missing_effects_text(verdict))} {opening}"]
+    parameters = []
+    if verdict.kind in words.NAMING:
+        parameters = [item for effect in verdict.effects for item in effect.parameters]
+    if verdict.force is not None:
+        force = verdict.force
+        clauses.append(f"{words.number(force.rms)} {force.unit} (rms) at {force.port}")
+    elif parameters:
+        value, interval = words.estimate_text(parameters[0])
+        size = f"{words.parameter_text(parameters[0])} {value}"
+        clauses.append(f"{size} {words.unit_text(parameters[0].unit)}".rstrip() + f" ({interval})")
+    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        clauses.append(f"probability {probability_text(verdict.probability)}")
+    return f"{'; '.join(clauses)}."
+
+
 def sizes_sentence(content: ReportInput) -> str:
     """Return the sentence on the sizes of the named effects, in SI units or by their parameters."""
     investigation = content.investigation
@@ -222,6 +249,7 @@ FUNCTIONS = (
     score_rows,
     effect_rows,
     missing_effects_text,
+    verdict_card,
     sizes_sentence,
     deciding_gates,
     calibration_rows,

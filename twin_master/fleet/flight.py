@@ -19,6 +19,7 @@ from reporting.files import (
     write_members,
 )
 from reporting.json_file import read_json
+from reporting.notebook import html_table
 from reporting.progress import Progress, SilentProgress
 from reporting.words import listing
 from twin_master import run_folder
@@ -29,6 +30,7 @@ from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_fol
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.evidence import reason_transitions_are_fixed
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
+from twin_master.fleet.reading import figure_rows, group_figures, open_fleet
 from twin_master.fleet.shard import ShardResult, result_of_unflown
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
@@ -42,11 +44,13 @@ from twin_master.mission.parts import (
 from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.network.twin import build_graphical_model
+from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:
     import zarr
+    from matplotlib.axes import Axes
 
 RESULT_NAME = "fleet.json"
 """The file in the folder of a fleet that says how its flight ended."""
@@ -82,6 +86,27 @@ class FleetOutcome:
     seconds: float
     shards_flown: int
     shards_kept: int
+
+    def _repr_html_(self) -> str:
+        """Return how the twins of each group fared, for a notebook."""
+        figures = {name: group_figures(group) for name, group in open_fleet(self.folder).items()}
+        title = f"Fleet of {self.twins} twins in {self.folder}"
+        return html_table(title, ("result", *figures), figure_rows(figures))
+
+    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+        """Draw the believed states of all twins over the steps, with the median of the truth.
+
+        Parameters
+        ----------
+        axes : Axes or sequence of Axes, optional
+            A panel for each factor of the state of each group; new ones of pyplot by default.
+
+        Returns
+        -------
+        list of Axes
+            The panels.
+        """
+        return plot_courses(open_fleet(self.folder), axes)
 
 
 def fly_fleet(
