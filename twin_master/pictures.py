@@ -4,7 +4,7 @@ They are drawn from `run.nc` alone, so that they take whatever `open_run` return
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -53,18 +53,20 @@ def plot_belief(run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | Non
     from reporting import figures as style
 
     tree = _tree_of(run)
-    filtered = tree["filtered"]
+    filtered = tree["filtered"].to_dataset()
+    policy = tree["policy"].to_dataset()
+    truth = tree["truth"].to_dataset() if "truth" in tree.children else {}
     names = [str(name) for name in filtered["region"].values]
     steps = filtered["step"].values
     panels = new_panels(len(names), axes)
     for panel, name in zip(panels, names, strict=True):
-        scale, unit = printed_state(tree["policy"][name].attrs.get("units", "1"))
+        scale, unit = printed_state(policy[name].attrs.get("units", "1"))
         mean = scale * filtered["mean"].sel(region=name).values
         deviation = scale * filtered["standard_deviation"].sel(region=name).values
         style.band(panel, steps, mean - 2.0 * deviation, mean + 2.0 * deviation, style.PRESENT)
         panel.plot(steps, mean, color=style.PRESENT, label="believed, with two standard deviations")
-        if "truth" in tree.children and "state" in tree["truth"].data_vars:
-            true_state = scale * tree["truth"]["state"].sel(region=name).values
+        if "state" in truth:
+            true_state = scale * truth["state"].sel(region=name).values
             panel.plot(steps, true_state, **style.TRUTH_LINE, label="truth")
         panel.set_ylabel(f"{name} ({unit})")
     panels[0].legend(frameon=False)
@@ -92,7 +94,7 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     """
     from reporting import figures as style
 
-    residual = _tree_of(run)["filtered"]["residual"]
+    residual = _tree_of(run)["filtered"].to_dataset()["residual"]
     (panel,) = new_panels(1, axes)
     panel.set_facecolor("#c8c8c8")
     image = panel.pcolormesh(
@@ -164,11 +166,10 @@ def _tree_of(run: "xr.DataTree | HasTree") -> "xr.DataTree":
     TypeError
         If neither arrays nor the result of a run came.
     """
-    tree = getattr(run, "tree", run)
+    tree: object = getattr(run, "tree", run)
     if not hasattr(tree, "children"):
         raise TypeError(
             f"A run is needed, as `uav_twin.open_run` or `uav_twin.fly` returns it, and a "
             f"{type(run).__name__} came: open a folder with `uav_twin.open_run`."
         )
-    result: xr.DataTree = tree
-    return result
+    return cast("xr.DataTree", tree)

@@ -91,7 +91,8 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     places = [text.index(words) for words in opening]
     assert places == sorted(places)
     # one line says what is missing, where, how large and how sure that is; the others are unfolded
-    card = f"Quadratic aerodynamic damping at {force.port} is missing; {number(force.rms)} N (rms) at {force.port}"
+    size = f"{number(force.rms)} N (rms) at {force.port}"
+    card = f"Quadratic aerodynamic damping at {force.port} is missing; {size}"
     assert f'class="card">{card}; probability {probability_text(drag.verdict.probability)}.<' in text
     assert text.index('class="card"') < text.index("<details>") < places[0]
     assert f">{number(held.chi_square_per_sample)}<" in text
