@@ -9,7 +9,6 @@ import json
 import shlex
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
-from importlib import resources
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -20,6 +19,11 @@ from discrepancy.errors import VerdictFileError
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
+from reporting.format_schema import (
+    JsonSchema,
+    format_schema,
+    summary_of_class,
+)
 from reporting.json_file import plain as json_of
 from reporting.json_file import read_json
 from reporting.provenance import Provenance
@@ -28,15 +32,73 @@ PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in
 """Unit of every real parameter of every primitive (translational or rotational port: the first
 or second)."""
 
+_MEANING_OF_VALUE = {
+    "along_chord": "How much further aft the force acts.",
+    "along_span": "How much further outboard the force acts.",
+    "amplitude": "Change of the zero after `time`.",
+    "angle": "Angle by which the gauge is turned.",
+    "channel": 'Name of the channel, or "*" for all channels of `quantity`.',
+    "chi": "Exponent of the distribution of slip displacements.",
+    "coefficient": "Factor of the law.",
+    "compliance": "Rotation of the root for each unit of moment.",
+    "cosine": "Amplitude of the cosine.",
+    "damping_ratio": "Fraction of critical damping.",
+    "displacement_exponent": "Exponent of the displacement.",
+    "element_count": "Number of parallel elements.",
+    "exponent": "Exponent of the law.",
+    "force": "Formula of the force in the `time` of the trial.",
+    "fraction": "Additional fraction of the weight.",
+    "frequency": "Frequency.",
+    "gain": "Relative error of the gain.",
+    "half_width": "Half the width of the gap.",
+    "lag": "Time by which the reading is late.",
+    "length": "Length of the stretch.",
+    "level": "Speed, or value of the state, at which the law begins.",
+    "limit": "Largest reading.",
+    "logger": 'Name of the logger, or "*" for all.',
+    "loss": "Lost fraction of the stiffness.",
+    "mass": "Added mass.",
+    "offset": "Added reading; of a `channel_offset` a formula in the `time` of the trial.",
+    "order": "Order of the law or filter.",
+    "phase": "Phase of the sine.",
+    "port": "Name of the port.",
+    "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
+    "rate": "Relative change in each unit of time.",
+    "reference_displacement": "Displacement by which that of the law is divided.",
+    "reference_velocity": "Speed by which that of the law is divided.",
+    "run": "Label of the run.",
+    "side": "Sign of the displacement on which the law acts; 0 for both.",
+    "sine": "Amplitude of the sine.",
+    "slip_force": "Force at which all elements slip.",
+    "start": "Start of the stretch, as a distance from the root.",
+    "station": "Place, as a distance from the root.",
+    "stiffness": "Stiffness of the spring.",
+    "tare": "Added force.",
+    "time": "Time in which the zero moves by `amplitude`.",
+    "time_constant": "Time constant of the filter.",
+    "velocity_exponent": "Exponent of the speed.",
+    "wave_number": "Angle of the sine for each unit of displacement.",
+    "yield_displacement": "Displacement at which the law yields.",
+    "zero": "Error of the first time stamp.",
+}
+"""Meaning of each value of the primitives, by its name; the equation of a primitive says more."""
+
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
 _JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
-_SECONDS = {"type": ["number", "null"], "description": "[s]; null: open."}
+_NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
+_BEGIN = {
+    "type": ["number", "null"],
+    "description": "Begin in the time of the trial; null if it is open.",
+    "unit": "s",
+}
+_END = {**_BEGIN, "description": "End in the time of the trial; null if it is open."}
 _WINDOWS = {
     "type": "array",
-    "description": "It acts within these only: stretches of trials, in their time.",
+    "description": "Stretches of trials in which the primitive acts; without them it acts always.",
     "items": {
         "type": "object",
-        "properties": {"trial": {"type": "string"}, "begin": _SECONDS, "end": _SECONDS},
+        "description": "A stretch of a trial in which a primitive acts.",
+        "properties": {"trial": _NAME_OF_TRIAL, "begin": _BEGIN, "end": _END},
         "required": ["trial", "begin", "end"],
         "additionalProperties": False,
     },
@@ -65,15 +127,16 @@ def _patch(rows: object) -> ModelPatch:
 def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
     """Return the JSON Schema of one kind of primitive, from its own fields."""
     units = PRIMITIVE_UNITS[primitive.kind]
-    columns: dict[str, Any] = {"kind": {"const": primitive.kind, "type": "string"}}
+    kind_of_primitive = {"const": primitive.kind, "description": "Kind of the primitive."}
+    columns: dict[str, Any] = {"kind": kind_of_primitive}
     for name, kind in primitive.value_types().items():
-        columns[name] = {"type": _JSON_TYPES[kind]}
+        columns[name] = {"type": _JSON_TYPES[kind], "description": _MEANING_OF_VALUE[name]}
         if name in units:
-            columns[name]["description"] = f"[{units[name]}]"
+            columns[name]["unit"] = units[name]
     return {
         "type": "object",
         "title": primitive.__name__,
-        "description": (primitive.__doc__ or "").split("\n")[0],
+        "description": summary_of_class(primitive),
         "properties": {
             **columns,
             **({"windows": _WINDOWS} if primitive.can_act_in_windows else {}),
@@ -89,7 +152,6 @@ Number = Annotated[
     WithJsonSchema(
         {
             "anyOf": [{"type": "number"}, {"enum": ["Infinity", "-Infinity"]}, {"type": "null"}],
-            "description": "null: not a number, or not known.",
         }
     ),
 ]
@@ -146,23 +208,33 @@ class Origin:
         return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
-def shipped_schema(name: str) -> dict[str, Any]:
-    """Return the JSON Schema that is shipped for "verdict" or "patch".
+def document_schema(kind: type, schema: str) -> JsonSchema:
+    """Return the JSON Schema of a document: its record with the entries of its origin beside it.
 
-    Raises
-    ------
-    VerdictFileError
-        If there is none of that name.
+    Every key of a document is always there.
+
+    Parameters
+    ----------
+    kind : type
+        Class of the record, with an entry `origin`.
+    schema : str
+        Name of the schema, the value of the key `schema`.
     """
-    if name not in ("verdict", "patch"):
-        raise VerdictFileError(
-            f"There are JSON Schemas for verdict and patch, but not for {name!r}."
-        )
-    text = (
-        resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
-    )
-    schema: dict[str, Any] = json.loads(text)
-    return schema
+    content = format_schema(kind, schema)
+    definitions = content["$defs"]
+    keys_of_origin = definitions.pop("Origin")["properties"]
+    own_keys = {key: entry for key, entry in content["properties"].items() if key != "origin"}
+    for table in definitions.values():
+        if "properties" in table:
+            table |= {"required": list(table["properties"]), "additionalProperties": False}
+    name_of_schema = {"const": schema, "description": "Name and version of the format."}
+    properties = {"schema": name_of_schema, **keys_of_origin, **own_keys}
+    return {
+        **content,
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }
 
 
 def plain_data(value: Any) -> Any:

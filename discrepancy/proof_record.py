@@ -17,25 +17,26 @@ class Scores:
         Root mean square residual by channel [channel's unit].
     chi_square_per_sample : float
         Mean square residual over the variance of the noise, of channels with a noise record; nan
-        without one.
+        without one [1].
     log_score : float
-        Mean predictive log density of a sample, standardised by its noise.
+        Mean predictive log density of a sample, standardised by its noise [nat].
     coverage_50, coverage_90 : float
-        Fraction of the samples within the central predictive intervals of 50 % and 90 %.
+        Fraction of the samples within the central predictive intervals of 50 % and 90 % [1].
     whiteness : float
         Least p-value of the Ljung-Box test over the channels of dynamic trials (Holm); nan without
-        dynamic trials.
+        dynamic trials [1].
     sample_count : int
         Number of used samples.
     chi_square_expected, chi_square_deviation : float
         Mean and standard deviation of `chi_square_per_sample` if the model is right. They allow for
         what the fit absorbs or leaves uncertain, and for the degrees of freedom of the noise
-        records; nan without a noise record.
+        records; nan without a noise record [1].
     pit : tuple of float
         Fractions of the probability integral transforms in ten equal bins; 0.1 each if predictions
-        are right.
+        are right [1].
     pit_p_value : float
-        p-value of their uniformity, for the effective number of samples; nan if that is below ten.
+        p-value of their uniformity, for the effective number of samples; nan if that is below
+        ten [1].
     """
 
     rms: Mapping[str, Number]
@@ -69,10 +70,10 @@ class ClosedShare:
     Attributes
     ----------
     value : float
-        The fraction; negative if the error grew.
+        The fraction; negative if the error grew [1].
     low, high : float
         90 % interval of the fraction by a bootstrap of blocks of the records; nan with fewer than
-        five blocks.
+        five blocks [1].
     trials : str
         "held-out", or "fitted" if no trial was held out.
     trial_count : int

@@ -33,8 +33,11 @@ class Moment:
     """When something changed [s since the trial's start]: posterior median and 90 % interval."""
 
     value: float
+    """Posterior median [s]."""
     low: float
+    """Quantile 0.05 [s]."""
     high: float
+    """Quantile 0.95 [s]."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class GapWindow:
     size : float
         Root mean square residual in the window over the noise, of the channel with the largest. For
         a channel without a noise record, the residuals of the model without effects in the fitted
-        trials replace the noise, also if `with_effect` is true.
+        trials replace the noise, also if `with_effect` is true [1].
     with_effect : bool
         True if the gap remains with the best hypothesis; False for the model without effects.
     """
@@ -74,11 +77,17 @@ class Estimate:
     """A number with its 90 % interval: posterior median and quantiles 0.05, 0.95, in `unit`."""
 
     name: str
+    """Name of the number."""
     value: Number
+    """Posterior median [unit of the entry]."""
     low: Number
+    """Quantile 0.05 [unit of the entry]."""
     high: Number
+    """Quantile 0.95 [unit of the entry]."""
     unit: str
+    """Unit of the number."""
     description: str = ""
+    """What the number is."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +95,19 @@ class NamedEffect:
     """An effect in a hypothesis: identifier, name, place, parameters with intervals, patch."""
 
     identifier: str
+    """Identifier of the effect in the catalogue."""
     name: str
+    """Name of the effect."""
     place: str
+    """Where it acts."""
     family: str
+    """Name of its family."""
     parameters: tuple[Estimate, ...]
+    """Its parameters."""
     shape: tuple[Estimate, ...]
+    """Its free exponents, if its family was fitted."""
     patch: Patch
+    """Primitive changes of the model."""
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
@@ -112,9 +128,13 @@ class CalibratedParameter:
     """A calibrated parameter of a hypothesis: posterior mean and standard deviation, in `unit`."""
 
     name: str
+    """Name of the parameter."""
     mean: Number
+    """Posterior mean [unit of the entry]."""
     deviation: Number
+    """Posterior standard deviation [unit of the entry]."""
     unit: str
+    """Unit of the parameter."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +148,9 @@ class Hypothesis:
     log_evidence : float
         ln p(data | hypothesis) by Laplace's approximation [nat].
     probability : float
-        Posterior probability among the hypotheses compared.
+        Posterior probability among the hypotheses compared [1].
     chi_square, degrees_of_freedom : float
-        Chi-squared of the fitted trials against the noise records, and its degrees of freedom.
+        Chi-squared of the fitted trials against the noise records, and its degrees of freedom [1].
     parameters : tuple of CalibratedParameter
         Calibrated parameters of the model, fitted together with these effects.
     """
@@ -168,7 +188,7 @@ class Gate:
     passed : bool or None
         True if the hypothesis passed; None if the gate could not be applied.
     statistic, limit : float
-        Statistic, and the limit that it was compared with.
+        Statistic, and the limit that it was compared with [unit of the statistic].
     reason : str
         The outcome, or why the gate could not be applied, in one sentence.
     """
@@ -194,7 +214,7 @@ class RemainderEstimate:
     channel : str
         Name of the channel.
     size : float
-        Standard deviation of the remainder over that of the channel's noise.
+        Standard deviation of the remainder over that of the channel's noise [1].
     time : float
         Correlation time of the remainder [s].
     frequency : float
@@ -233,10 +253,15 @@ class ForceMoment:
     """A missing force at a moment: trial, time [s], force, displacement and speed of its port."""
 
     trial: str
+    """Name of the trial."""
     time: Number
+    """Time [s]."""
     force: Number
+    """Force [unit of the force]."""
     displacement: Number
+    """Displacement of the port [m or rad]."""
     speed: Number
+    """Speed of the port [m/s or rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -251,9 +276,9 @@ class ForceAtPort:
         Unit of the force: "N", "N m", or "N or N m" if the model does not say whether the port
         translates or rotates. At a port of a state it is the unit of the flow.
     rms, displacement, speed : float
-        Root mean squares of the force, and of displacement and speed of the port [m or rad, and per
-        second]. At a port of a state, `displacement` is that of the state's integral, and `speed`
-        that of the state.
+        Root mean squares of the force [`unit`], and of displacement and speed of the port [m or rad
+        and per second]. At a port of a state, `displacement` is that of the state's integral, and
+        `speed` that of the state.
     largest : ForceMoment
         The moment at which the force is largest.
     evidence : mapping of str to float
@@ -262,7 +287,7 @@ class ForceAtPort:
         Correlation time of the force [s].
     orders : mapping of str to float
         Fraction of the force's variance that is explained by its mean at equal displacement,
-        velocity, amplitude or time, by the name of that variable.
+        velocity, amplitude or time, by the name of that variable [1].
     ordered_by : tuple of str
         Variables that explain the force about as well as the best one; empty if none explains it.
     law : str
@@ -297,9 +322,13 @@ class UnfittedRecord:
     """
 
     trial: str
+    """Name of the trial."""
     channel: str
+    """Name of the channel."""
     left: Number
+    """Root mean square residual [unit of the channel]."""
     varies: Number
+    """Standard deviation of the readings about their mean [unit of the channel]."""
 
 
 @dataclass(frozen=True)
@@ -312,11 +341,11 @@ class MovedUnknown:
         Name of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT
         in TRIAL".
     stated, deviation : float
-        Stated value and its standard deviation [`unit`].
+        Stated value and its standard deviation [unit of the entry].
     value : float
-        Value in the fit without any effect [`unit`].
+        Value in the fit without any effect [unit of the entry].
     deviations : float
-        Distance of the two in standard deviations.
+        Distance of the two in standard deviations [1].
     unit : str
         Unit in SI; for a gain it is "1", and the values are relative errors of the gain.
     """
@@ -334,8 +363,11 @@ class NotFitted:
     """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
 
     identifier: str
+    """Identifier of the effect in the catalogue."""
     reason: str
+    """Why it was not fitted."""
     gain: Number = nan
+    """Gain of log evidence that a screen promised at most [nat]."""
 
 
 @dataclass(frozen=True)
@@ -343,9 +375,13 @@ class Experiment:
     """A proposed next experiment: what to do, its mutual information [nat], cost [1], and why."""
 
     description: str
+    """What to do."""
     information: Number
+    """Mutual information of the result and the open question [nat]."""
     cost: Number
+    """Cost [1]."""
     reason: str
+    """Why it is proposed."""
 
 
 @dataclass(frozen=True)
@@ -363,7 +399,7 @@ class Verdict:
         contain the named one, of all members of the group, of 'none' (nothing missing), or of the
         candidates together with 'none' (below detectability). For a family it is that of the family
         and its members, or that of the member if only the shape gate found the family. It is nan
-        for an unexplained gap.
+        for an unexplained gap [1].
     log_bayes_factor : float
         Log evidence of the best hypothesis over that of 'none' [nat].
     effects : tuple of NamedEffect
@@ -378,7 +414,7 @@ class Verdict:
     hypotheses : tuple of Hypothesis
         Hypotheses that were compared, the most probable first.
     inclusion : mapping of str to float
-        Probability that an effect is in the set, by identifier.
+        Probability that an effect is in the set, by identifier [1].
     next_experiments : tuple of Experiment
         Proposed experiments, the best first; empty if no question is open.
     remarks : tuple of str

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from discrepancy.document import Origin, write_document
+from discrepancy.document import Origin, document_schema, write_document
 from discrepancy.judgement.conclusion import hypothesis_record
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import Hypothesis
+from reporting.format_schema import JsonSchema
 
 SO_FAR_SCHEMA = "uav-twin verdict so far 1"
 """Value of the key `schema`."""
@@ -71,6 +72,11 @@ class SearchInProgress:
             )
             for identifiers, probability in probabilities
         )
+
+
+def so_far_schema() -> JsonSchema:
+    """Return the JSON Schema of `verdict_so_far.json`; a null number is not known."""
+    return document_schema(VerdictSoFar, SO_FAR_SCHEMA)
 
 
 def write_so_far(folder: Path, hypotheses: Sequence[Hypothesis], origin: Origin) -> Path | None:

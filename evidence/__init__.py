@@ -1,1 +1,1 @@
-"""What shipped numbers rest on: how they were found, a second model beside the first; not shipped itself."""
+"""Studies on which shipped numbers and meshes rest; they are not distributed."""

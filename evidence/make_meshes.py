@@ -10,40 +10,110 @@ from numpy.typing import ArrayLike, NDArray
 from scenarios import STRUCTURE_FOLDER
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
-CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
-EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))
+"""Corners of a hexahedron: whether each lies at the upper end of the cell along x, y and z."""
+EDGES = (
+    (0, 1),
+    (1, 2),
+    (2, 3),
+    (3, 0),
+    (4, 5),
+    (5, 6),
+    (6, 7),
+    (7, 4),
+    (0, 4),
+    (1, 5),
+    (2, 6),
+    (3, 7),
+)
+"""Edges of a hexahedron: the two corners of each."""
+CORNER_COUNT = len(CORNERS)
+
+SKIN = 1
+STIFFENERS = 2
+FIRST_STIFFENER_MIDDLE = 3
+SECOND_STIFFENER_MIDDLE = 4
+SKIN_MIDDLE = 5
+PANEL_GROUPS = {
+    "skin": SKIN,
+    "stiffeners": STIFFENERS,
+    "stiffener 1 middle": FIRST_STIFFENER_MIDDLE,
+    "stiffener 2 middle": SECOND_STIFFENER_MIDDLE,
+    "skin middle": SKIN_MIDDLE,
+}
+"""Physical groups of the stiffened panel, with their numbers in the mesh file."""
 
 
 def hexahedra(
-    lines: Sequence[ArrayLike], kept: Callable[[float, float, float], bool]
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Points (n, 3) and cells (m, 20) of the cells of a tensor grid that `kept` keeps by their centres."""
-    places = [np.asarray(line, dtype=float) for line in lines]
-    nodes = []
-    for cell in itertools.product(*(range(len(line) - 1) for line in places)):
-        corners = np.column_stack([line[cell[k] + CORNERS[:, k]] for k, line in enumerate(places)])
-        if kept(*corners.mean(axis=0)):
-            nodes.append(np.vstack((corners, [0.5 * (corners[a] + corners[b]) for a, b in EDGES])))
-    points, numbers = np.unique(np.round(np.concatenate(nodes), 9), axis=0, return_inverse=True)
-    return points, numbers.reshape(-1, 20)
+    lines: Sequence[ArrayLike], is_material: Callable[[float, float, float], bool]
+) -> tuple[FloatArray, IntArray]:
+    """Return points and 20-node hexahedra of the cells of a tensor grid that hold material.
+
+    Parameters
+    ----------
+    lines : sequence of 3 arrays
+        Coordinates of the grid lines along x, y and z.
+    is_material : callable
+        Returns whether the cell with the centre x, y, z holds material.
+
+    Returns
+    -------
+    points : (n, 3) array
+        Positions of the nodes.
+    cells : (m, 20) array
+        Nodes of the cells: the corners, then the middles of the edges.
+    """
+    grid_lines = [np.asarray(line, dtype=float) for line in lines]
+    cell_counts = [len(line) - 1 for line in grid_lines]
+    node_positions = []
+    for cell in itertools.product(*map(range, cell_counts)):
+        corners = _corner_positions(grid_lines, cell)
+        x, y, z = corners.mean(axis=0)
+        if is_material(x, y, z):
+            middles = [0.5 * (corners[start] + corners[end]) for start, end in EDGES]
+            node_positions.append(np.vstack((corners, middles)))
+    # Neighbouring cells share nodes: equal positions become one point.
+    rounded = np.round(np.concatenate(node_positions), 9)
+    points, numbers = np.unique(rounded, axis=0, return_inverse=True)
+    return points, numbers.reshape(-1, CORNER_COUNT + len(EDGES))
+
+
+def _corner_positions(grid_lines: Sequence[FloatArray], cell: Sequence[int]) -> FloatArray:
+    """Return the positions (8, 3) of the corners of a cell, given its index along each axis."""
+    positions = []
+    for line, index, offset in zip(grid_lines, cell, np.transpose(CORNERS), strict=True):
+        positions.append(line[index + offset])
+    return np.column_stack(positions)
+
+
+def _cell_centres(points: FloatArray, cells: IntArray) -> FloatArray:
+    """Return x, y and z of the centre of each cell, as an array (3, m)."""
+    corners = points[cells[:, :CORNER_COUNT]]
+    return np.asarray(corners.mean(axis=1).T)
 
 
 def bracket() -> None:
-    """Write an angle: a back of 60 mm bolted to a wall above, an arm of 80 mm, 6 mm thick and 40 mm wide."""
-    x = [0, 6, 16, 26, 36, 46, 58, 70, 80]
-    z = [0, 6, 16, 26, 36, 48, 60]
-    points, cells = hexahedra((x, np.linspace(0, 40, 4), z), lambda x, _, z: x < 6 or z < 6)
-    centres = points[cells[:, :8]].mean(axis=1)
+    """Write an angle bracket, 6 mm thick and 40 mm wide.
+
+    A back of 60 mm is bolted to a wall in its upper part and carries an arm of 80 mm.
+    """
+    x_lines = [0, 6, 16, 26, 36, 46, 58, 70, 80]
+    y_lines = np.linspace(0, 40, 4)
+    z_lines = [0, 6, 16, 26, 36, 48, 60]
+    points, cells = hexahedra((x_lines, y_lines, z_lines), lambda x, _, z: x < 6 or z < 6)
     mesh = meshio.Mesh(points, [("hexahedron20", cells)])
+
+    x, _, z = points.T
     mesh.point_sets = {
-        "WALL": np.flatnonzero((points[:, 0] == 0) & (points[:, 2] >= 36)),
-        "END": np.flatnonzero(points[:, 0] == 80),
+        "WALL": np.flatnonzero((x == 0) & (z >= 36)),
+        "END": np.flatnonzero(x == 80),
     }
-    heel = (centres[:, 0] < 16) & (centres[:, 2] < 16)
+    x, _, z = _cell_centres(points, cells)
     mesh.cell_sets = {
-        "HEEL": [np.flatnonzero(heel)],
-        "ARM": [np.flatnonzero((centres[:, 0] > 26) & (centres[:, 0] < 46))],
+        "HEEL": [np.flatnonzero((x < 16) & (z < 16))],
+        "ARM": [np.flatnonzero((x > 26) & (x < 46))],
     }
     file = STRUCTURE_FOLDER / "bracket.inp"
     mesh.write(file)
@@ -52,23 +122,27 @@ def bracket() -> None:
 
 
 def panel() -> None:
-    """Write a skin of 300 x 200 x 2 mm on two stiffeners of 20 x 3 mm, with the physical groups of Gmsh."""
-    x = [0, 25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275, 300]
-    y = [0, 25, 48.5, 51.5, 75, 100, 125, 148.5, 151.5, 175, 200]
-    points, cells = hexahedra((x, y, [-20, -10, 0, 2]), lambda _, y, z: z > 0 or abs(abs(y - 100) - 50) < 2)
-    centres = points[cells[:, :8]].mean(axis=1)
-    group = np.full(len(cells), 1)  # skin
-    group[centres[:, 2] < 0] = 2  # stiffeners
-    foot = (centres[:, 2] < 0) & (centres[:, 0] > 100) & (centres[:, 0] < 200)
-    group[foot & (centres[:, 1] < 100)] = 3
-    group[foot & (centres[:, 1] > 100)] = 4
-    group[(centres[:, 2] > 0) & (abs(centres[:, 0] - 150) < 25) & (abs(centres[:, 1] - 100) < 30)] = 5
-    names = ("skin", "stiffeners", "stiffener 1 middle", "stiffener 2 middle", "skin middle")
+    """Write a skin of 300 x 200 x 2 mm on two stiffeners of 20 x 3 mm, with physical groups."""
+    x_lines = [0, 25, 50, 75, 100, 125, 150, 175, 200, 225, 250, 275, 300]
+    y_lines = [0, 25, 48.5, 51.5, 75, 100, 125, 148.5, 151.5, 175, 200]
+    z_lines = [-20, -10, 0, 2]
+    points, cells = hexahedra(
+        (x_lines, y_lines, z_lines), lambda _, y, z: z > 0 or abs(abs(y - 100) - 50) < 2
+    )
+    x, y, z = _cell_centres(points, cells)
+    in_stiffener = z < 0
+    in_stiffener_middle = in_stiffener & (x > 100) & (x < 200)
+    group = np.full(len(cells), SKIN)
+    group[in_stiffener] = STIFFENERS
+    group[in_stiffener_middle & (y < 100)] = FIRST_STIFFENER_MIDDLE
+    group[in_stiffener_middle & (y > 100)] = SECOND_STIFFENER_MIDDLE
+    group[(z > 0) & (abs(x - 150) < 25) & (abs(y - 100) < 30)] = SKIN_MIDDLE
+    dimension = len(points.T)
     mesh = meshio.Mesh(
         points,
         [("hexahedron20", cells)],
         cell_data={"gmsh:physical": [group], "gmsh:geometrical": [group]},
-        field_data={name: np.array([number, 3]) for number, name in enumerate(names, start=1)},
+        field_data={name: np.array([number, dimension]) for name, number in PANEL_GROUPS.items()},
     )
     mesh.write(STRUCTURE_FOLDER / "stiffened_panel.msh", file_format="gmsh22", binary=False)
 

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
@@ -16,17 +15,7 @@ _UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
 def fill_template(template: str, /, **values: object) -> str:
     """Return a Jinja2 template filled with values, as one line."""
-    return words.in_one_line(rendered(template, **values))
-
-
-def rendered(template: str, /, **values: object) -> str:
-    """Return a Jinja2 template filled with values, with its line breaks."""
-    return _text_template(template).render(**values)
-
-
-def evaluated(expression: str, /, **values: object) -> Any:
-    """Return the value of a Jinja2 expression; it is None where a name has no value."""
-    return _text_environment().compile_expression(expression)(**values)
+    return words.in_one_line(_text_template(template).render(**values))
 
 
 @cache

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from reporting.page import Words
+    from reporting.page import Table as TextTable
     from reporting.progress import Progress
 
 _Command = Any  # Typer does not export the classes of its commands and options.
@@ -76,24 +76,13 @@ def say(text: str, **style: Any) -> None:
         typer.secho(text, **style)
 
 
-def show(command: str, words: "Words", **values: Any) -> None:
-    """Print the result of a command.
-
-    Parameters
-    ----------
-    command : str
-        The key of ``[printed]`` that holds the blocks to print, see `Words.rendered_blocks`.
-    words : Words
-        The file of words.
-    **values : object
-        The values of the templates.
-    """
-    for kind, content in words.rendered_blocks(words.content["printed"][command], **values):
-        if kind == "table":
-            _name, table = content
-            print_table([column.name for column in table.columns], table.rows)
+def show(blocks: "Iterable[str | TextTable]") -> None:
+    """Print the result of a command: its lines and tables, one after the other."""
+    for block in blocks:
+        if isinstance(block, str):
+            say(block)
         else:
-            say(content, fg="yellow" if kind == "notice" else None)
+            print_table([column.name for column in block.columns], block.rows)
 
 
 def print_table(

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from reporting.choices import did_you_mean
+from reporting.known_keys import known_keys
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 from reporting.words import counted, is_or_are, listing, small
 
@@ -319,8 +321,9 @@ def validate(
     try:
         record: _Model = _validator_of(model).validate_python(content)
     except ValidationError as cause:
-        message = _validation_message(cause, what, first_index)
-        raise error(f"{source}: {message}.") from None
+        message = _validation_message(cause, model, what, first_index)
+        full_stop = "" if message.endswith("?") else "."
+        raise error(f"{source}: {message}{full_stop}") from None
     return record
 
 
@@ -336,16 +339,19 @@ def short_repr(value: object) -> str:
 
 
 _UNKNOWN_KEY_TYPES = ("extra_forbidden", "unexpected_keyword_argument")
+_WORD_TYPES = ("literal_error", "enum")
 _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 
 
-def _validation_message(error: ValidationError, what: str, first_index: int) -> str:
+def _validation_message(error: ValidationError, model: object, what: str, first_index: int) -> str:
     """Return the message about the fault that helps the user most, of those pydantic found.
 
     Parameters
     ----------
     error : ValidationError
         The error of pydantic, with all faults.
+    model : type
+        The class that describes the file.
     what : str
         What the file describes, with its article.
     first_index : int
@@ -355,7 +361,7 @@ def _validation_message(error: ValidationError, what: str, first_index: int) -> 
     # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
     unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
     if unknown:
-        return _unknown_keys_message(unknown, what, first_index)
+        return _unknown_keys_message(unknown, model, what, first_index)
     missing = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
     if not missing:
         return _value_message(faults[0], first_index)
@@ -367,11 +373,17 @@ def _validation_message(error: ValidationError, what: str, first_index: int) -> 
     return f"{listing(keys)} {is_or_are(len(keys))} missing"
 
 
-def _unknown_keys_message(faults: list[ErrorDetails], what: str, first_index: int) -> str:
+def _unknown_keys_message(
+    faults: list[ErrorDetails], model: object, what: str, first_index: int
+) -> str:
     """Return the message about keys that the model does not have."""
     keys = [short_repr(_location_in_file(fault["loc"], first_index)) for fault in faults]
     if len(keys) > 1:
         return f"{listing(keys)} are not keys of {what}; remove them or correct their spelling"
+    *table_location, key = faults[0]["loc"]
+    question = did_you_mean(str(key), known_keys(model, tuple(table_location)))
+    if question:
+        return f"{keys[0]} is not a key of {what}.{question}"
     return f"{keys[0]} is not a key of {what}; remove it or correct its spelling"
 
 
@@ -397,7 +409,12 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
         expectation = f"{_EXPECTED_TYPES[kind]} is expected"
     else:
         expectation = small(fault["msg"])
-    return f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
+    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
+    if kind in _WORD_TYPES and isinstance(fault["input"], str):
+        words = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
+        question = did_you_mean(fault["input"], words)
+        return f"{message}.{question}" if question else message
+    return message
 
 
 def _missing_locations(fault: ErrorDetails, first_index: int) -> list[str]:

@@ -112,7 +112,6 @@ VERDICT = (
 """A verdict on a mass on a spring, its load cell with a tare."""
 
 READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
-    "README.md": (flown("level_turns", 22, "runs/demo"),),
     "docs/how_to/another_asset.md": ("library sample pump_wear --out pump.nc",),
     "docs/how_to/calibrate_a_wing.md": (calibrated_wing,),
     "docs/explanation/calibration.md": (

@@ -3,7 +3,7 @@
 They are drawn from `run.nc` alone, so that they take whatever `open_run` returns.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -111,9 +111,7 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     return panel
 
 
-def plot_courses(
-    groups: "Mapping[str, xr.Dataset]", axes: "Axes | Sequence[Axes] | None" = None
-) -> "list[Axes]":
+def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
     """Draw the believed states of the twins of a fleet over the steps.
 
     Each factor of the state of each group has a panel with the medians over the twins of the
@@ -122,7 +120,7 @@ def plot_courses(
 
     Parameters
     ----------
-    groups : mapping of str to Dataset
+    fleet : DataTree
         What `open_fleet` returns.
     axes : Axes or sequence of Axes, optional
         A panel for each factor of each group; new ones of pyplot by default.
@@ -135,14 +133,14 @@ def plot_courses(
     from reporting import figures as style
 
     rows = []
-    for group_name, group in groups.items():
-        for number, factor in enumerate(group.attrs["factors"]):
-            rows.append((group_name, str(factor), number))
+    for group_name, group in fleet.children.items():
+        for factor in group["filtered"].to_dataset()["region"].values:
+            rows.append((group_name, str(factor)))
     panels = new_panels(len(rows), axes)
-    for panel, (group_name, factor, number) in zip(panels, rows, strict=True):
-        group = groups[group_name]
-        believed = group["mean"].values[..., number]
-        truth = group["state"].values[..., number]
+    for panel, (group_name, factor) in zip(panels, rows, strict=True):
+        group = fleet.children[group_name]
+        believed = group["filtered"].to_dataset()["mean"].sel(region=factor).values
+        truth = group["truth"].to_dataset()["state"].sel(region=factor).values
         steps = np.flatnonzero(~np.isnan(believed).all(axis=0))
         quantiles = np.nanquantile(believed[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
         style.band(panel, steps, quantiles[0], quantiles[4], style.PRESENT)

@@ -109,15 +109,9 @@ def print_calibration(
 
 def _print_posterior(result: "Calibration") -> None:
     """Print prior and posterior of the parameters of a calibration, and their correlations."""
-    from calibration.result import text
+    from calibration.result.text import printed_calibration
 
-    terminal.show(
-        "calibration",
-        words=text.WORDS,
-        result=result,
-        headline=text.headline(result),
-        correlations=text.correlation_lines(result),
-    )
+    terminal.show(printed_calibration(result))
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:
@@ -234,10 +228,9 @@ def calibrate_wing(
             terminal.say(f"Step {origin.step}: {origin.text}.")
     calibration = calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
     if not json:
-        from calibration.paper.figures import WORDS
+        from calibration.paper.figures import printed_table_1
 
-        columns, rows = WORDS.table("table_1", calibration.table_1)
-        terminal.print_table([column.name for column in columns], rows)
+        terminal.show([printed_table_1(calibration.table_1).table])
     written = None
     if out is not None:
         written = write_wing_folder(calibration, out, report=not no_report)

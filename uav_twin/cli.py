@@ -15,6 +15,7 @@ from uav_twin import (
     discrepancy_commands,
     fmu,
     fmu_simulation,
+    schema_command,
     structure,
     watch_command,
     wing_commands,
@@ -200,6 +201,9 @@ structure_group.command("verify")(structure.verify)
 structure_group.command("field")(structure.field)
 structure_group.command("reduce")(structure.reduce)
 structure_group.command("fmu")(structure.fmu)
+
+
+app.command("schema", rich_help_panel=MODELS)(schema_command.schema)
 
 
 def main() -> None:

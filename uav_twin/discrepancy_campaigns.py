@@ -214,19 +214,11 @@ def import_files(
         answers["reference-temperature"] = {"": reference_temperature}
     understanding = _understand_files(files, answers, model)
     _print_understanding(understanding)
-    # Without a terminal, a question that is still open is an error of `campaign` below
+    # Without a terminal, a question that is still open is an error of `campaign`
     is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
-    dialogue = ImportDialogue(ImportCommand(files, out, model), understanding)
-    has_asked = is_interactive and dialogue.ask_all()
-    understanding = dialogue.understanding
-    if has_asked:
-        _print_understanding(understanding)
+    if is_interactive:
+        understanding = _ask_and_confirm(ImportCommand(files, out, model), understanding, folder)
     campaign = understanding.campaign(folder.resolve().name)
-    if has_asked:
-        dialogue.print_repetition()
-    if is_interactive and not dialogue.confirm(f"Write {folder}?"):
-        terminal.say("Nothing was written.")
-        raise typer.Exit(1)
     write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
     terminal.say(f"Wrote {folder}: {_campaign_size(campaign)}.")
     if understanding.assumed:
@@ -235,6 +227,31 @@ def import_files(
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
     terminal.say(f"Next: uav-twin discrepancy check {_shell_arguments(folder, model)}")
+
+
+def _ask_and_confirm(
+    command: ImportCommand, understanding: "LaboratoryImport", folder: Path
+) -> "LaboratoryImport":
+    """Ask what is open, and whether to write the folder; return the import with the answers.
+
+    Raises
+    ------
+    CampaignFileError, CampaignDataError
+        If no campaign can be made with the answers.
+    typer.Exit
+        If the user stops the dialogue, or wants nothing to be written.
+    """
+    dialogue = ImportDialogue(command, understanding)
+    has_asked = dialogue.ask_all()
+    if has_asked:
+        _print_understanding(dialogue.understanding)
+    dialogue.understanding.campaign(folder.resolve().name)  # wrong files are told before
+    if has_asked:
+        dialogue.print_repetition()
+    if not dialogue.confirm(f"Write {folder}?"):
+        terminal.say("Nothing was written.")
+        raise typer.Exit(1)
+    return dialogue.understanding
 
 
 def _campaign_size(campaign: "Campaign") -> str:

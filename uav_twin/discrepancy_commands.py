@@ -402,15 +402,14 @@ def _print_verdict(content: "ReportInput", folder: Path) -> None:
     If its folder contains a patch, the intervals of the parameters are read from there.
     """
     from discrepancy.files.verdict import PATCH_NAME, read_patch
-    from discrepancy.report.page import template_values
-    from discrepancy.report.text import WORDS
+    from discrepancy.report.printed import verdict_lines
 
     patch_file = folder / PATCH_NAME
     if patch_file.is_file():
         intervals = [effect.intervals for effect in read_patch(patch_file).effects]
         content = dataclasses.replace(content, intervals=intervals)
     terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
-    terminal.show("run", words=WORDS, **template_values(content))
+    terminal.show(verdict_lines(content))
 
 
 def check(
@@ -460,27 +459,9 @@ def _print_check(
 
     The latter is left out if it is None, because a fault is fatal.
     """
-    from discrepancy.report.decidability_text import (
-        campaign_needs,
-        confused_effects,
-        detectability_texts,
-        group_lines,
-    )
-    from discrepancy.report.text import WORDS
+    from discrepancy.report.printed import check_lines
 
-    terminal.show(
-        "check",
-        words=WORDS,
-        able=separability,
-        data=data,
-        model=model,
-        faults=faults,
-        catalogue=catalogue,
-        detectability_texts=detectability_texts,
-        confused_effects=confused_effects,
-        group_lines=group_lines,
-        campaign_needs=campaign_needs,
-    )
+    terminal.show(check_lines(data, model, catalogue, faults, separability))
 
 
 def _check_record(

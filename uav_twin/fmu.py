@@ -57,6 +57,7 @@ def bind(
     """
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.client.draft import draft_binding
+    from uav_twin.formats import schema_line
 
     refuse_existing(out, replace=replace)
     # The objects of up to 100,000 variables all stay in use: garbage collection would free nothing
@@ -69,7 +70,7 @@ def bind(
     if out is None:
         typer.echo(text, nl=False)
         return
-    atomic_write_text(out, text)
+    atomic_write_text(out, schema_line("binding") + text)
     terminal.say(
         f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`."
     )

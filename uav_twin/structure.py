@@ -383,6 +383,7 @@ def fmu(
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.structure_fmu import build_fmu, check_form
     from fmu_asset.structures import rig_text, structure_binding_text
+    from uav_twin.formats import schema_line
 
     version: Literal[2, 3] = 3 if fmi == 3 else 2
     check_form(kind, version)
@@ -410,10 +411,10 @@ def fmu(
     model = reduced_model(source, memory_limit=_in_bytes(memory_limit))
     print_packed_fmu(build_fmu(model, target, kind=kind, fmi=version, replace=replace))
     if binding is not None:
-        atomic_write_text(binding, binding_text)
+        atomic_write_text(binding, schema_line("binding") + binding_text)
         terminal.say(f"{binding}: its binding")
     if rig is not None:
-        atomic_write_text(rig, model_text)
+        atomic_write_text(rig, schema_line("fmu-model") + model_text)
         terminal.say(
             f"{rig}: the model of `uav-twin calibrate campaign` and "
             f"`discrepancy run CAMPAIGN --model {rig}`"

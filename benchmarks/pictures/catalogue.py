@@ -1,6 +1,6 @@
 """Every picture of docs/images by its name, with what README and docs say of it."""
 
-from benchmarks.pictures import examples, front, measured, missions
+from benchmarks.pictures import examples, front, measured, missions, tutorials
 from benchmarks.pictures.picture import Picture, Statement
 
 NOTEBOOK_FLEET = "fleet"
@@ -68,6 +68,22 @@ PICTURES = {
             ),
             minutes=True,
             source=NOTEBOOK_FLEET,
+        ),
+        Picture(
+            "exchanger",
+            tutorials.draw_exchanger,
+            (Statement("docs/tutorials/your_own_fmu.md", "reduces the flow on day {change},"),),
+        ),
+        Picture(
+            "calibrated_wing",
+            tutorials.draw_calibrated_wing,
+            (
+                Statement(
+                    "docs/tutorials/calibrate_a_wing.md",
+                    "from 1.000 ± 0.025 to {mean} ± {deviation}.",
+                ),
+            ),
+            minutes=True,
         ),
         Picture(
             "fleet",

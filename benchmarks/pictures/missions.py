@@ -92,12 +92,12 @@ def draw_fleet() -> Drawing:
     group = open_group(folder, record["name"])
     status = group["status"].values
     assets = flown_rows(status)
-    mean = group["mean"].values
+    mean = group["filtered/mean"].values
     last_mean = mean[assets, last_steps(group)[assets]]
     failed = int(np.sum(status == FAILED))
     pictures = (
         map_figure(scenario, last_mean, failed),
-        course_figure(scenario, mean[assets], group["state"].values[assets]),
+        course_figure(scenario, mean[assets], group["truth/state"].values[assets]),
     )
     png = stacked([to_png(figure, RESOLUTION) for figure in pictures])
     return Drawing(png, {"assets": len(status)})

@@ -1,1 +1,1 @@
-"""Studies behind published figures; each names the page under docs/ in its first line."""
+"""Studies behind published figures; the docstring of each names its page under docs/."""

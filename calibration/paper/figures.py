@@ -1,5 +1,6 @@
 """Table 1 (the digital state) and Fig. 5 (calibration step 2) of the paper, with our results."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +16,13 @@ from calibration.static.posterior import ScalarPosterior
 from reporting import figures as style
 from reporting.files import atomic_write_text
 from reporting.page import Words
+from reporting.record_table import (
+    RecordColumn,
+    TitledTable,
+    number_cells,
+    table_of_records,
+    text_cells,
+)
 from reporting.table_file import table_text
 
 WORDS = Words("calibration.paper", "table_1.toml")
@@ -49,6 +57,11 @@ class PaperFigure:
     mean: float
     source: str
     standard_deviation: float | None = None
+
+    @property
+    def title_with_unit(self) -> str:
+        """The title, and the printed unit if there is one."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
 
     def printed(self, mean: float, deviation: float | None = None, *, sign: str = "") -> str:
         """Return a value as printed, without its unit.
@@ -109,6 +122,31 @@ class TableRow:
     def paper_procedure_difference(self) -> float:
         """The mean by the paper's procedure minus the authors' [SI]."""
         return self.paper_procedure.mean - self.paper.mean
+
+
+def _printed_moments(row: TableRow, moments: Moments) -> str:
+    """Return mean and standard deviation of a quantity, as printed."""
+    return row.paper.printed(moments.mean, moments.standard_deviation)
+
+
+def printed_table_1(rows: Sequence[TableRow]) -> TitledTable:
+    """Return Table 1 of the paper with this calibration beside it, as texts."""
+    columns: list[RecordColumn[TableRow]] = [
+        text_cells(
+            "figure", lambda row: ", ".join(filter(None, (row.paper.title, row.paper.unit)))
+        ),
+        number_cells("prior", lambda row: _printed_moments(row, row.prior)),
+        number_cells("this wing", lambda row: _printed_moments(row, row.posterior)),
+        number_cells(
+            "the paper's procedure", lambda row: _printed_moments(row, row.paper_procedure)
+        ),
+        number_cells(
+            "in the paper",
+            lambda row: row.paper.printed(row.paper.mean, row.paper.standard_deviation),
+        ),
+        number_cells("difference", lambda row: row.paper.printed(row.difference, sign="+")),
+    ]
+    return TitledTable(table_of_records(columns, rows), **WORDS.words("tables", "table_1"))
 
 
 def table_1(

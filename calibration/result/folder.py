@@ -8,15 +8,18 @@ from tempfile import TemporaryDirectory
 from calibration.result.figures import corner_figure, drawn_parameters, readings_figure
 from calibration.result.file import FILE_NAME, result_bytes
 from calibration.result.record import Calibration
-from calibration.result.text import (
-    PROCEDURES,
-    WORDS,
-    correlation_lines,
+from calibration.result.tables import (
+    channels_table,
+    origin_table,
+    parameters_table,
+    readings_table,
 )
+from calibration.result.text import NOTICEABLE_CORRELATION, correlation_lines
 from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors
 from reporting.page import Page, ReportFigure
 from reporting.progress import stage
+from reporting.record_table import add_titled_table
 
 FIGURES = "figures"
 REPORT_NAME = "report.html"
@@ -124,10 +127,12 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     folder : Path
         The folder of the page, in which the figures are written.
     """
+    hashes = result.provenance["input_hashes"].items()
+    inputs = ", ".join(f"{name} {value[:12]}" for name, value in hashes)
     page = Page(
-        title=WORDS.say("title", result=result),
-        subtitle=WORDS.say("subtitle", result=result),
-        footer=(WORDS.say("footer", result=result),),
+        title=f"Calibration of {result.asset}",
+        subtitle=f"Parameters of {result.model} from {result.source}",
+        footer=(f"Seed {result.seed}. Inputs: {inputs}{'.' if inputs else ''}",),
     )
     page.add_section("Result")
     highlights = []
@@ -138,29 +143,50 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     for sentence in result.findings:
         page.add_notice(sentence)
     if not result.findings:
-        page.add_paragraph(WORDS.say("agreed"))
+        page.add_paragraph("Noise and priors allow what is left, and every parameter is told.")
     parameter_columns, titles = drawn_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
-    posterior_figure = corner_figure(titles, [posterior_set])
-    add_figure(page, WORDS.figure("posterior", posterior_figure), folder)
-    both_figure = corner_figure(titles, [posterior_set, prior_set])
-    add_figure(page, WORDS.figure("prior_and_posterior", both_figure), folder)
-    procedure = PROCEDURES[result.procedure]
-    WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
+    posterior = ReportFigure(
+        "posterior",
+        corner_figure(titles, [posterior_set]),
+        title="Posterior",
+        caption=(
+            "Samples of the posterior; upper right: correlations. Numbers over "
+            f"{NOTICEABLE_CORRELATION:g} are blue."
+        ),
+    )
+    add_figure(page, posterior, folder)
+    prior_and_posterior = ReportFigure(
+        "prior_and_posterior",
+        corner_figure(titles, [posterior_set, prior_set]),
+        title="Prior and posterior",
+        caption="The same with samples of the prior; the histograms have scales of their own.",
+    )
+    add_figure(page, prior_and_posterior, folder)
+    add_titled_table(page, parameters_table(result))
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
     page.add_section("What is left of the readings")
     if result.readings:
-        add_figure(page, WORDS.figure("readings", readings_figure(result)), folder)
-    WORDS.add_table(page, "readings", result.readings, result=result)
-    WORDS.add_table(page, "channels", result.channels)
+        readings = ReportFigure(
+            "readings",
+            readings_figure(result),
+            title="Readings",
+            caption=(
+                "The model before and after the calibration, and what was measured with its 95 % "
+                "interval. The vertical scale of each panel is free."
+            ),
+        )
+        add_figure(page, readings, folder)
+    add_titled_table(page, readings_table(result))
+    add_titled_table(page, channels_table(result))
     return page
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
     """Add the last section, the origin of the calibration, to its page, and write the page."""
     page.begin_fold("Where the calibration comes from")
-    WORDS.add_table(page, "origin", result=result)
+    add_titled_table(page, origin_table(result))
     page.end_fold()
     atomic_write_text(folder / REPORT_NAME, page.render())

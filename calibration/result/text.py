@@ -1,23 +1,15 @@
 """The figures of a calibration in words, for console and page."""
 
-from math import isfinite
+from collections.abc import Iterator
 
 import numpy as np
 
+from calibration.result import tables
 from calibration.result.record import Calibration
-from reporting.page import Words
+from reporting.page import Table
 
-WORDS = Words("calibration.result", isfinite=isfinite)
 NOTICEABLE_CORRELATION = 0.3
 """Correlation from which it is reported, and printed in colour."""
-
-PROCEDURES = {
-    "quadrature": "by quadrature",
-    "Gaussian": "a Gaussian, checked along its axes",
-    "several optima": "several optima, each a Gaussian",
-    "joint": "of all experiments together, by importance sampling",
-    "paper": "by the paper's procedure, step after step",
-}
 
 
 def correlation_lines(result: Calibration) -> list[str]:
@@ -35,4 +27,24 @@ def correlation_lines(result: Calibration) -> list[str]:
 
 def headline(result: Calibration) -> str:
     """Return the sentence on the calibrated asset and the procedure."""
-    return WORDS.say("headline", result=result, procedure=PROCEDURES[result.procedure])
+    asset = "" if result.asset == result.source else f"{result.asset}: "
+    campaign = f", campaign {result.source}" if result.design is None else ""
+    information = ""
+    if result.information is not None:
+        information = f", {result.information:.1f} nat gained"
+    return (
+        f"{asset}{result.model}{campaign}; posterior {tables.PROCEDURES[result.procedure]}, "
+        f"{len(result.samples)} samples{information}"
+    )
+
+
+def printed_calibration(result: Calibration) -> Iterator[str | Table]:
+    """Yield what is printed of a calibration: lines and tables."""
+    yield headline(result)
+    yield tables.parameters_table(result).table
+    yield from correlation_lines(result)
+    for titled in (tables.readings_table(result), tables.channels_table(result)):
+        if titled.table.rows:
+            yield titled.table
+    for finding in result.findings:
+        yield f"- {finding}"

@@ -11,8 +11,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
-from calibration.paper.figures import WORDS as TABLE_1
-from calibration.paper.figures import calibration_figure, write_table_1
+from calibration.paper.figures import calibration_figure, printed_table_1, write_table_1
 from calibration.paper.load_test import StaticCalibration, push_forward
 from calibration.result.figures import corner_figure, drawn_parameters
 from calibration.result.file import FILE_NAME
@@ -32,6 +31,7 @@ from reporting import figures as style
 from reporting.arrays import Float
 from reporting.page import Page, Words
 from reporting.progress import stage
+from reporting.record_table import add_titled_table
 from reporting.words import plus_minus
 
 WORDS = Words("calibration.wing")
@@ -132,7 +132,7 @@ def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
 
 def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder: Path) -> None:
     """Add Table 1, the load test, and the posteriors next to those of the paper to a page."""
-    TABLE_1.add_table(page, "table_1", calibration.table_1)
+    add_titled_table(page, printed_table_1(calibration.table_1))
     load_test_figure = calibration_figure(calibration.static)
     add_figure(page, WORDS.figure("load_test", load_test_figure), folder)
     rows = [
@@ -146,10 +146,11 @@ def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder:
         ("the paper's procedure", calibration.paper.samples[:, columns]),
     ]
     authors = calibration.lab.authors
+    remark = ""
     if authors is not None:
         sets.append(("authors' model", authors.samples))
-    corner = corner_figure(names, sets)
-    figure = WORDS.figure("procedure", corner, authors=authors is not None)
+        remark = "; grey are the authors’ published samples"
+    figure = WORDS.figure("procedure", corner_figure(names, sets), authors=remark)
     add_figure(page, figure, folder)
 
 

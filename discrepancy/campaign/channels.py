@@ -35,7 +35,7 @@ class NoiseRecord:
     standard_deviation : float
         Standard deviation s0 of a reading [channel's unit].
     degrees_of_freedom : float
-        Degrees of freedom n0 of s0; infinite if the standard deviation is taken as exact.
+        Degrees of freedom n0 of s0; infinite if the standard deviation is taken as exact [1].
     samples : (n,) ndarray or None
         The recorded noise itself, mean removed, if there is one.
     interval : float or None

@@ -21,6 +21,7 @@ from pydantic_core import PydanticKnownError
 
 from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
+from reporting.format_schema import MUST_BE_STATED, NeverInFile
 from reporting.toml_file import Name, NotNegative, Number, Positive
 
 MOST_MODES = 100
@@ -42,15 +43,20 @@ def _refuse_empty_text(value: str) -> str:
     return value
 
 
-NOT_IN_FILES = BeforeValidator(_refuse_key)
+NOT_IN_FILES = BeforeValidator(_refuse_key, json_schema_input_type=NeverInFile)
 """Marks a field that is read from the tables, and that the TOML file must not state."""
 InFiles = Annotated[
-    str, AfterValidator(_refuse_empty_text), Field(max_length=200, validate_default=True)
+    str,
+    AfterValidator(_refuse_empty_text),
+    Field(max_length=200, validate_default=True, json_schema_extra={MUST_BE_STATED: True}),
 ]
 """A text that every file must state, although records in memory may leave it empty."""
 Deviation = Annotated[
     NotNegative,
-    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
+    WrapValidator(
+        lambda value, check: inf if value == "free" else check(value),
+        json_schema_input_type=NotNegative | Literal["free"],
+    ),
     PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
 ]
 """A standard deviation; an infinite one is written "free" in files."""

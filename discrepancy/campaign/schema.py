@@ -41,14 +41,18 @@ class StatedPriorSection(Section):
     """`[parameters.NAME]`: mean and standard deviation that replace the model's own prior [SI]."""
 
     mean: Number
+    """Mean of the parameter [SI]."""
     deviation: NotNegative
+    """Standard deviation of the parameter [SI]."""
 
 
 class NoiseFileSection(Section):
     """`[noise]`: the table of samples at rest; `interval` [s] replaces its column `time`."""
 
     file: Name
+    """Table of samples at rest."""
     interval: Positive | None = None
+    """Sampling interval, in place of the column `time` [s]."""
 
 
 def _unit_in_si(recorded: records.InTables) -> float:
@@ -147,14 +151,22 @@ class TrialSection(records.TrialKeys):
     __pydantic_config__ = IN_FILES
 
     start: NotNegative | None = None
+    """Time since the start of the campaign; by default 0, or the first time of the table [s]."""
     temperature: Number | None = None
+    """Temperature of the trial; by default the reference temperature [degC]."""
     health: dict[Name, NotNegative] = field(default_factory=dict)
+    """Stiffness loss of each damage region, by its name, and `deviation`, their standard deviation
+    [1]."""
     release: Annotated[Release, pydantic.AfterValidator(_release_in_si)] | None = None
+    """How a ring-down began; every ring-down needs it."""
     channels: Annotated[tuple[Name, ...], LIST] | None = None
+    """Names of the channels that count, in this order; by default all that have a column."""
     left_out: dict[
         str, Annotated[tuple[Annotated[int, pydantic.Field(strict=True, ge=1)], ...], LIST]
     ] = field(default_factory=dict)
+    """Rows that do not count, counted from 1, by the name of the channel."""
     begins: records.Start | None = None
+    """How a forced or driven trial began; by default settled under what acts first."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -211,20 +223,34 @@ class CampaignSection(Section):
     model_config = pydantic.ConfigDict(strict=False)
 
     format: Literal[1]
+    """Version of the format."""
     name: str
+    """Title of the campaign."""
     force_unit: Annotated[Name, pydantic.AfterValidator(_checked_force_unit)] = FORCE_UNIT
+    """Unit of the column `force` of all tables."""
     reference_temperature: Annotated[Number, pydantic.Field(ge=-273.15)] | None = None
+    """Temperature at which the model holds [degC]."""
     parameters: dict[Name, StatedPriorSection] = pydantic.Field(default_factory=dict)
+    """Prior of parameters of the model, by their names, in place of the model's own."""
     noise: NoiseFileSection | None = None
+    """Table of samples at rest."""
     channel: Annotated[tuple[ChannelInFile, ...], pydantic.Field(min_length=1), LIST]
+    """What is measured."""
     input: Annotated[
         tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_input_in_si)], ...], LIST
     ] = ()
+    """What drives a driven trial, or a static trial of an FMU."""
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
+    """The records."""
     event: Annotated[tuple[Event, ...], LIST] = ()
+    """What happened at known moments."""
     remarks: Annotated[tuple[str, ...], LIST] = ()
+    """Sentences for people."""
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = pydantic.Field(default_factory=dict)
+    """Channels and inputs that share a clock, by the name of their logger; "force" is the force of
+    forced trials."""
     accept: Accepted = ()
+    """Faults of the data that are accepted in all channels and trials."""
 
     @property
     def columns(self) -> tuple[records.InTables, ...]:

@@ -37,7 +37,7 @@ class EffectSection(EffectKeys):
     Attributes
     ----------
     primitives : tuple of dict
-        Primitives of the patch, whose values may be expressions.
+        Primitives of the patch, whose values may be expressions [unit of the primitive].
     places : str, tuple of str or None
         A word of `PLACES`, the names of the places, or None if there is no choice.
     preferred : tuple of str
@@ -55,6 +55,21 @@ class EffectSection(EffectKeys):
     preferred: tuple[str, ...] = ()
     needs: tuple[str, ...] = USUAL
     events: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EffectsFile:
+    """A file with several effects.
+
+    Attributes
+    ----------
+    effect : tuple of EffectSection
+        The effects.
+    """
+
+    __pydantic_config__ = ROW
+
+    effect: tuple[EffectSection, ...]
 
 
 def _has_ports_of_a_wing(model: Model) -> bool:

@@ -32,7 +32,7 @@ class Prior:
         Distribution: "log_normal" and "normal" have 90 % of their mass between `low` and `high`,
         "uniform" has all of it there.
     low, high : float
-        Bounds, in the unit of the number; both positive for "log_normal".
+        Bounds; both positive for "log_normal" [unit of the parameter].
     """
 
     __pydantic_config__ = ROW
@@ -134,7 +134,7 @@ class ShapeParameter:
     name, symbol, description : str
         Those of an `EffectParameter`.
     canonical : float
-        Value in the named effect.
+        Value in the named effect [1].
     prior : Prior
         Prior within the family.
     """

@@ -8,7 +8,7 @@ whatever the law is, and lowers that force in steps (continuation). The innovati
 the evidence by Laplace's approximation. The missing force with the largest evidence is returned.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import inf
@@ -44,12 +44,18 @@ SPEED_WINDOWS = (0.1, 0.02, 0.005)
 """Half widths of the window of speeds over which laws of the speed are averaged, divided by the rms
 speed. The window becomes narrower from one estimate to the next, so that the jump of dry friction
 is introduced gradually."""
+NARROWEST_WINDOWS = (0.001, 0.0002)
+"""Still narrower windows, which are tried after the missing force has been lowered. In a window a
+body that sticks creeps; with a large missing force the narrow ones lead the iteration astray."""
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
 CONVERGED_STEP = 0.02
 """Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
 CONVERGED_EVIDENCE = 0.05
 """Change of the log evidence below which the iteration has converged [nat]."""
+LEAST_RISE, MOST_STAGNANT_ITERATIONS = 0.5, 2
+"""Rise of the log evidence that counts as progress [nat], and the number of iterations in a row
+without progress after which the iteration ends."""
 STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Fractions of a step that are tried in turn."""
 LONGEST_STEP = 2.0
@@ -57,6 +63,8 @@ LONGEST_STEP = 2.0
 PATTERN_FACTORS = (3.0, 1.7, 1.3)
 """Factors on size and time of a missing force in the search for its most probable values, in
 turn."""
+MOST_REPETITIONS = 4
+"""Largest number of times in a row that one factor is tried, as long as the evidence rises."""
 LARGEST_DECLINE = 12.0
 """Difference to the largest log evidence above which still smaller missing forces are not tried
 [nat]."""
@@ -123,6 +131,8 @@ class MotionEstimate:
         The motion and the missing forces of each trial.
     converged : bool
         Whether the last step was short enough.
+    speed_window : float
+        The half width of the window of speeds with which it was estimated, see `LawArguments`.
     """
 
     effect: FloatArray
@@ -133,6 +143,7 @@ class MotionEstimate:
     log_evidence: float
     trials: tuple[SmoothedTrial, ...]
     converged: bool
+    speed_window: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +272,7 @@ class MotionEstimator:
     prior_medians: Mapping[int, Process]
 
     def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
-        """Return a hypothesis at its most probable values.
+        """Return a hypothesis at its most probable values, from values that may be far from them.
 
         Parameters
         ----------
@@ -284,6 +295,74 @@ class MotionEstimator:
             current = start_from_estimate(smoothed)
         estimate = self._lower_missing_forces(laws, current)
         return None if estimate is None else self._tune_processes(laws, estimate)
+
+    def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
+        """Return a hypothesis at its most probable values, from values that are near them.
+
+        The missing forces at the start need not be large. The windows of speeds become as narrow as
+        the evidence allows.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values and trajectories to begin with.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if the laws are not possible along the trajectories.
+        """
+        estimate = self._lower_missing_forces(laws, start)
+        if estimate is None:
+            return None
+        estimate = self._tune_processes(laws, estimate)
+        narrowed = self._narrow_windows(laws, estimate)
+        return narrowed if narrowed is estimate else self._tune_processes(laws, narrowed)
+
+    def polish(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+    ) -> MotionEstimate | None:
+        """Return a hypothesis at its most probable values, from values that are nearly these.
+
+        Only the last factor of the search for the most probable missing forces is tried.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values, trajectories and missing forces to begin with.
+        speed_window : float
+            The half width of the window of speeds, see `LawArguments`.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if the laws are not possible along the trajectories.
+        """
+        estimate = self._iterate_gauss_newton(laws, start, speed_window)
+        if estimate is None:
+            return None
+        return self._tune_processes(laws, estimate, PATTERN_FACTORS[-1:])
+
+    def _narrow_windows(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
+        """Return the estimate with the narrowest window of speeds that makes it more probable.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        estimate : MotionEstimate
+            The estimate with a wider window.
+        """
+        for speed_window in NARROWEST_WINDOWS:
+            narrower = self._iterate_gauss_newton(laws, start_from_estimate(estimate), speed_window)
+            if narrower is None or narrower.log_evidence < estimate.log_evidence + LEAST_RISE:
+                break
+            estimate = narrower
+        return estimate
 
     def _lower_missing_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
@@ -329,7 +408,12 @@ class MotionEstimator:
             current_start = start_from_estimate(estimate)
         return best_estimate
 
-    def _tune_processes(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
+    def _tune_processes(
+        self,
+        laws: HypothesisLaws,
+        estimate: MotionEstimate,
+        factors: Sequence[float] = PATTERN_FACTORS,
+    ) -> MotionEstimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
         This is a pattern search with decreasing factors, in which the trials stay linear along one
@@ -341,33 +425,72 @@ class MotionEstimator:
             The laws and sensor errors of the hypothesis.
         estimate : MotionEstimate
             The estimate with the present sizes and times.
+        factors : sequence of float
+            The factors on size and time that are tried in turn.
         """
         start = start_from_estimate(estimate)
-        linear = self.linearise(laws, start, SPEED_WINDOWS[-1])
+        linear = self.linearise(laws, start, estimate.speed_window)
         if linear is None:
             return estimate
         processes = dict(start.processes)
-        largest_evidence = self._evidence_with_processes(linear, processes)
-        for factor in PATTERN_FACTORS:
-            for port, quantity in product(
-                tuple(processes), ("standard_deviation", "correlation_time")
-            ):
-                # the first of a larger and a smaller value that is more probable is kept
-                for ratio in (factor, 1.0 / factor):
-                    value = ratio * getattr(processes[port], quantity)
-                    changed_processes = processes | {
-                        port: replace(processes[port], **{quantity: value})
-                    }
-                    evidence = self._evidence_with_processes(linear, changed_processes)
-                    if evidence > largest_evidence:
-                        processes, largest_evidence = changed_processes, evidence
-                        break
+        first_evidence = self._evidence_with_processes(linear, processes)
+        largest_evidence = first_evidence
+        for factor in factors:
+            for _ in range(MOST_REPETITIONS):
+                last_evidence = largest_evidence
+                processes, largest_evidence = self._try_factor(
+                    linear, processes, largest_evidence, factor
+                )
+                if largest_evidence < last_evidence + LEAST_RISE:
+                    break
+        if largest_evidence < first_evidence + LEAST_RISE:
+            return estimate
         tuned = self._iterate_gauss_newton(
-            laws, replace(start, processes=processes), SPEED_WINDOWS[-1]
+            laws, replace(start, processes=processes), estimate.speed_window
         )
         if tuned is None or tuned.log_evidence <= estimate.log_evidence:
             return estimate
         return tuned
+
+    def _try_factor(
+        self,
+        linear: Linearisation,
+        processes: dict[int, Process],
+        largest_evidence: float,
+        factor: float,
+    ) -> tuple[dict[int, Process], float]:
+        """Return missing forces, each size and time changed by a factor if that is more probable.
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials.
+        processes : dict of int to Process
+            The missing forces, by the number of the port.
+        largest_evidence : float
+            Their log evidence [nat].
+        factor : float
+            The factor by which, or by whose inverse, each size and time is multiplied.
+
+        Returns
+        -------
+        processes : dict of int to Process
+            The more probable missing forces.
+        log_evidence : float
+            Their log evidence [nat].
+        """
+        for port, quantity in product(tuple(processes), ("standard_deviation", "correlation_time")):
+            # the first of a larger and a smaller value that is more probable is kept
+            for ratio in (factor, 1.0 / factor):
+                value = ratio * getattr(processes[port], quantity)
+                changed_processes = processes | {
+                    port: replace(processes[port], **{quantity: value})
+                }
+                evidence = self._evidence_with_processes(linear, changed_processes)
+                if evidence > largest_evidence:
+                    processes, largest_evidence = changed_processes, evidence
+                    break
+        return processes, largest_evidence
 
     def _iterate_gauss_newton(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
@@ -393,15 +516,24 @@ class MotionEstimator:
         current = start
         last_evidence = -inf
         estimate: MotionEstimate | None = None
+        stagnant_iterations = 0
+        largest_evidence = -inf
         for _ in range(MOST_ITERATIONS):
             linear = self.linearise(laws, current, speed_window)
             if linear is None:
                 return estimate
-            new_estimate = self._estimate_of_linearisation(linear, current, last_evidence)
+            new_estimate = self._estimate_of_linearisation(
+                linear, current, last_evidence, speed_window
+            )
             if new_estimate is None:
                 return estimate
             estimate = new_estimate
-            if estimate.converged:
+            if estimate.log_evidence > largest_evidence + LEAST_RISE:
+                stagnant_iterations = 0
+            else:
+                stagnant_iterations += 1
+            largest_evidence = max(largest_evidence, estimate.log_evidence)
+            if estimate.converged or stagnant_iterations == MOST_STAGNANT_ITERATIONS:
                 return estimate
             last_evidence = estimate.log_evidence
             next_start = self._take_step(laws, current, estimate, linear, speed_window)
@@ -411,7 +543,11 @@ class MotionEstimator:
         return estimate
 
     def _estimate_of_linearisation(
-        self, linear: Linearisation, start: EstimatorStart, last_evidence: float
+        self,
+        linear: Linearisation,
+        start: EstimatorStart,
+        last_evidence: float,
+        speed_window: float,
     ) -> MotionEstimate | None:
         """Return the estimate of linear trials, after a whole Gauss-Newton step from a start.
 
@@ -424,6 +560,8 @@ class MotionEstimator:
         last_evidence : float
             The log evidence of the previous estimate [nat]. The iteration has converged if neither
             the evidence nor an unknown changes notably.
+        speed_window : float
+            The half width of the window of speeds with which the laws are linear.
 
         Returns
         -------
@@ -454,6 +592,7 @@ class MotionEstimator:
             log_evidence=evidence,
             trials=smoothed,
             converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
+            speed_window=speed_window,
         )
 
     def _evidence_with_processes(

@@ -52,6 +52,35 @@ def propagate_covariance(
             propagated[k, i] = element
 
 
+@callable_when_compiled
+def weight_moved_to_end(
+    begin: FloatArray, end: FloatArray, tangent_at_begin: FloatArray, tangent_at_end: FloatArray
+) -> float:
+    """Return the fraction of a force's weight at the start of a substep that moves to its end.
+
+    Let s be the stiffness of a law over the substep: the decrease of its force by the motion that
+    the force causes. The theta scheme changes no sign if theta is at least 1 - 1 / s. With a
+    fraction w moved to the end theta is (1 + w) / 2, so that w is 1 - 2 / s; it is zero below
+    s = 2.
+
+    Parameters
+    ----------
+    begin, end : (n, P) ndarray
+        The change of the state by a unit force at the start and at the end of the substep.
+    tangent_at_begin, tangent_at_end : (P, n) ndarray
+        The derivative of the laws' force at a port by the state, at both ends.
+    """
+    largest_stiffness = 0.0
+    for p in range(len(tangent_at_begin)):
+        stiffness_at_begin, stiffness_at_end = 0.0, 0.0
+        for i in range(len(begin)):
+            change = begin[i, p] + end[i, p]
+            stiffness_at_begin -= tangent_at_begin[p, i] * change
+            stiffness_at_end -= tangent_at_end[p, i] * change
+        largest_stiffness = max(largest_stiffness, stiffness_at_begin, stiffness_at_end)
+    return 1.0 - 2.0 / largest_stiffness if largest_stiffness > 2.0 else 0.0
+
+
 @compiled
 def substep_matrices_with_laws(
     substeps: int,
@@ -74,6 +103,10 @@ def substep_matrices_with_laws(
         d = b u[j] + e u[j + 1] + drift[j].
 
     The matrix on the left is inverted by the Woodbury identity, with a system of P equations.
+
+    Where a law is stiff, as dry friction is while a body sticks, this scheme would let the speed
+    change its sign in each substep. A part of b is then added to e, so that the force counts more
+    at the end of the substep (see `weight_moved_to_end`).
 
     Parameters
     ----------
@@ -104,9 +137,19 @@ def substep_matrices_with_laws(
     inverse, explicit, work = np.empty((3, states, states))
     coupling = np.empty((ports, ports))
     explicit_drift = np.empty((states, drift.shape[2]))
+    begin, end = np.empty((2, states, ports))
     for j in range(steps):
         interval = interval_of_sample[j // substeps + 1]
-        begin, end = by_force_at_begin[interval], by_force_at_end[interval]
+        tangent = force_by_state[j + 1]
+        moved = weight_moved_to_end(
+            by_force_at_begin[interval], by_force_at_end[interval], force_by_state[j], tangent
+        )
+        for i in range(states):
+            for p in range(ports):
+                begin[i, p] = (1.0 - moved) * by_force_at_begin[interval, i, p]
+                end[i, p] = (
+                    by_force_at_end[interval, i, p] + moved * by_force_at_begin[interval, i, p]
+                )
         # right side: the laws' force at the start of the step, and all drift
         multiply(begin, force_by_state[j], explicit)
         explicit += free_transition[interval]
@@ -120,7 +163,6 @@ def substep_matrices_with_laws(
                     )
                 explicit_drift[i, w] = element
         # inverse of the left side: (I - end tangent)^-1 = I + end (I - tangent end)^-1 tangent
-        tangent = force_by_state[j + 1]
         multiply(tangent, end, coupling)
         if ports == 1:
             inverse_tangent = tangent / (1.0 - coupling[0, 0])

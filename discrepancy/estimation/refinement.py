@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.candidate import with_step
+from discrepancy.fits.candidate import Candidate, with_step
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.filtered import Solution
-from discrepancy.missing_force.linear_trials import PortDeviations, TrialMotion
+from discrepancy.missing_force.linear_trials import LinearTrials, PortDeviations, TrialMotion
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
@@ -26,6 +26,13 @@ MOST_REFINED = 4
 first."""
 REFINED_WITHIN = 60.0
 """Difference to the best score above which no hypothesis is estimated with the motion [nat]."""
+DIFFERENT_TIMES = 2.0
+"""Ratio of two correlation times of a missing force above which an estimate begins with either."""
+MOST_LINEARISATIONS = 3
+"""Largest number of times that the trials are linearised about the unknowns of an estimate."""
+SAME_POINT = 0.1
+"""Change of all shared unknowns, in prior standard deviations, below which the trials are not
+linearised again."""
 
 
 def refine_hypotheses(
@@ -89,24 +96,43 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     ForceHypothesis or None
         The hypothesis; None if its laws are not possible along the motion.
     """
-    trials = tuple(hypothesis.linear_trials.trials)
-    problem = search.problem
-    laws = EffectLaws(
-        search.column_builder,
-        trials,
-        hypothesis.candidate,
-        search.evaluate_model_laws,
-        unknowns_of_model_laws(search),
+    first = _estimate_about_point_of_search(search, hypothesis)
+    if first is None:
+        return None
+    trials, estimate = _linearise_about_estimate(
+        search, hypothesis.candidate, hypothesis.linear_trials, first
     )
-    estimator = MotionEstimator(
-        trials, problem.shared.precision, search.prior_processes(hypothesis.processes)
-    )
+    return _hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
+
+
+def _estimate_about_point_of_search(
+    search: ForceSearch, hypothesis: ForceHypothesis
+) -> MotionEstimate | None:
+    """Return the estimate in trials that are linear about the unknowns of the search.
+
+    The estimate begins with missing forces that are as large as without any effect: the trajectory
+    then follows the readings even if the parameters of the law are still wrong. With the law the
+    search may have found a far shorter correlation time than without it. Which one leads to the
+    better optimum is not known beforehand, so the estimate begins with either if they differ much.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypothesis : ForceHypothesis
+        The hypothesis as the search has fitted it.
+
+    Returns
+    -------
+    MotionEstimate or None
+        The more probable estimate; None if the laws are not possible along the motion.
+    """
+    trials = hypothesis.linear_trials
+    laws, estimator = _laws_and_estimator(search, hypothesis.candidate, trials)
     trajectories = tuple(
         Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
         for motion in hypothesis.motions
     )
-    # missing forces as large as without any effect: the trajectory then follows the readings even
-    # if the parameters of the law are still wrong
     processes = {
         port: replace(
             process,
@@ -114,10 +140,117 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
         )
         for port, process in hypothesis.processes.items()
     }
-    estimate = estimator.estimate(
-        laws, EstimatorStart(hypothesis.effect, hypothesis.shared, trajectories, processes)
+    beginnings = [processes]
+    without_effect = search.hypothesis_of_all_ports.processes
+    times_without_effect = {
+        port: replace(process, correlation_time=without_effect[port].correlation_time)
+        for port, process in processes.items()
+        if port in without_effect
+    }
+    if any(
+        abs(np.log(process.correlation_time / processes[port].correlation_time))
+        > np.log(DIFFERENT_TIMES)
+        for port, process in times_without_effect.items()
+    ):
+        beginnings.append(processes | times_without_effect)
+    estimates = []
+    for beginning in beginnings:
+        start = EstimatorStart(hypothesis.effect, hypothesis.shared, trajectories, beginning)
+        estimate = estimator.estimate(laws, start)
+        if estimate is not None:
+            estimates.append(estimate)
+    return max(estimates, key=lambda estimate: estimate.log_evidence, default=None)
+
+
+def _linearise_about_estimate(
+    search: ForceSearch, candidate: Candidate, trials: LinearTrials, estimate: MotionEstimate
+) -> tuple[LinearTrials, MotionEstimate]:
+    """Return trials that are linear about the unknowns of an estimate, and the estimate in them.
+
+    The search takes its trials as linear about the unknowns that it found without any effect. The
+    response of the model is not linear in a parameter: a mass that is wrong by a tenth leaves a
+    hundredth of the forces, which would then be missing.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    candidate : Candidate
+        The effects.
+    trials : LinearTrials
+        The trials in which the hypothesis was estimated.
+    estimate : MotionEstimate
+        The estimate.
+
+    Returns
+    -------
+    trials : LinearTrials
+        The trials.
+    estimate : MotionEstimate
+        The estimate in these trials; the given one if none can be made in them.
+    """
+    for _ in range(MOST_LINEARISATIONS):
+        point = search.point_of_unknowns(estimate.shared, estimate.local)
+        point_of_trials = trials.trials[0].linearisation_point[: len(point.shared)]
+        if np.all(np.abs(point.shared - point_of_trials) < SAME_POINT):
+            break
+        next_trials = search.column_builder.trials_about(point)
+        laws, estimator = _laws_and_estimator(search, candidate, next_trials)
+        start = start_in_other_trials(estimate, trials.trials, next_trials.trials)
+        next_estimate = estimator.estimate_nearby(laws, start)
+        if next_estimate is None:
+            break
+        trials, estimate = next_trials, next_estimate
+    return trials, estimate
+
+
+def start_in_other_trials(
+    estimate: MotionEstimate, trials: Sequence[PortedTrial], other_trials: Sequence[PortedTrial]
+) -> EstimatorStart:
+    """Return the start of an estimate in trials that are linear about other unknowns.
+
+    The motion of the ports stays the same. The model moves them differently about other unknowns,
+    so that the added state changes by what moves the ports back.
+
+    Parameters
+    ----------
+    estimate : MotionEstimate
+        The estimate.
+    trials : sequence of PortedTrial
+        The trials in which it was estimated.
+    other_trials : sequence of PortedTrial
+        The trials in which the next estimate is made, with the same fine stamps.
+    """
+    trajectories = []
+    for smoothed, trial, other, local in zip(
+        estimate.trials, trials, other_trials, estimate.local, strict=True
+    ):
+        unknowns = np.concatenate((estimate.shared, local))
+        trajectory = smoothed.trajectory
+        motion = np.concatenate(trial.port_motion(unknowns, trajectory.added_state), axis=1)
+        other_motion = np.concatenate(other.port_motion(unknowns, trajectory.added_state), axis=1)
+        motion_by_state = np.concatenate((other.system.positions, other.system.speeds))
+        change = (motion - other_motion) @ np.linalg.pinv(motion_by_state).T
+        trajectories.append(replace(trajectory, added_state=trajectory.added_state + change))
+    return EstimatorStart(estimate.effect, estimate.shared, tuple(trajectories), estimate.processes)
+
+
+def _laws_and_estimator(
+    search: ForceSearch, candidate: Candidate, trials: LinearTrials
+) -> tuple[EffectLaws, MotionEstimator]:
+    """Return the laws of a hypothesis in some trials, and the estimator of these trials."""
+    laws = EffectLaws(
+        search.column_builder,
+        tuple(trials.trials),
+        candidate,
+        search.evaluate_model_laws,
+        unknowns_of_model_laws(search),
     )
-    return None if estimate is None else _hypothesis_of_estimate(search, hypothesis, estimate)
+    prior_medians = search.prior_processes(search.hypothesis_of_all_ports.processes)
+    estimator = MotionEstimator(
+        tuple(trials.trials), search.problem.shared.precision, prior_medians
+    )
+    return laws, estimator
 
 
 def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
@@ -132,7 +265,7 @@ def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
 
 
 def _hypothesis_of_estimate(
-    search: ForceSearch, hypothesis: ForceHypothesis, estimate: MotionEstimate
+    search: ForceSearch, candidate: Candidate, trials: LinearTrials, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, to which further effects may be added.
 
@@ -140,8 +273,10 @@ def _hypothesis_of_estimate(
     ----------
     search : ForceSearch
         The search for the missing force.
-    hypothesis : ForceHypothesis
-        The hypothesis before the estimate.
+    candidate : Candidate
+        The effects.
+    trials : LinearTrials
+        The trials in which they were estimated.
     estimate : MotionEstimate
         The estimate.
 
@@ -152,16 +287,14 @@ def _hypothesis_of_estimate(
     """
     motions = [
         _trial_motion(trial, smoothed)
-        for trial, smoothed in zip(hypothesis.linear_trials.trials, estimate.trials, strict=True)
+        for trial, smoothed in zip(trials.trials, estimate.trials, strict=True)
     ]
-    linear_trials = search.linearise_effects(
-        hypothesis.linear_trials, motions, hypothesis.candidate, estimate.effect
-    )
+    linear_trials = search.linearise_effects(trials, motions, candidate, estimate.effect)
     if linear_trials is None:
         return None
     mean = np.concatenate((estimate.shared, estimate.effect))
     return ForceHypothesis(
-        candidate=hypothesis.candidate,
+        candidate=candidate,
         effect=estimate.effect,
         processes=estimate.processes,
         log_evidence=estimate.log_evidence,

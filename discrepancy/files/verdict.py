@@ -11,7 +11,14 @@ import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from discrepancy.campaign.records import Channel, Quantity
-from discrepancy.document import PRIMITIVE_UNITS, Number, Origin, read_document, write_document
+from discrepancy.document import (
+    PRIMITIVE_UNITS,
+    Number,
+    Origin,
+    document_schema,
+    read_document,
+    write_document,
+)
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
@@ -21,6 +28,7 @@ from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
+from reporting.format_schema import JsonSchema
 from reporting.words import brief
 
 VERDICT_SCHEMA = "uav-twin verdict 5"
@@ -93,6 +101,16 @@ def write_verdict(path: Path, verdict: Verdict, proof: Proof | None, origin: Ori
         If the file cannot be written.
     """
     return write_document(path, VERDICT_SCHEMA, StoredVerdict(verdict, proof, origin))
+
+
+def verdict_schema() -> JsonSchema:
+    """Return the JSON Schema of `verdict.json`; a null number is not a number, or not known."""
+    return document_schema(StoredVerdict, VERDICT_SCHEMA)
+
+
+def patch_schema() -> JsonSchema:
+    """Return the JSON Schema of `patch.json`; a null number is not a number, or not known."""
+    return document_schema(StoredPatch, PATCH_SCHEMA)
 
 
 def read_verdict_file(path: Path) -> StoredVerdict:
@@ -180,14 +198,14 @@ class PrimitiveInterval:
     parameter : str
         Name of the parameter.
     value : float
-        Value in the patch.
+        Value in the patch [unit of the entry].
     low, high : float
-        Ends of the interval; nan if no draws of the posterior were taken.
+        Ends of the interval; nan if no draws of the posterior were taken [unit of the entry].
     unit : str
         Unit of the parameter.
     """
 
-    primitive: Annotated[int, Field(ge=0, description="Index in the effect's list `patch`.")]
+    primitive: Annotated[int, Field(ge=0)]
     parameter: str
     value: Annotated[float, Field(allow_inf_nan=False)]
     low: Number
@@ -200,6 +218,7 @@ class PatchEffect(NamedEffect):
     """An effect with the intervals of its primitives."""
 
     intervals: tuple[PrimitiveInterval, ...]
+    """90 % posterior intervals of the numbers of its primitives."""
 
 
 def _checked_basis(kind: VerdictKind) -> VerdictKind:

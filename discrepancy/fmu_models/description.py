@@ -27,7 +27,9 @@ def _as_table(force: object) -> object:
     return {DEFAULT_PLACE: force} if isinstance(force, str) else force
 
 
-Forces = Annotated[dict[Name, Name], BeforeValidator(_as_table)]
+Forces = Annotated[
+    dict[Name, Name], BeforeValidator(_as_table, json_schema_input_type=Name | dict[Name, Name])
+]
 """Force inputs by load place."""
 
 
@@ -85,9 +87,9 @@ class StaticSection(Section):
     limit : float
         Longest motion that is waited for [s].
     tolerance : float
-        At rest, no output moves by more than this share of its largest value.
+        At rest, no output moves by more than this fraction of its largest value [1].
     parameters : table
-        Parameters of the FMU in such trials, in its units.
+        Parameters of the FMU in such trials, in its units [unit of the FMU].
     """
 
     settle: bool = False
@@ -101,7 +103,9 @@ class MotionSection(Section):
     """`[motion]`: ring-downs and forced trials; `step` [s] only if the FMU has one step size."""
 
     step: Positive | None = None
+    """Communication step; needed only if the FMU has one step size [s]."""
     parameters: dict[Name, Number] = Field(default_factory=dict)
+    """Parameters of the FMU in ring-downs and forced trials, in its units [unit of the FMU]."""
 
 
 class ReleaseSection(Section):
@@ -144,7 +148,10 @@ class FmuOutputSection(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for the numbers a to b."""
 
     variable: Variable
+    """Name in the binding or in the FMU, in which `{a..b}` stands for the numbers a to b; by
+    default `name`."""
     quantity: Quantity = Quantity.DISPLACEMENT
+    """What it is."""
 
 
 class FmuInputSection(FmuOutputSection):
@@ -157,24 +164,33 @@ class FmuPortSection(NamedSection):
     """`[[port]]`: where an internal force can act; `rotation`: a moment and an angle."""
 
     force: Name
+    """Input of the force or moment."""
     displacement: Name
+    """Output of the displacement or angle."""
     velocity: Name | None = None
+    """Output of the velocity or angular velocity."""
     rotation: bool = False
+    """Whether the port turns."""
 
 
 class FmuParameterSection(ParameterSection):
     """`[[parameter]]`: a calibrated parameter that is a variable of the FMU."""
 
     variable: Variable
+    """Name in the binding or in the FMU; by default `name`."""
 
 
 class ScalesSection(Section):
     """`[scales]`: natural scales that cannot be computed with the FMU, as in `Scales`; all SI."""
 
     length: Positive | None = None
+    """Characteristic length [m]."""
     tip_stiffness: Positive | None = None
+    """Force at the place of the load for each metre of its displacement [N/m]."""
     modal_mass: Positive | None = None
+    """Mass of the first mode [kg]."""
     angular_frequency: Positive | None = None
+    """Angular frequency of the first mode [rad/s]."""
 
 
 class FmuModelDescription(ModelDescription):
@@ -182,17 +198,31 @@ class FmuModelDescription(ModelDescription):
 
     Attributes
     ----------
-    format, kind : 1, "fmu"
-        What it is.
-    name : str
-        For people.
+    kind : "fmu"
+        Kind of the model.
     fmu : str
         The FMU, seen from the file's folder.
     binding : str, optional
         A binding file, seen from the file's folder, or a shipped binding by name. Without one,
         names here are variables of the FMU.
-    inputs, static, motion, release, input, output, port, parameter, scales
-        See there.
+    inputs : FmuInputsSection
+        Inputs that a trial sets.
+    static : StaticSection
+        How a state at rest is reached.
+    motion : MotionSection
+        How a motion is computed.
+    release : ReleaseSection or None
+        How a ring-down starts.
+    input : tuple of FmuInputSection
+        Inputs that static trials hold in each row, and that drive driven trials.
+    output : tuple of FmuOutputSection
+        What channels can measure.
+    port : tuple of FmuPortSection
+        Where an internal force can act.
+    parameter : tuple of FmuParameterSection
+        Calibrated parameters, which are variables of the FMU.
+    scales : ScalesSection
+        Natural scales that cannot be computed with the FMU.
     effects : table
         Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
         `effect.<id>.<number>`).

@@ -17,7 +17,7 @@ from discrepancy.search.strategy import Search
 from discrepancy.search.wide_noise import compare_under_wide_noise
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
-from reporting.words import capital, listing
+from reporting.words import capital, listing, small
 
 from .closed_share import compared_trials_text, percent_with_interval
 from .coloured_noise import remainder_estimates, verdict_under_coloured_noise
@@ -443,8 +443,19 @@ def _best_hypothesis_sentence(
     """Return the sentence on the best hypothesis, and the reason why it is not named, if any."""
     effects = effects_text(named_effects(comparison.problem, hypothesis))
     share_clause = comparison.closed_share(hypothesis).clause
-    reason_clause = f"; it is no name, as {reason}" if reason else ""
-    return f"The best hypothesis is {effects}: {share_clause}{reason_clause}."
+    sentence = f"The best hypothesis is {effects}: {share_clause}."
+    return f"{sentence} {not_named_sentence(reason)}" if reason else sentence
+
+
+def not_named_sentence(reason: str) -> str:
+    """Return the sentence that a hypothesis is not named, with the reason.
+
+    Parameters
+    ----------
+    reason : str
+        The reason as a clause or a sentence, such as "What is left follows the loads."
+    """
+    return f"It is not named, because {small(reason.removesuffix('.'))}."
 
 
 def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> str:

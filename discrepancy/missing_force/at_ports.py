@@ -18,7 +18,6 @@ from fe.runtime.patch import ModelPatch
 from .explained import NO_EFFECTS, ForceHypothesis, fit_missing_forces
 from .filtered import Process
 from .hypotheses import ColumnBuilder, scale_processes
-from .linear_trials import LinearTrials
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
@@ -47,9 +46,10 @@ class MissingForces:
     model_laws : ModelPatch
         The model's own laws at its ports, which its linear system does not contain.
     point : Point
-        The unknowns about which the trials are linear.
+        The unknowns about which the trials are linear. A hypothesis that was estimated with the
+        motion has trials of its own, which are linear about its own unknowns.
     column_builder : ColumnBuilder
-        The object that computes the columns of effects in these trials.
+        The object that linearises the trials, and computes the columns of effects in them.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -60,15 +60,16 @@ class MissingForces:
         self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
         self.hypothesis_by_port: dict[str, ForceHypothesis] = {}
+        self.column_builder = ColumnBuilder(self.problem, self.trial_indices, self.model_laws)
         # first estimate, along the motion of the model at the prior means
         self.point = self.problem.prior_mean_point(NO_EFFECTS)
-        linear_trials = self._linearise_trials()
+        linear_trials = self.column_builder.trials_about(self.point)
         for port, name in enumerate(self.ports):
             processes = self.prior_processes((port,))
             self.hypothesis_by_port[name] = fit_missing_forces(linear_trials, processes, processes)
         # second estimate, about the unknowns of the best port
-        self.point = self._clipped_point(self.hypothesis_of_best_port())
-        linear_trials = self._linearise_trials()
+        self.point = self.clipped_point(self.hypothesis_of_best_port())
+        linear_trials = self.column_builder.trials_about(self.point)
         for port, name in enumerate(self.ports):
             last_processes = self.hypothesis_by_port[name].processes
             motions = linear_trials.smooth(last_processes).motions
@@ -170,8 +171,8 @@ class MissingForces:
         """
         hypothesis = self.hypothesis_by_port[port]
         for _ in range(2):
-            self.point = self._clipped_point(hypothesis)
-            linear_trials = self._linearise_trials()
+            self.point = self.clipped_point(hypothesis)
+            linear_trials = self.column_builder.trials_about(self.point)
             # the model's own laws depend on the motion, and it on them: iterate twice
             for _ in range(2):
                 motions = linear_trials.smooth(hypothesis.processes).motions
@@ -192,24 +193,29 @@ class MissingForces:
         hypothesis : ForceHypothesis
             The hypothesis.
         """
-        point = self._clipped_point(hypothesis)
+        point = self.clipped_point(hypothesis)
         return Point(hypothesis.shared.copy(), point.local, hypothesis.effect.copy())
 
-    def _linearise_trials(self) -> LinearTrials:
-        """Return the trials, linear about `point`, and rebuild `column_builder` there."""
-        self.column_builder = ColumnBuilder(
-            self.problem, self.trial_indices, self.point, self.model_laws
-        )
-        return self.column_builder.trials_without_effects()
-
-    def _clipped_point(self, hypothesis: ForceHypothesis) -> Point:
+    def clipped_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the unknowns of a hypothesis without its effects, clipped to their ranges."""
+        return self.point_of_unknowns(hypothesis.shared, hypothesis.local)
+
+    def point_of_unknowns(self, shared: FloatArray, local_of_trials: Iterable[FloatArray]) -> Point:
+        """Return values of the unknowns as a point of the problem, clipped to their ranges.
+
+        Parameters
+        ----------
+        shared : (K,) array
+            The shared unknowns.
+        local_of_trials : iterable of (L,) array
+            The unknowns of each trial in motion.
+        """
         local = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
-        for number, values in zip(self.trial_indices, hypothesis.local, strict=True):
+        for number, values in zip(self.trial_indices, local_of_trials, strict=True):
             local[number] = values
         low, high = self.problem.shared.bounds
         # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
         # within two prior standard deviations
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(hypothesis.shared, low, high), tuple(local), np.zeros(0))
+        return Point(np.clip(shared, low, high), tuple(local), np.zeros(0))

@@ -234,23 +234,20 @@ class ColumnBuilder:
         The campaign and model.
     trial_indices : sequence of int
         The indices, in the problem, of the trials in motion.
-    point : Point
-        The unknowns about which the trials are linear.
     model_laws : ModelPatch
         The model's own laws.
     """
 
     def __init__(
-        self, problem: Problem, trial_indices: Sequence[int], point: Point, model_laws: ModelPatch
+        self, problem: Problem, trial_indices: Sequence[int], model_laws: ModelPatch
     ) -> None:
         self.problem = problem
         self.trial_indices = trial_indices
-        self.point = point
         self.model_laws = model_laws
 
-    def trials_without_effects(self) -> LinearTrials:
-        """Return the trials without any effect, linear about the point."""
-        trials = [ported_trial(self.problem, number, self.point) for number in self.trial_indices]
+    def trials_about(self, point: Point) -> LinearTrials:
+        """Return the trials without any effect, linear about values of the unknowns."""
+        trials = [ported_trial(self.problem, number, point) for number in self.trial_indices]
         return LinearTrials(trials, self.problem.shared.precision)
 
     def trials_along_motions(
@@ -451,8 +448,7 @@ class ColumnBuilder:
         patch : ModelPatch
             The patch.
         """
-        shared = self.point.shared
-        local = self.point.local[trial_index]
+        shared, local = self._linearisation_point(trial)
         # both responses are without the gains of the channels
         patched, _ = self.problem.response(trial_index, shared, local, patch)
         response, _ = self.problem.response(trial_index, shared, local, ModelPatch())
@@ -483,8 +479,7 @@ class ColumnBuilder:
         """
         problem = self.problem
         data = problem.trials[trial_index]
-        shared = self.point.shared
-        local = self.point.local[trial_index]
+        shared, local = self._linearisation_point(trial)
         # the true values at the sensors, and their rates
         response, rates = problem.response(trial_index, shared, local, ModelPatch())
         gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
@@ -506,6 +501,12 @@ class ColumnBuilder:
             clock_error = clock_rate * (trial.time - trial.time[0]) + clock_zero
             change += true_rates * clock_error[:, None]
         return trial.divide_by_noise(change * gains)
+
+    def _linearisation_point(self, trial: PortedTrial) -> tuple[FloatArray, FloatArray]:
+        """Return the shared unknowns (K,) and those of a trial (L,) about which it is linear."""
+        shared_count = self.problem.shared.unknown_count
+        shared, local = np.split(trial.linearisation_point, [shared_count])
+        return shared, local
 
 
 def _explained_rates(trial: PortedTrial, motion: TrialMotion) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Point
 
-from .explained import ForceHypothesis
+from .explained import NO_EFFECTS, ForceHypothesis
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
 from .hypotheses import ColumnBuilder
 from .linear_trials import LinearTrials, TrialMotion
@@ -56,15 +56,12 @@ class ForceShares:
         self.search = search
         campaign = search.problem.campaign
         held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
-        self._held_out: tuple[ColumnBuilder, LinearTrials] | None = None
+        self._held_out: ColumnBuilder | None = None
+        self._held_out_trials: dict[bytes, LinearTrials] = {}
         self._without_effect: dict[bool, tuple[LinearTrials, list[TrialMotion]]] = {}
         if held_out:
             problem = search.problem.with_trials(held_out)
-            numbers = range(len(problem.trials))
-            local = problem.prior_mean_point(search.hypothesis_of_all_ports.candidate).local
-            point = Point(search.point.shared, local, np.zeros(0))
-            columns = ColumnBuilder(problem, numbers, point, search.model_laws)
-            self._held_out = (columns, columns.trials_without_effects())
+            self._held_out = ColumnBuilder(problem, range(len(problem.trials)), search.model_laws)
 
     @property
     def has_held_out(self) -> bool:
@@ -224,7 +221,8 @@ class ForceShares:
             smoothed = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
             return hypothesis.linear_trials, smoothed.motions
         assert self._held_out is not None
-        builder, linear_trials = self._held_out
+        builder = self._held_out
+        linear_trials = self._held_out_trials_about_unknowns_of(hypothesis)
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
         motions = linear_trials.smooth(processes, solution).motions
         # the laws act along the motion, which in turn depends on their force: iterate
@@ -237,6 +235,25 @@ class ForceShares:
             linear_trials = builder.trials_along_motions(linear_trials, motions, effects_column)
             motions = linear_trials.smooth(processes, solution).motions
         return linear_trials, motions
+
+    def _held_out_trials_about_unknowns_of(self, hypothesis: ForceHypothesis) -> LinearTrials:
+        """Return the held-out trials, linear about the shared unknowns as the fitted ones are.
+
+        Parameters
+        ----------
+        hypothesis : ForceHypothesis
+            The hypothesis with its fitted trials.
+        """
+        assert self._held_out is not None
+        problem = self._held_out.problem
+        fitted_trial = hypothesis.linear_trials.trials[0]
+        shared = fitted_trial.linearisation_point[: problem.shared.unknown_count]
+        key = shared.tobytes()
+        if key not in self._held_out_trials:
+            local = problem.prior_mean_point(NO_EFFECTS).local
+            point = Point(shared, local, np.zeros(0))
+            self._held_out_trials[key] = self._held_out.trials_about(point)
+        return self._held_out_trials[key]
 
 
 def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:

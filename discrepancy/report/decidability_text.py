@@ -13,8 +13,16 @@ from discrepancy.judgement.separability import (
     Detectability,
     Separability,
 )
-from discrepancy.report.text import WORDS, number, unit_text
+from discrepancy.report.text import number, unit_text
 from reporting.words import listing
+
+WORDS_OF_KINDS = {
+    TrialKind.STATIC: "a static loading",
+    TrialKind.RINGDOWN: "a ring-down",
+    TrialKind.FORCED: "a forced vibration",
+    TrialKind.DRIVEN: "a driven test",
+    TrialKind.FLIGHT: "a flight",
+}
 
 
 def detectability_texts(detectability: Detectability) -> tuple[str, str, str]:
@@ -77,9 +85,14 @@ def group_lines(separability: Separability, hint: str = "the table says to which
         detectability.parameter and detectability.distance > 0.0 for detectability in detectable
     )
     if not separability.identifiers or not shows_any:
-        return [WORDS.say("nothing_shown")]
+        return [
+            "These trials show none of the effects that can be tested: nothing moves in what the "
+            "model predicts of them. Say how each trial begins and what drives it."
+        ]
     if not separability.groups:
-        return [WORDS.say("all_apart")]
+        return [
+            "Every effect that can be tested here can be told from every other at its prior median."
+        ]
     lines = []
     for group in separability.groups:
         names = [name.replace("_", " ") for name in group]
@@ -122,9 +135,16 @@ def campaign_needs(
     sentences += _sentence_on_hidden_effects(separability)
     without_noise = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if without_noise:
-        sentences.append(WORDS.say("give_noise", names=", ".join(without_noise)))
+        sentences.append(
+            f"Give a noise record for {', '.join(without_noise)} (samples at rest, or a standard "
+            "deviation with its degrees of freedom): without it the absolute gate cannot be "
+            "applied, and the sizes above take a thousandth of the range for its noise."
+        )
     if not campaign.held_out:
-        sentences.append(WORDS.say("hold_out"))
+        sentences.append(
+            "Hold out a trial, or measure one more at another level: without it nothing can be "
+            "proved."
+        )
     return sentences
 
 
@@ -148,11 +168,14 @@ def _sentence_on_group(
     changed_by_all = frozenset(TrialKind).intersection(*kinds_of_effects)
     distinguishing = changed_by_some - changed_by_all
     kinds = [kind for kind in TrialKind if kind in distinguishing and kind in missing_kinds]
-    return WORDS.say(
-        "add_kinds" if kinds else "vary",
-        names=listing(name.replace("_", " ") for name in group),
-        kinds=" or ".join(WORDS.content["kinds"][kind.value] for kind in kinds),
-    )
+    names = listing(name.replace("_", " ") for name in group)
+    if not kinds:
+        return (
+            f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
+            "load, a known added mass, another temperature, strain beside displacement."
+        )
+    texts_of_kinds = " or ".join(WORDS_OF_KINDS[kind] for kind in kinds)
+    return f"To tell {names} apart, add {texts_of_kinds}: some of them act there and others do not."
 
 
 def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
@@ -175,13 +198,12 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     factor = inf
     if nearest.distance > 0.0:
         factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5
-    sentence = WORDS.say(
-        "unseen" if len(hidden) > 1 else "unseen_one",
-        unseen=listing(
-            detectability.effect.identifier.replace("_", " ") for detectability in hidden
-        ),
-        first=nearest.effect.identifier.replace("_", " "),
-        factor=factor,
-        trials=factor**2,
-    )
-    return [sentence]
+    names = [detectability.effect.identifier.replace("_", " ") for detectability in hidden]
+    improvement = f"with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials"
+    if len(names) == 1:
+        return [f"At its prior median {names[0]} would not be seen; it would be {improvement}."]
+    first = nearest.effect.identifier.replace("_", " ")
+    return [
+        f"At their prior medians {listing(names)} would not be seen; {first} would be the first, "
+        f"{improvement}."
+    ]

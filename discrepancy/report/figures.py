@@ -31,6 +31,8 @@ from discrepancy.report.motion_figures import (
 from discrepancy.report.text import (
     WORDS,
     added_label,
+)
+from discrepancy.report.verdict_sentences import (
     force_sentence,
     port_motion_units,
     proof_scores,
@@ -329,6 +331,16 @@ def _unit_of_noise(before: ResidualSet) -> str:
     )
 
 
+def _sentence_on_held_out_trials(names: Sequence[str], *, has_both: bool) -> str:
+    """Return which trials are held out, and that two panels have one scale if there are two."""
+    if names:
+        them = "them" if len(names) > 1 else "it"
+        text = f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."
+    else:
+        text = "No trial is held out."
+    return f"{text} Both panels have one scale." if has_both else text
+
+
 @style.publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their captions are in `words.toml`.
@@ -356,7 +368,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         _add_figure(figures, "pit", pit_figure(with_pit), where=trials_text)
     if content.separability is not None:
         figure = separability_figure(content.separability)
-        _add_figure(figures, "separability", figure, confused=CONFUSION_DISTANCE)
+        _add_figure(figures, "separability", figure, confused=f"{CONFUSION_DISTANCE:g}")
     if content.self_calibration is not None:
         _add_figure(figures, "self_calibration", confusion_figure(content.self_calibration))
     return figures
@@ -378,7 +390,7 @@ def _add_residual_figures(
     after = investigation.after if added_label(investigation) else None
     held_out = [fitted.trial.name for fitted in before.trials if fitted.trial.held_out]
     scale = {
-        "beside": WORDS.say("beside", names=held_out, both=after is not None),
+        "beside": _sentence_on_held_out_trials(held_out, has_both=after is not None),
         "unit": _unit_of_noise(before),
     }
     if content.design is not None:

@@ -1,307 +1,101 @@
-"""The page of an investigation: verdict, location of the gap, reasons, proof, and origin.
+"""The page of an investigation: verdict, location of the gap, reasons, proof, and origin."""
 
-Its text and order stand in `words.toml`; here are the functions that the text uses by name.
-"""
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite, isnan
 
-from functools import partial
-from math import isfinite, nan
-from typing import Any
-
-from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.closed_share import NOMINAL_UNIT
-from discrepancy.judgement.conclusion import (
-    calibrated_parameters,
-    effects_text,
-    named_effects,
-    probability_text,
-)
+from discrepancy.catalogue.entry import Effect
+from discrepancy.judgement.closed_share import percent_with_interval
+from discrepancy.judgement.conclusion import effects_text, named_effects, probability_text
 from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
-from discrepancy.report import text as words
-from discrepancy.report.decidability_text import (
-    confused_effects,
-    detectability_texts,
-    group_lines,
-)
+from discrepancy.location.locate import Location
+from discrepancy.report import tables, verdict_tables
+from discrepancy.report.decidability_text import group_lines
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.text import WORDS
-from discrepancy.self_calibration import Proportion, SelfCalibration, ordered_outcomes
-from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
+from discrepancy.report.sizes import size_sentence
+from discrepancy.report.text import (
+    NAMING,
+    WORDS,
+    added_label,
+    estimate_text,
+    formula,
+    number,
+    parameter_text,
+    unit_text,
+)
+from discrepancy.report.verdict_sentences import (
+    error_sentence,
+    group_members,
+    headline,
+    noise_levels,
+    ordered_percent,
+    parameters_sentence,
+    proof_scores,
+    remainders_sentence,
+    tested_trials,
+)
+from discrepancy.verdict import Estimate, Gate, NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
-from reporting.templates import fill_template
-from reporting.words import capital, listing, plus_minus
-
-MOST_SHOWN_HYPOTHESES = 8
-"""Most hypotheses in the table of evidence."""
-NINETY = 1.6449
-"""Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
-
-
-def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
-    """Return the rows of the table of evidence: hypotheses with their roles.
-
-    Those of the verdict come first, then the most probable others, at most `MOST_SHOWN_HYPOTHESES`
-    in all. The hypothesis without effects is always included.
-    """
-    if verdict.group:
-        members = [*verdict.group]
-        role = "member of the group"
-    else:
-        members = [" + ".join(sorted(effect.identifier for effect in verdict.effects))]
-        role = verdict.kind.value
-    remaining_members = {member for member in members if member}
-    chosen: list[tuple[Hypothesis, str]] = []
-    remaining_hypotheses: list[tuple[Hypothesis, str]] = []
-    for hypothesis in verdict.hypotheses:  # the most probable first
-        identifiers = " + ".join(hypothesis.identifiers)
-        if identifiers in remaining_members:
-            remaining_members.remove(identifiers)
-            chosen.append((hypothesis, role))
-        else:
-            remaining_hypotheses.append((hypothesis, ""))
-    ranked = chosen + remaining_hypotheses
-    without_effects = [row for row in ranked[MOST_SHOWN_HYPOTHESES:] if not row[0].effects]
-    return ranked[:MOST_SHOWN_HYPOTHESES] + without_effects
-
-
-def not_compared_rows(verdict: Verdict) -> list[tuple[str, str]]:
-    """Return the rows of effects that were not fitted: each reason with the effects it concerns."""
-    names_by_reason: dict[str, list[str]] = {}
-    for omitted in verdict.not_fitted:
-        gain = f" ({words.number(omitted.gain, 2)} nat)" if isfinite(omitted.gain) else ""
-        reason = omitted.reason
-        if reason.startswith("screened out"):
-            reason = "screened out"
-        name = omitted.identifier.replace("_", " ")
-        names_by_reason.setdefault(reason, []).append(f"{name}{gain}")
-    rows = []
-    for reason, names in names_by_reason.items():
-        rows.append((f"{reason[:1].upper()}{reason[1:]}", listing(names)))
-    return rows
-
-
-def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
-    """Return the rows of the model's parameters: name, unit, and values with 90 % half-widths.
-
-    Values are those of the calibration, of the fit of the model as it was, and of the fit with the
-    effect. Without an effect the last is left out; without parameters there are no rows.
-    """
-    problem, search, fit = investigation.problem, investigation.search, investigation.fit
-    if problem is None or search is None or fit is None:
-        return []
-    fits = [search.no_effect]
-    if fit.candidate.terms:
-        fits.append(fit)
-    estimates_of_fits = [calibrated_parameters(problem, fitted) for fitted in fits]
-    layout = problem.shared
-    means = layout.centre.tolist()[: layout.parameter_count]
-    deviations = layout.scale.tolist()[: layout.parameter_count]
-    rows = []
-    for index, (mean, deviation) in enumerate(zip(means, deviations, strict=True)):
-        cells = [_with_half_width(mean, deviation)]
-        for estimates in estimates_of_fits:
-            cells.append(_with_half_width(estimates[index].mean, estimates[index].deviation))
-        parameter = estimates_of_fits[0][index]
-        name = parameter.name.replace("_", " ")
-        rows.append((name, words.unit_text(parameter.unit), *cells))
-    return rows
-
-
-def _with_half_width(value: float, deviation: float) -> str:
-    """Return a value with the half-width of its 90 % interval, or "exact" if its deviation is 0."""
-    return plus_minus(value, NINETY * deviation) if deviation > 0.0 else f"{value:.6g}, exact"
-
-
-def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]]:
-    """Return the table of scores without and with the effects.
-
-    Returns
-    -------
-    titles : list of str
-        Titles of the columns, such as "held out, before".
-    rows : list of list of str
-        Name of a score, or rms of a channel, and its values in these columns.
-    """
-    proof = investigation.proof
-    assert proof is not None
-    all_scores = {
-        "held out, before": proof.held_out_before,
-        "held out, after": proof.held_out_after,
-        "fitted, before": proof.fitted_before,
-        "fitted, after": proof.fitted_after,
-    }
-    scores = {title: score for title, score in all_scores.items() if score is not None}
-    fill_cell = partial(fill_template, number=words.number, p_value_text=words.p_value_text)
-    rows = []
-    for title, template in WORDS.content["scores"].items():
-        rows.append([title, *(fill_cell(template, score=score) for score in scores.values())])
-    # rms of the residuals of each channel, in the unit in which it is drawn
-    names = dict.fromkeys(name for score in scores.values() for name in score.rms)
-    for name in names:
-        factor, unit = UNITS[investigation.campaign.channels[name].quantity].drawn
-        cells = [words.number(factor * score.rms.get(name, nan)) for score in scores.values()]
-        shown_unit = "in its own unit" if unit == NOMINAL_UNIT else unit
-        rows.append([f"rms residual of {name.replace('_', ' ')} ({shown_unit})", *cells])
-    return list(scores), rows
-
-
-def effect_rows(verdict: Verdict) -> list[dict[str, Any]]:
-    """Return the rows of the table of effects: one row for each parameter of each effect.
-
-    If the verdict is a group of hypotheses that look alike, its members follow one another, and the
-    first row of each has its number as `member`. `item` is the parameter; None if an effect has
-    none.
-    """
-    rows = []
-    members = [*words.group_members(verdict).values()] or [verdict.effects]
-    for number, effects in enumerate(members, start=1):
-        label: int | str = number
-        for effect in effects:
-            for parameter in (*effect.parameters, *effect.shape) or (None,):
-                rows.append({"member": label, "effect": effect, "item": parameter})
-                label = ""
-    return rows
-
+from reporting.record_table import add_titled_table
+from reporting.words import capital, counted, listing
 
 LONGEST_CARD = 60
 """Most characters of a card of the page; the sentence below it has all names."""
+LEAST_SHOWN_SHARE = 0.05
+"""Share of the residuals below which a disagreement is left to the file."""
+MOST_SHOWN_DISAGREEMENTS = 8
+"""Most disagreements of model and data that the page lists."""
+
+OPENING = {
+    VerdictKind.NOTHING_MISSING: "is missing",
+    VerdictKind.NAMED: "is missing",
+    VerdictKind.NAMED_IN_PART: "is missing; more than noise is left",
+    VerdictKind.FAMILY: "is missing",
+    VerdictKind.GROUP: "is missing: these data cannot tell which",
+    VerdictKind.UNEXPLAINED: "fits what is missing",
+    VerdictKind.DATA_ERROR: "are at fault",
+    VerdictKind.BELOW_LIMIT: "is missing",
+}
+"""What the first card of the page says of its text."""
+
+TEXT_WITHOUT_EFFECT = {
+    VerdictKind.NOTHING_MISSING: "nothing",
+    VerdictKind.DATA_ERROR: "the data",
+    VerdictKind.BELOW_LIMIT: "nothing that could be seen",
+}
+"""The text of the first card for verdicts that name no effect."""
 
 
-def missing_effects_text(verdict: Verdict) -> str:
-    """Return what the model lacks in a few words, for a card at the top of the page."""
-    members = words.group_members(verdict)
-    if members:
-        names = listing(members, "or")
-        return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
-    if verdict.kind in WORDS.content["without"]:
-        return str(WORDS.content["without"][verdict.kind])
-    phrases = []
-    if verdict.kind in words.NAMING:
-        # an effect whose shape was freed is named by its family
-        effects = [effect for effect in verdict.effects if not (effect.shape and verdict.family)]
-        phrases.append(effects_text(effects))
-    if verdict.family:
-        phrases.append(f"an effect of the family {verdict.family}")
-    return listing(filter(None, phrases)) or "no name"
+@dataclass(frozen=True)
+class _PictureBook:
+    """The page with the figures that it may show.
 
-
-def verdict_card(verdict: Verdict) -> str:
-    """Return the verdict in one line: what is missing, where, how large, and how sure that is.
-
-    The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval.
+    Attributes
+    ----------
+    page : Page
+        The page.
+    drawings : mapping of str to bytes
+        SVG of each figure, by name.
+    figures : mapping of str to ReportFigure
+        The figures with their titles and captions.
     """
-    opening = str(WORDS.content["opening"][verdict.kind])
-    clauses = [f"{capital(missing_effects_text(verdict))} {opening}"]
-    parameters = []
-    if verdict.kind in words.NAMING:
-        parameters = [item for effect in verdict.effects for item in effect.parameters]
-    if verdict.force is not None:
-        force = verdict.force
-        clauses.append(f"{words.number(force.rms)} {force.unit} (rms) at {force.port}")
-    elif parameters:
-        value, interval = words.estimate_text(parameters[0])
-        size = f"{words.parameter_text(parameters[0])} {value}"
-        clauses.append(f"{size} {words.unit_text(parameters[0].unit)}".rstrip() + f" ({interval})")
-    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        clauses.append(f"probability {probability_text(verdict.probability)}")
-    return f"{'; '.join(clauses)}."
 
+    page: Page
+    drawings: Mapping[str, bytes]
+    figures: Mapping[str, ReportFigure]
 
-def sizes_sentence(content: ReportInput) -> str:
-    """Return the sentence on the sizes of the named effects, in SI units or by their parameters."""
-    investigation = content.investigation
-    if content.intervals and investigation.problem is not None and investigation.fit is not None:
-        effects = named_effects(investigation.problem, investigation.fit)
-        sentence = words.size_sentence(investigation, effects, content.intervals)
-        if sentence:
-            return sentence
-    verdict = investigation.verdict
-    return WORDS.say("sizes", effects=verdict.effects if verdict.kind in words.NAMING else ())
+    def add(self, *names: str) -> None:
+        """Add those of the named figures that could be drawn."""
+        for name in names:
+            if name in self.figures:
+                figure = self.figures[name]
+                self.page.add_figure(self.drawings[name], figure.caption, title=figure.title)
 
-
-def deciding_gates(verdict: Verdict) -> list[Gate]:
-    """Return the gates that compared a p-value; those that did not pass come first."""
-    compared = [
-        gate
-        for gate in verdict.gates
-        if isfinite(gate.statistic) and gate.name not in ("shape", "held-out trials")
-    ]
-    return sorted(compared, key=lambda gate: not gate.has_failed)
-
-
-def calibration_rows(self_calibration: SelfCalibration) -> list[tuple[str, str, Proportion]]:
-    """Return the rows of the self-calibration: hidden or not, the outcome, and its fraction."""
-    rows = []
-    for title, null in (("an effect was hidden", False), ("nothing was hidden", True)):
-        for outcome in ordered_outcomes(self_calibration, null=null):
-            rows.append((title, outcome, self_calibration.share(outcome, null=null)))
-    rows.append(
-        ("named rightly", "90 % intervals that hold the true value", self_calibration.coverage())
-    )
-    return rows
-
-
-FUNCTIONS = (
-    evidence_rows,
-    not_compared_rows,
-    parameter_rows,
-    score_rows,
-    effect_rows,
-    missing_effects_text,
-    verdict_card,
-    sizes_sentence,
-    deciding_gates,
-    calibration_rows,
-    group_lines,
-    confused_effects,
-    detectability_texts,
-    gap_times_sentence,
-    words.hypothesis_name,
-    words.headline,
-    words.error_sentence,
-    words.noise_levels,
-    words.remainders_sentence,
-    words.tested_trials,
-    words.force_sentence,
-)
-"""Functions that the templates of the page and of the command call by name."""
-
-
-def template_values(content: ReportInput) -> dict[str, Any]:
-    """Return the names that the templates of the page and of the command use, with their values."""
-    investigation = content.investigation
-    verdict = investigation.verdict
-    proof = investigation.proof
-    effects = () if investigation.search is None else investigation.search.effects
-    fault_sentences = {fault.sentence for fault in investigation.faults}
-    without_effects = None
-    for hypothesis in verdict.hypotheses:
-        if not hypothesis.effects:
-            without_effects = hypothesis
-            break
-    return {
-        **{function.__name__: function for function in FUNCTIONS},
-        "texts": WORDS.content,
-        "content": content,
-        "found": investigation,
-        "origin": content.origin,
-        "tried": content.self_calibration,
-        "able": content.separability,
-        "verdict": verdict,
-        "proof": proof,
-        "force": verdict.force,
-        "location": investigation.location,
-        "fitted": verdict.kind is not VerdictKind.DATA_ERROR,
-        "named": verdict.kind in words.NAMING,
-        "nothing": verdict.kind in KINDS_WITHOUT_GAP,
-        "label": words.added_label(investigation),
-        "members": words.group_members(verdict),
-        "scored": None if proof is None else words.proof_scores(proof),
-        "without": without_effects,
-        "catalogue": {effect.identifier: effect for effect in effects},
-        "remarks": [remark for remark in verdict.remarks if remark not in fault_sentences],
-    }
+    def add_paragraph(self, text: str) -> None:
+        """Add a paragraph, unless it is empty."""
+        if text.strip():
+            self.page.add_paragraph(text.strip())
 
 
 def render_report(
@@ -319,6 +113,8 @@ def render_report(
         The figures with their captions, as `report_figures` returned them.
     """
     origin = content.origin
+    investigation = content.investigation
+    verdict = investigation.verdict
     page = Page(
         origin.campaign,
         f"What the model “{origin.model}” lacks beside these data: located, named, added, proved",
@@ -328,5 +124,281 @@ def render_report(
             f"{origin.provenance.seed}.",
         ),
     )
-    WORDS.fill(page, drawings, figures=figures, **template_values(content))
+    book = _PictureBook(page, drawings, figures)
+    _add_verdict(book, content)
+    if verdict.kind is not VerdictKind.DATA_ERROR:  # faulty data are not fitted
+        if verdict.next_experiments:
+            _add_next_experiment(book, verdict)
+        _add_location(book, investigation)
+        page.add_section("What it looks like")
+        book.add("history", "backbone", "spectrum", "load")
+        _add_reasons(book, investigation)
+        if investigation.proof is not None:
+            _add_proof(book, investigation)
+        if content.separability is not None or content.self_calibration is not None:
+            _add_decidability(book, content)
+    _add_data(book, investigation)
+    page.add_section("Where it comes from")
+    page.begin_fold("Campaign, model, command and versions")
+    add_titled_table(page, tables.origin_table(origin))
+    page.end_fold()
     return page.render()
+
+
+def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
+    """Add the first section: the verdict in one line, as a picture, in sentences and as a table.
+
+    The sentences are unfolded on demand.
+    """
+    investigation = content.investigation
+    verdict = investigation.verdict
+    page = book.page
+    page.add_section("Verdict")
+    page.add_card(verdict_card(verdict))
+    book.add("missing_force")
+    page.begin_fold("How this was concluded")
+    page.add_highlights(_cards(investigation))
+    page.add_notice(headline(verdict))
+    book.add_paragraph(f"{sizes_sentence(content)} {error_sentence(investigation)}")
+    book.add_paragraph(_meaning(verdict))
+    book.add_paragraph(remainders_sentence(verdict))
+    catalogue: dict[str, Effect] = {}
+    if investigation.search is not None:
+        catalogue = {effect.identifier: effect for effect in investigation.search.effects}
+    if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
+        names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
+        book.add_paragraph(
+            f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
+        )
+    effects: dict[str, NamedEffect] = {}
+    for effect in verdict.effects:
+        effects.setdefault(effect.identifier, effect)
+    for effect in effects.values():
+        if effect.identifier in catalogue:
+            book.add_paragraph(_effect_paragraph(effect, catalogue[effect.identifier]))
+    page.end_fold()
+    add_titled_table(page, verdict_tables.effects_table(content))
+
+
+def verdict_card(verdict: Verdict) -> str:
+    """Return the verdict in one line: what is missing, where, how large, and how sure that is.
+
+    The size is the missing force at its port or, if there is no such force, the first parameter of
+    a named effect with its 90 % interval.
+    """
+    clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
+    parameters: list[Estimate] = []
+    if verdict.kind in NAMING:
+        for effect in verdict.effects:
+            parameters += effect.parameters
+    if verdict.force is not None:
+        force = verdict.force
+        clauses.append(f"{number(force.rms)} {force.unit} (rms) at {force.port}")
+    elif parameters:
+        value, interval = estimate_text(parameters[0])
+        size = f"{parameter_text(parameters[0])} {value} {unit_text(parameters[0].unit)}".rstrip()
+        clauses.append(f"{size} ({interval})")
+    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        clauses.append(f"probability {probability_text(verdict.probability)}")
+    return f"{'; '.join(clauses)}."
+
+
+def _cards(investigation: Investigation) -> list[tuple[str, str]]:
+    """Return the cards at the top of the page: values with their meaning."""
+    verdict = investigation.verdict
+    proof = investigation.proof
+    force = verdict.force
+    cards = [(capital(missing_effects_text(verdict)), OPENING[verdict.kind])]
+    if force is not None:
+        cards.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
+    if proof is not None and proof.closed is not None:
+        taken_or_added = "taken away" if proof.closed.value >= 0.0 else "added"
+        reservation = "" if verdict.kind in NAMING else ", which is no name"
+        meaning = (
+            f"of the mean square error in {proof.closed.trials} trials is {taken_or_added} by "
+            f"{added_label(investigation)}{reservation}"
+        )
+        cards.append((percent_with_interval(proof.closed), meaning))
+    if force is not None and force.ordered_by and not tested_trials(force):
+        meaning = f"what orders it: {ordered_percent(force)} % of its variance"
+        cards.append((listing(force.ordered_by), meaning))
+    if proof is not None and force is None:
+        before, _, trials = proof_scores(proof)
+        if isfinite(before.chi_square_per_sample):
+            meaning = f"times the noise, rms on {trials} trials, before and after"
+            cards.append((" → ".join(noise_levels(proof)), meaning))
+    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        cards.append((probability_text(verdict.probability), "probability of the verdict"))
+    gates = deciding_gates(verdict)
+    if gates and proof is None and force is None:
+        gate = gates[0]
+        meaning = f"p of the {gate.name}; a fit has at least {number(gate.limit)}"
+        cards.append((number(gate.statistic), meaning))
+    return cards
+
+
+def missing_effects_text(verdict: Verdict) -> str:
+    """Return what the model lacks in a few words, for a card at the top of the page."""
+    members = group_members(verdict)
+    if members:
+        names = listing(members, "or")
+        return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
+    if verdict.kind in TEXT_WITHOUT_EFFECT:
+        return TEXT_WITHOUT_EFFECT[verdict.kind]
+    phrases = []
+    if verdict.kind in NAMING:
+        # an effect whose shape was freed is named by its family
+        effects = [effect for effect in verdict.effects if not (effect.shape and verdict.family)]
+        phrases.append(effects_text(effects))
+    if verdict.family:
+        phrases.append(f"an effect of the family {verdict.family}")
+    return listing(filter(None, phrases)) or "no name"
+
+
+def sizes_sentence(content: ReportInput) -> str:
+    """Return the sentence on the sizes of the named effects, in SI units or by their parameters."""
+    investigation = content.investigation
+    if content.intervals and investigation.problem is not None and investigation.fit is not None:
+        effects = named_effects(investigation.problem, investigation.fit)
+        sentence = size_sentence(investigation, effects, content.intervals)
+        if sentence:
+            return sentence
+    verdict = investigation.verdict
+    return parameters_sentence(verdict.effects if verdict.kind in NAMING else ())
+
+
+def deciding_gates(verdict: Verdict) -> list[Gate]:
+    """Return the gates that compared a p-value; those that did not pass come first."""
+    compared = [
+        gate
+        for gate in verdict.gates
+        if isfinite(gate.statistic) and gate.name not in ("shape", "held-out trials")
+    ]
+    return sorted(compared, key=lambda gate: not gate.has_failed)
+
+
+def _meaning(verdict: Verdict) -> str:
+    """Return what the kind of the verdict means, as far as the absolute fit could be judged."""
+    could_not_judge = any(
+        gate.name == "absolute fit" and gate.passed is None for gate in verdict.gates
+    )
+    unjudged: dict[str, str] = WORDS.content["unjudged"]
+    if could_not_judge and verdict.kind in unjudged:
+        return unjudged[verdict.kind]
+    return str(WORDS.content["meaning"][verdict.kind])
+
+
+def _effect_paragraph(effect: NamedEffect, entry: Effect) -> str:
+    """Return the equation, the signature and the source of an effect of the catalogue."""
+    return (
+        f"{capital(effect.name)}: {formula(entry.equation)}. "
+        f"Its signature: {formula(entry.signature).rstrip('.')}. "
+        f"Source: {entry.reference.rstrip('.')}."
+    )
+
+
+def _add_next_experiment(book: _PictureBook, verdict: Verdict) -> None:
+    """Add the section on the tests that would decide most."""
+    book.page.add_section("Next experiment")
+    book.add_paragraph(
+        "What would decide most between the hypotheses that are still open, for its cost. "
+        "Information is the mutual information of hypothesis and data, by simulation; ln 2 = 0.69 "
+        "nat decides between two equals."
+    )
+    book.add_paragraph(gap_times_sentence(verdict.windows))
+    add_titled_table(book.page, verdict_tables.next_experiments_table(verdict))
+
+
+def _add_location(book: _PictureBook, investigation: Investigation) -> None:
+    """Add the section on where, when and in which channel model and data disagree."""
+    location = investigation.location
+    has_no_gap = investigation.verdict.kind in KINDS_WITHOUT_GAP
+    book.page.add_section("What the model leaves" if has_no_gap else "Where the gap is")
+    book.add_paragraph(_location_sentence(location, has_no_gap=has_no_gap))
+    book.add("residual_map", "residual_table", "time_line")
+    if location is not None:
+        shown = [found for found in location.disagreements if found.share >= LEAST_SHOWN_SHARE]
+        for disagreement in shown[:MOST_SHOWN_DISAGREEMENTS]:
+            book.add_paragraph(f"• {disagreement.sentence}")
+        add_titled_table(book.page, tables.global_tests_table(location))
+
+
+def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
+    """Return whether the residuals of the model as it was stand out, and in how many cells."""
+    if location is None:
+        return "The residuals were not searched for patterns."
+    if location.disagrees:
+        significant = sum(cell.significant for cell in location.cells)
+        discoveries = "is a discovery" if significant == 1 else "are discoveries"
+        return (
+            f"The model as it was disagrees with the fitted trials; {significant} of "
+            f"{counted(len(location.cells), 'cell')} of the map (channel, trial, and bin of time, "
+            f"amplitude, frequency or load) {discoveries} at a false discovery rate of 5 %."
+        )
+    if has_no_gap:
+        return (
+            "No global test finds a disagreement between the model as it was and the fitted trials."
+        )
+    return (
+        "The residuals of the model as it was do not stand out by themselves, or cannot be judged "
+        "by their size: what is missing shows where effects are fitted, or in the missing force."
+    )
+
+
+def _add_reasons(book: _PictureBook, investigation: Investigation) -> None:
+    """Add the section on the gates, the compared hypotheses, and the model's parameters."""
+    verdict = investigation.verdict
+    book.page.add_section("Why this verdict")
+    add_titled_table(book.page, verdict_tables.gates_table(verdict))
+    add_titled_table(book.page, verdict_tables.evidence_table(verdict))
+    add_titled_table(book.page, verdict_tables.not_compared_table(verdict))
+    add_titled_table(book.page, tables.parameters_table(investigation))
+
+
+def _add_proof(book: _PictureBook, investigation: Investigation) -> None:
+    """Add the section on the scores of held-out trials, without and with the effects."""
+    proof = investigation.proof
+    assert proof is not None
+    book.page.add_section("Proof on held-out trials")
+    if investigation.verdict.kind not in NAMING:
+        book.page.add_notice(
+            f'The model "with the effect" has {added_label(investigation)} here, which is not '
+            "named: the figures say how well it does, not that it is there."
+        )
+    book.add_paragraph(proof.remaining)
+    book.add("pit")
+    add_titled_table(book.page, tables.proof_table(investigation, proof))
+
+
+def _add_decidability(book: _PictureBook, content: ReportInput) -> None:
+    """Add the section on which effects the campaign can detect and tell apart."""
+    page = book.page
+    page.add_section("What this campaign can decide")
+    if content.separability is not None:
+        for line in group_lines(content.separability):
+            book.add_paragraph(line)
+    book.add("separability")
+    if content.separability is not None:
+        add_titled_table(page, tables.detectable_sizes_table(content.separability))
+    book.add("self_calibration")
+    if content.self_calibration is not None:
+        add_titled_table(page, tables.self_calibration_table(content.self_calibration))
+
+
+def remarks_beside_faults(investigation: Investigation) -> list[str]:
+    """Return the remarks of the verdict that do not repeat a fault of the data."""
+    fault_sentences = {fault.sentence for fault in investigation.faults}
+    return [remark for remark in investigation.verdict.remarks if remark not in fault_sentences]
+
+
+def _add_data(book: _PictureBook, investigation: Investigation) -> None:
+    """Add the section on the faults of the data, the remarks, and the trials."""
+    book.page.add_section("Data")
+    for fault in investigation.faults:
+        book.page.add_notice(fault.sentence)
+    remarks = remarks_beside_faults(investigation)
+    for remark in remarks:
+        book.add_paragraph(f"• {remark}")
+    if not investigation.faults and not remarks:
+        book.add_paragraph("No fault was found.")
+    add_titled_table(book.page, tables.trials_table(investigation.campaign))

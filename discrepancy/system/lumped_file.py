@@ -95,26 +95,47 @@ class LumpedDescription(ModelDescription):
 
     what: ClassVar[str] = "a lumped model"
     mass: Matrix = ()
+    """Mass matrix (n, n), its diagonal, or one number; left out if there are only states [SI]."""
     stiffness: Matrix = ()
+    """Stiffness matrix (n, n), its diagonal, or one number [SI]."""
     damping: Damping | None = None
+    """Damping of the displacements."""
     capacity: Matrix = ()
+    """Matrix T (m, m) of the states, its diagonal, or one number [SI]."""
     conductance: Matrix = ()
+    """Matrix R (m, m) of the states, its diagonal, or one number [SI]."""
     coupling: CouplingSection = CouplingSection()
+    """Coupling of displacements and states."""
     free: bool = False
+    """Whether the stiffness may be singular, as of a body that can float away."""
     characteristic_length: Positive | None = None
+    """Length that stands for the size of the structure; by default the largest station, or 1
+    [m]."""
     mass_part: tuple[PartSection, ...] = ()
+    """Parts of the mass that a parameter can scale."""
     stiffness_part: tuple[PartSection, ...] = ()
+    """Parts of the stiffness that a parameter can scale."""
     damping_part: tuple[PartSection, ...] = ()
+    """Parts of the damping that a parameter can scale."""
     capacity_part: tuple[PartSection, ...] = ()
+    """Parts of the capacity that a parameter can scale."""
     conductance_part: tuple[PartSection, ...] = ()
+    """Parts of the conductance that a parameter can scale."""
     load: tuple[LoadSection, ...] = ()
+    """Constant loads."""
     input: tuple[InputSection, ...] = ()
+    """Loads and prescribed motions that a trial records."""
     output: tuple[OutputSection, ...] = Field(min_length=1)
+    """What channels can measure."""
     port: tuple[PortSection, ...] = ()
     place: tuple[PlaceSection, ...] = ()
+    """Places where a mass can be added."""
     root: RootSection | None = None
+    """Motion of the structure if its base turns."""
     law: tuple[LawSection, ...] = ()
+    """Laws that the model has at ports."""
     controller: tuple[ControllerSection, ...] = ()
+    """Controllers."""
     parameter: tuple[ScaledParameter, ...] = ()
 
     @classmethod

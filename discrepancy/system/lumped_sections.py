@@ -43,9 +43,21 @@ def _as_matrix(value: object) -> object:
     return rows
 
 
-Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list)]
-Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_rows)]
-Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_matrix)]
+_NumbersOrRows = Number | tuple[Number, ...] | tuple[tuple[Number, ...], ...]
+"""What a file may state for a matrix: one number, a row or diagonal, or all rows."""
+Vector = Annotated[
+    tuple[Number, ...],
+    Field(min_length=1),
+    BeforeValidator(as_list, json_schema_input_type=Number | tuple[Number, ...]),
+]
+Rows = Annotated[
+    tuple[tuple[Number, ...], ...],
+    BeforeValidator(_as_rows, json_schema_input_type=_NumbersOrRows),
+]
+Matrix = Annotated[
+    tuple[tuple[Number, ...], ...],
+    BeforeValidator(_as_matrix, json_schema_input_type=_NumbersOrRows),
+]
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 """Fraction of critical damping. Above one a mode is overdamped; a value above three is an error."""
 
@@ -53,10 +65,20 @@ Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 class Damping(Section):
     """`[damping]`: modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
 
-    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(as_list)] | None = None
+    ratios: (
+        Annotated[
+            tuple[Ratio, ...],
+            BeforeValidator(as_list, json_schema_input_type=Ratio | tuple[Ratio, ...]),
+        ]
+        | None
+    ) = None
+    """Damping ratio of each mode, as a fraction of critical damping [1]."""
     matrix: Matrix | None = None
+    """Damping matrix, its diagonal, or one number [SI]."""
     alpha: NotNegative | None = None
+    """Factor on the mass matrix [1/s]."""
     beta: NotNegative | None = None
+    """Factor on the stiffness matrix [s]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the fault that there is not exactly one kind of damping."""
@@ -69,18 +91,21 @@ class PartSection(NamedSection):
     """`[[mass_part]]` and the like: a part that a parameter can scale, added to the base matrix."""
 
     matrix: Matrix
+    """Matrix of the part, its diagonal, or one number [SI]."""
 
 
 class NamedVector(NamedSection):
     """A row of the unknowns with a name."""
 
     vector: Vector
+    """One number for each unknown, displacements before states [SI]."""
 
 
 class LoadSection(NamedVector):
     """`[[load]]`: a constant load; with `through`, the matrix of that name times the vector."""
 
     through: Name | None = None
+    """Name of a matrix, such as "mass", by which the vector is multiplied."""
 
 
 class InputSection(LoadSection):
@@ -93,7 +118,9 @@ class InputSection(LoadSection):
     """
 
     quantity: Quantity = Quantity.FORCE
+    """What the input is; a motion is prescribed, anything else is a load."""
     station_derivative: Vector | None = None
+    """Change of the vector for each metre that the load moves along the structure [1/m]."""
 
 
 class OutputSection(NamedSection):
@@ -105,10 +132,15 @@ class OutputSection(NamedSection):
     """
 
     vector: Vector | None = None
+    """One number for each unknown; the output is their sum times these [SI]."""
     quantity: Quantity = Quantity.DISPLACEMENT
+    """What the output is."""
     reaction: Name | None = None
+    """Name of an input: the output is the force by which its motion is prescribed."""
     controller: Name | None = None
+    """Name of a controller: the output is what it gives."""
     constant: Number = 0.0
+    """Number that is added [SI]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the rules on an output: it is of one kind only, and a reaction is a force."""
@@ -128,8 +160,11 @@ class CouplingSection(Section):
     """`[coupling]` between n displacements and m states."""
 
     force_of_states: Rows | None = None
+    """Matrix F (n, m): forces on the displacements for each state [SI]."""
     flow_of_speeds: Rows | None = None
+    """Matrix G (m, n): flows into the states for each speed [SI]."""
     flow_of_displacements: Rows | None = None
+    """Matrix H (m, n): flows into the states for each displacement [SI]."""
 
 
 class PortSection(NamedVector):
@@ -141,6 +176,7 @@ class PortSection(NamedVector):
     """
 
     acts: Vector | None = None
+    """Vector along which a law acts, if it is not `vector` [SI]."""
 
 
 class LawSection(Section):
@@ -149,8 +185,11 @@ class LawSection(Section):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     name: Name
+    """Name of the law, which is unique."""
     kind: Name
+    """Kind of the law, a primitive at a port."""
     port: Name
+    """Name of the port."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the rules on a law: its kind is known, and its numbers are allowed for it."""
@@ -181,13 +220,21 @@ class ControllerSection(NamedSection):
     """
 
     vector: Vector
+    """One number for each unknown; the controller measures their sum times these [SI]."""
     acts: Vector
+    """One number for each unknown: where what it gives acts [SI]."""
     quantity: Quantity
+    """What it measures."""
     reference: Name | None = None
+    """Name of the input of the campaign that it follows; by default zero."""
     proportional: Number = 0.0
+    """Gain P of the error [SI]."""
     derivative: Number = 0.0
+    """Gain D of the slope of the error [SI]."""
     integral: Number = 0.0
+    """Gain I of the integral of the error [SI]."""
     derivative_of: Literal["error", "measurement"] = "error"
+    """Whether D acts on the slope of the error, or of the measurement alone."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the fault of a controller without a gain."""
@@ -199,17 +246,26 @@ class PlaceSection(NamedVector):
     """`[[place]]`: a place along the structure, by its station [m], where a mass can be added."""
 
     station: Number
+    """Place along the structure [m]."""
 
 
 class RootSection(Section):
     """`[root]`: motion of the unknowns if the structure rotates rigidly about its root [m/rad]."""
 
     lever: Vector
+    """Motion of each unknown if the base turns [m/rad]."""
 
 
 class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a calibrated factor that scales the terms that it names."""
 
-    terms: Annotated[tuple[Name, ...], BeforeValidator(as_list)]
+    terms: Annotated[
+        tuple[Name, ...],
+        BeforeValidator(as_list, json_schema_input_type=Name | tuple[Name, ...]),
+    ]
+    """Names of what the factor scales: a matrix, a part, an input, a load, a law, a controller or
+    one of its gains; one or several."""
     mean: Number = 1.0
+    """Mean of the posterior [1]."""
     low: NotNegative
+    """Least possible value [1]."""

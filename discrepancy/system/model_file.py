@@ -24,16 +24,22 @@ class NamedSection(Section):
     """A table with a name."""
 
     name: Name
+    """Name, which is unique among tables of this kind."""
 
 
 class ParameterSection(NamedSection):
     """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
 
     mean: Number
+    """Mean of the posterior [unit of the parameter]."""
     deviation: NotNegative
+    """Standard deviation of the posterior [unit of the parameter]."""
     low: Number
+    """Least possible value [unit of the parameter]."""
     high: Number
+    """Largest possible value [unit of the parameter]."""
     unit: str = "1"
+    """Unit of the parameter."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield a mean out of its range."""
@@ -50,9 +56,13 @@ class ModelDescription(Section):
     what: ClassVar[str]
     """The model with its article, for sentences."""
     format: Literal[1]
+    """Version of the format."""
     name: Name
+    """Name of the model."""
     parameter: tuple[ParameterSection, ...] = ()
+    """Calibrated parameters."""
     port: tuple[NamedSection, ...] = ()
+    """Where an internal force can act."""
 
     @classmethod
     def parse(cls, content: object, source: str = "the model") -> Self:

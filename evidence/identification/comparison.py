@@ -1,7 +1,8 @@
-"""The identified wing beside the published model, row by row, fitted and held out apart."""
+"""The identified wing beside the published model, row by row; rows say what was fitted."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +10,11 @@ from numpy.typing import NDArray
 from .local_model import LocalModel
 from .responses import ReducedWing
 from .targets import (
+    HEALTHY,
     LEVELS,
     LIBRARY_FACTOR,
     LIMITING_GAUGE,
+    NO_LOSS,
     Targets,
     fitted_states,
 )
@@ -20,25 +23,51 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 PERCENT = 100.0
+GAUGE_COUNT = 24
+"""Number of gauges of the published library."""
+PUBLISHED_FACTOR_SLOPE = (0.4114, 0.3244)
+"""d ln f / d ln e of both bending modes in the published model."""
+PUBLISHED_MASS_SLOPE = (-0.5075, -0.2925)
+"""d ln f / d m_pitot [1/kg] of both bending modes in the published model."""
+
+
+class Limits(NamedTuple):
+    """Limits that the project set for the differences of an output; None for no limit.
+
+    Attributes
+    ----------
+    rms : float or None
+        Limit of the root mean square.
+    largest : float or None
+        Limit of the largest difference.
+    """
+
+    rms: float | None = None
+    largest: float | None = None
+
+
+NO_LIMITS = Limits()
+LAST = len(LEVELS) - 1
+"""Index of the largest loss of a region."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One line of the comparison.
+    """Differences of an output between model and published folders, a row of the comparison.
 
     Attributes
     ----------
     name, unit : str
-        What, and its unit.
+        Name of the output, and the unit of its differences.
     rms, largest : float
-        Of the differences, model less target; equal up to the sign for a single figure, whose sign `largest`
-        keeps.
+        Root mean square of the differences, model minus target, and the largest difference with
+        its sign. For a single figure, they agree except for the sign.
     wanted_rms, wanted_largest : float or None
-        What was aimed at.
+        Limits that the project set; None for no limit.
     fitted : bool
-        Whether the numbers of the design were fitted to it.
+        Whether the numbers of the design were fitted to the output.
     where : str
-        Where the largest difference is; gauges are counted from 1.
+        Gauge of the largest difference, counted from 1; empty if no gauge has it.
     """
 
     name: str
@@ -52,33 +81,37 @@ class Comparison:
 
     @property
     def reached(self) -> bool | None:
-        """Whether all wanted limits are kept; None where there are none."""
-        limits = [(self.rms, self.wanted_rms), (abs(self.largest), self.wanted_largest)]
-        kept = [found <= limit for found, limit in limits if limit is not None]
-        return all(kept) if kept else None
+        """Whether all wanted limits are kept; None if the row has no limits."""
+        if self.wanted_rms is None and self.wanted_largest is None:
+            return None
+        rms_is_kept = self.wanted_rms is None or self.rms <= self.wanted_rms
+        largest_is_kept = self.wanted_largest is None or abs(self.largest) <= self.wanted_largest
+        return rms_is_kept and largest_is_kept
 
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """What the model says to everything that the published folders hold.
+    """Outputs of the model for everything that the published folders hold.
 
     Attributes
     ----------
-    strain : (5, 5, G) dimensionless
-    strain_slope : (G,)
+    strain : (5, 5, G) array
+        Strains [1] of the gauges at 3g, for z1 and z2 at `targets.LEVELS`.
+    strain_slope : (G,) array
+        d ln strain / d ln e of the healthy wing.
     tip_stiffness, tip_stiffness_slope : float
-        N/m, 1.
-    frequency : (R, 2) Hz
-        In the published rows.
-    frequency_at_one, frequency_slope, mass_slope : (2,)
-        Hz, 1, 1/kg.
-    curvature : float
-        Second difference of ln f2 along the line of the rows, over the square of ln e.
+        Tip stiffness [N/m] at e = 1, and d ln k / d ln e.
+    frequency : (R, 2) array
+        First and second flapwise bending frequency [Hz] in each published row.
+    frequency_at_one, frequency_slope, mass_slope : (2,) arrays
+        Both frequencies [Hz] at e = 1, and the slopes of their logarithms in ln e [1] and in the
+        pitot's mass [1/kg].
     mode_order : tuple of int
-        Places of the two flapwise bending modes.
-    modes : (m,) Hz
-        Lowest frequencies.
+        Numbers of the two flapwise bending modes among all modes, from 0.
+    modes : (m,) array
+        Lowest frequencies [Hz].
     unknowns : int
+        Number of free unknowns of the full model.
     """
 
     strain: FloatArray
@@ -96,125 +129,177 @@ class Outputs:
     @property
     def ratio(self) -> FloatArray:
         """Strain over healthy strain (5, 5, G)."""
-        return np.asarray(self.strain / self.strain[0, 0])
+        return np.asarray(self.strain / self.healthy_strain)
+
+    @property
+    def healthy_strain(self) -> FloatArray:
+        """Strains (G,) of the healthy wing."""
+        return np.asarray(self.strain[HEALTHY])
 
     @property
     def interaction(self) -> FloatArray:
-        """Departure (G,) of the strain at (80, 80) from the product of both effects."""
-        return _interaction(self.strain)
+        """Relative difference (G,) of the strain at (80, 80) % from the product of both effects."""
+        both_damaged = self.strain[LAST, LAST]
+        first_damaged = self.strain[LAST, NO_LOSS]
+        second_damaged = self.strain[NO_LOSS, LAST]
+        ratio = both_damaged * self.healthy_strain / (first_damaged * second_damaged)
+        return np.asarray(ratio - 1.0)
 
 
 def outputs(model: LocalModel, targets: Targets) -> Outputs:
-    """Evaluate everything at the point of a local model."""
+    """Evaluate all outputs at the point of a local model."""
     wing: ReducedWing = model.wing
-    stiffness = wing.tip_stiffness().value
-    at_one, factor_slope, mass_slope = wing.frequency_slopes()
-    rows = targets.young_modulus_factor, targets.servo_mass, targets.pitot_mass
+    every_state = np.ones((len(LEVELS), len(LEVELS)), dtype=bool)
+    tip_stiffness, tip_stiffness_slope = wing.tip_stiffness().value
+    log_frequency = wing.log_frequency(
+        targets.young_modulus_factor, targets.servo_mass, targets.pitot_mass
+    )
+    regression = wing.frequency_slopes()
     return Outputs(
-        strain=wing.all_strains(np.ones((len(LEVELS), len(LEVELS)), dtype=bool)).value,
+        strain=wing.all_strains(every_state).value,
         strain_slope=wing.strain_slope(LIBRARY_FACTOR).value,
-        tip_stiffness=float(stiffness[0]),
-        tip_stiffness_slope=float(stiffness[1]),
-        frequency=np.exp(wing.log_frequency(*rows).value),
-        frequency_at_one=np.exp(at_one.value),
-        frequency_slope=factor_slope.value,
-        mass_slope=mass_slope.value,
+        tip_stiffness=float(tip_stiffness),
+        tip_stiffness_slope=float(tip_stiffness_slope),
+        frequency=np.exp(log_frequency.value),
+        frequency_at_one=np.exp(regression.log_frequency.value),
+        frequency_slope=regression.factor_slope.value,
+        mass_slope=regression.mass_slope.value,
         mode_order=model.mode_order,
         modes=model.frequency,
         unknowns=model.unknowns,
     )
 
 
-def compare(found: Outputs, targets: Targets) -> tuple[Comparison, ...]:
-    """Compare row by row; the wanted limits are those that the project set itself."""
-    return tuple(
-        row for group in (_stiffness, _strains, _ratios, _frequencies) for row in group(found, targets)
+def compare(model_outputs: Outputs, targets: Targets) -> tuple[Comparison, ...]:
+    """Compare the outputs row by row; the limits are those that the project set itself."""
+    return (
+        *_stiffness(model_outputs, targets),
+        *_strains(model_outputs, targets),
+        *_ratios(model_outputs, targets),
+        *_frequencies(model_outputs, targets),
     )
-
-
-def _interaction(strain: FloatArray) -> FloatArray:
-    return np.asarray(strain[-1, -1] * strain[0, 0] / (strain[-1, 0] * strain[0, -1]) - 1.0)
 
 
 def _row(
     name: str,
     unit: str,
     difference: FloatArray | float,
-    wanted: tuple[float | None, float | None],
+    limits: Limits,
     fitted: bool,
     *,
     by_gauge: bool = True,
 ) -> Comparison:
+    """Return the row of an output.
+
+    Parameters
+    ----------
+    name, unit : str
+        Name of the output, and the unit of its differences.
+    difference : (..., G) array or float
+        Differences, model minus target.
+    limits : Limits
+        Limits of the differences.
+    fitted : bool
+        Whether the numbers of the design were fitted to the output.
+    by_gauge : bool
+        Whether the last axis of the differences is that of the gauges.
+    """
     values = np.atleast_1d(difference)
     worst = int(np.nanargmax(np.abs(values)))
-    where = f"gauge {worst % 24 + 1}" if by_gauge and values.size > 2 else ""
+    where = f"gauge {worst % GAUGE_COUNT + 1}" if by_gauge and values.size > 2 else ""
     return Comparison(
-        name,
-        unit,
-        float(np.sqrt(np.nanmean(values**2))),
-        float(values.ravel()[worst]),
-        *wanted,
-        fitted,
-        where,
+        name=name,
+        unit=unit,
+        rms=float(np.sqrt(np.nanmean(values**2))),
+        largest=float(values.ravel()[worst]),
+        wanted_rms=limits.rms,
+        wanted_largest=limits.largest,
+        fitted=fitted,
+        where=where,
     )
 
 
-def _stiffness(found: Outputs, targets: Targets) -> Iterator[Comparison]:
-    relative = PERCENT * (found.tip_stiffness / targets.tip_stiffness - 1.0)
-    yield _row("tip stiffness k(1)", "%", relative, (None, 0.1), True)
-    relative = PERCENT * (found.tip_stiffness_slope / targets.tip_stiffness_slope - 1.0)
-    yield _row("d ln k / d ln e", "%", relative, (None, 0.5), True)
+def _stiffness(model_outputs: Outputs, targets: Targets) -> Iterator[Comparison]:
+    """Yield the rows of the static test."""
+    relative = PERCENT * (model_outputs.tip_stiffness / targets.tip_stiffness - 1.0)
+    yield _row("tip stiffness k(1)", "%", relative, Limits(largest=0.1), True)
+    relative = PERCENT * (model_outputs.tip_stiffness_slope / targets.tip_stiffness_slope - 1.0)
+    yield _row("d ln k / d ln e", "%", relative, Limits(largest=0.5), True)
 
 
-def _strains(found: Outputs, targets: Targets) -> Iterator[Comparison]:
-    healthy = PERCENT * (found.strain[0, 0] / targets.strain[0, 0] - 1.0)
-    yield _row("24 healthy strains at 3g", "%", healthy, (2.2, 4.5), True)
-    yield _row(
-        "slopes d ln strain / d ln e", "1", found.strain_slope - targets.strain_slope, (0.02, 0.05), True
-    )
-    limiting = found.strain[:, 0, LIMITING_GAUGE] / targets.strain[:, 0, LIMITING_GAUGE] - 1.0
-    yield _row("limiting gauge, all z1", "%", PERCENT * limiting, (None, 1.0), True, by_gauge=False)
-    largest = found.strain.argmax(axis=2) != LIMITING_GAUGE
-    yield _row("states whose largest gauge is another", "1", float(largest.sum()), (None, 0.0), False)
+def _strains(model_outputs: Outputs, targets: Targets) -> Iterator[Comparison]:
+    """Yield the rows of the strains."""
+    healthy = PERCENT * (model_outputs.healthy_strain / targets.healthy_strain - 1.0)
+    yield _row("24 healthy strains at 3g", "%", healthy, Limits(rms=2.2, largest=4.5), True)
+
+    slope = model_outputs.strain_slope - targets.strain_slope
+    yield _row("slopes d ln strain / d ln e", "1", slope, Limits(rms=0.02, largest=0.05), True)
+
+    limiting_strain = model_outputs.strain[:, NO_LOSS, LIMITING_GAUGE]
+    limiting = PERCENT * (limiting_strain / targets.strain[:, NO_LOSS, LIMITING_GAUGE] - 1.0)
+    yield _row("limiting gauge, all z1", "%", limiting, Limits(largest=1.0), True, by_gauge=False)
+
+    is_another = model_outputs.strain.argmax(axis=2) != LIMITING_GAUGE
+    count = float(is_another.sum())
+    yield _row("states whose largest gauge is another", "1", count, Limits(largest=0.0), False)
 
 
-def _ratios(found: Outputs, targets: Targets) -> Iterator[Comparison]:
-    points = PERCENT * (found.ratio - targets.ratio)
+def _ratios(model_outputs: Outputs, targets: Targets) -> Iterator[Comparison]:
+    """Yield the rows of the strain ratios under damage."""
+    points = PERCENT * (model_outputs.ratio - targets.ratio)
     fitted = fitted_states()
-    one, two = np.zeros_like(fitted), np.zeros_like(fitted)
-    one[1:, 0] = two[0, 1:] = True
+    only_first = np.zeros_like(fitted)
+    only_first[1:, NO_LOSS] = True
+    only_second = np.zeros_like(fitted)
+    only_second[NO_LOSS, 1:] = True
     combined = np.zeros_like(fitted)
     combined[1:, 1:] = True
-    last = np.zeros_like(fitted)
-    last[-1, -1] = True
     unit = "points"
-    yield _row("strain ratios under z1", unit, points[one], (1.1, 3.2), True)
-    yield _row("  z1 at 40, 80 %", unit, points[one & fitted], (None, None), True)
-    yield _row("  z1 at 20, 60 %", unit, points[one & ~fitted], (None, None), False)
-    yield _row("strain ratios under z2", unit, points[two], (0.85, 4.7), True)
-    yield _row("  z2 at 40, 80 %", unit, points[two & fitted], (None, None), True)
-    yield _row("  z2 at 20, 60 %", unit, points[two & ~fitted], (None, None), False)
-    yield _row("strain ratios at (80, 80)", unit, points[last], (1.5, 4.5), False)
-    yield _row("strain ratios, 16 combined states", unit, points[combined], (1.5, 4.5), False)
-    yield _row("interaction at (80, 80)", "1", found.interaction, (None, None), False)
+
+    limits = Limits(rms=1.1, largest=3.2)
+    yield _row("strain ratios under z1", unit, points[only_first], limits, True)
+    yield _row("  z1 at 40, 80 %", unit, points[only_first & fitted], NO_LIMITS, True)
+    yield _row("  z1 at 20, 60 %", unit, points[only_first & ~fitted], NO_LIMITS, False)
+
+    limits = Limits(rms=0.85, largest=4.7)
+    yield _row("strain ratios under z2", unit, points[only_second], limits, True)
+    yield _row("  z2 at 40, 80 %", unit, points[only_second & fitted], NO_LIMITS, True)
+    yield _row("  z2 at 20, 60 %", unit, points[only_second & ~fitted], NO_LIMITS, False)
+
+    limits = Limits(rms=1.5, largest=4.5)
+    yield _row("strain ratios at (80, 80)", unit, points[LAST, LAST], limits, False)
+    yield _row("strain ratios, 16 combined states", unit, points[combined], limits, False)
+    yield _row("interaction at (80, 80)", "1", model_outputs.interaction, NO_LIMITS, False)
 
 
-def _frequencies(found: Outputs, targets: Targets) -> Iterator[Comparison]:
-    for mode in range(2):
+def _frequencies(model_outputs: Outputs, targets: Targets) -> Iterator[Comparison]:
+    """Yield the rows of both flapwise bending frequencies."""
+    slope_limits = (Limits(largest=1.0), Limits(largest=2.0))
+    for mode, slope_limit in enumerate(slope_limits):
         name = f"f{mode + 1}"
-        at_one = PERCENT * (found.frequency_at_one[mode] / targets.all_frequency_at_one[mode] - 1.0)
-        yield _row(f"{name} at e = 1", "%", float(at_one), (None, 0.05), True)
-        rows = PERCENT * (found.frequency[:, mode] / targets.frequency[:, mode] - 1.0)
-        for kind, chosen in (("fitted", targets.fitted_row), ("held-out", ~targets.fitted_row)):
-            label = f"{name}, {kind} half of the rows"
-            yield _row(label, "%", rows[chosen], (None, 0.07), kind == "fitted", by_gauge=False)
-        slope = PERCENT * (found.frequency_slope[mode] / PUBLISHED_FACTOR_SLOPE[mode] - 1.0)
-        yield _row(f"d ln {name} / d ln e", "%", float(slope), (None, (1.0, 2.0)[mode]), True)
-        slope = PERCENT * (found.mass_slope[mode] / PUBLISHED_MASS_SLOPE[mode] - 1.0)
-        yield _row(f"d ln {name} / d m_pitot", "%", float(slope), (None, 2.0), True)
-    between = found.mode_order[1] - found.mode_order[0] - 1
-    yield _row("modes between the two", "1", float(between), (None, 1.0), False)
+        ratio = model_outputs.frequency_at_one[mode] / targets.all_frequency_at_one[mode]
+        difference = float(PERCENT * (ratio - 1.0))
+        yield _row(f"{name} at e = 1", "%", difference, Limits(largest=0.05), True)
 
+        rows = PERCENT * (model_outputs.frequency[:, mode] / targets.frequency[:, mode] - 1.0)
+        halves = {"fitted": targets.fitted_row, "held-out": ~targets.fitted_row}
+        for half, is_in_half in halves.items():
+            yield _row(
+                f"{name}, {half} half of the rows",
+                "%",
+                rows[is_in_half],
+                Limits(largest=0.07),
+                half == "fitted",
+                by_gauge=False,
+            )
 
-PUBLISHED_FACTOR_SLOPE = (0.4114, 0.3244)
-PUBLISHED_MASS_SLOPE = (-0.5075, -0.2925)
+        ratio = model_outputs.frequency_slope[mode] / PUBLISHED_FACTOR_SLOPE[mode]
+        difference = float(PERCENT * (ratio - 1.0))
+        yield _row(f"d ln {name} / d ln e", "%", difference, slope_limit, True)
+
+        ratio = model_outputs.mass_slope[mode] / PUBLISHED_MASS_SLOPE[mode]
+        difference = float(PERCENT * (ratio - 1.0))
+        yield _row(f"d ln {name} / d m_pitot", "%", difference, Limits(largest=2.0), True)
+    first, second = model_outputs.mode_order
+    modes_between = float(second - first - 1)
+    yield _row("modes between the two", "1", modes_between, Limits(largest=1.0), False)

@@ -4,4 +4,4 @@ from calibration.errors import CalibrationError
 
 
 class IdentificationError(CalibrationError, ValueError):
-    """A wing design cannot be identified: the start is laid out otherwise, or the fit does not converge."""
+    """A wing design cannot be identified from the start and data that were given."""

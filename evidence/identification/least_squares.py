@@ -1,12 +1,14 @@
 """Gauss-Newton on the full model: each step solves the whole problem on a local reduced model.
 
-The objective is half the sum of squares of the weighted residuals and of the parameters' distances from their
-prior means in prior standard deviations: the maximum of the posterior density if the weights were standard
-deviations of independent normal errors, which they are not (see `targets.Weights`).
+The objective is half the sum of squares of the weighted residuals and of the distances of the
+parameters from their prior means, in prior standard deviations. If the weights were standard
+deviations of independent normal errors, its minimum would be the maximum of the posterior density.
+They are not (see `targets.Weights`).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +20,22 @@ from reporting.progress import Progress, SilentProgress
 
 from .errors import IdentificationError
 from .local_model import LocalModel, build_local_model
-from .parameters import FreeParameter, deviations, scaled, values_of, with_values
+from .parameters import (
+    FreeParameter,
+    deviations,
+    prior_means,
+    scaled,
+    values_of,
+    with_values,
+)
 from .residuals import fitted_residuals
 from .targets import Targets, Weights
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 CONVERGED = 0.02
-"""A fit has converged when its next step changes no parameter by more than this many prior deviations."""
+"""Largest next step of a converged fit, in prior standard deviations."""
 RADIUS = 1.0
 """First and largest step of any parameter, in prior standard deviations."""
 _REFUSED = 1e6  # residual of a point at which the local model has no meaning
@@ -33,16 +43,17 @@ _REFUSED = 1e6  # residual of a point at which the local model has no meaning
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """One full model tried: the best point so far, and the next step from it.
+    """One iteration: the best point until then, and the next step from it.
 
     Attributes
     ----------
     objective, misfit : float
-        At the best point; the part of the data alone.
+        Objective at the best point, and the contribution of the data to it.
     largest_step : float
-        Largest change of a parameter in the next step, in prior deviations.
+        Largest change of a parameter in the next step, in prior standard deviations.
     limited : bool
-        Whether that step was cut at the reach of the derivatives, so that its length says nothing.
+        Whether the next step was cut where the derivatives stop being valid. Its length then says
+        nothing about convergence.
     """
 
     objective: float
@@ -60,15 +71,15 @@ class DesignFit:
     design : WingDesign
         The identified wing.
     parameters : tuple of FreeParameter
-        What was free.
-    values, start : (P,)
-        Where they are and where they began, each in its unit.
+        The P free parameters.
+    values, start : (P,) arrays
+        Values of the parameters at the end and at the start, each in its unit.
     model : LocalModel
-        The wing there, with derivatives.
+        The identified wing with derivatives.
     iterations : tuple of Iteration
-        Models tried, also those that were refused.
+        All iterations, with those whose step was refused.
     converged : bool
-        Whether the next step is below the tolerance, and not only because it was cut.
+        Whether the next step is below the tolerance and was not cut.
     """
 
     design: WingDesign
@@ -80,19 +91,124 @@ class DesignFit:
     converged: bool
 
 
-def objective(
+class WeightedResiduals(NamedTuple):
+    """Residuals of outputs and parameters, in standard deviations.
+
+    Attributes
+    ----------
+    residual : (M + P,) array
+        Residuals of the outputs, then distances of the parameters from their prior means.
+    jacobian : (M + P, P) array
+        Derivatives of the residuals, per prior standard deviation of each parameter.
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+
+    @property
+    def objective(self) -> float:
+        """Half the sum of squares of the residuals."""
+        return 0.5 * float(self.residual @ self.residual)
+
+
+def weighted_residuals(
     model: LocalModel,
     values: FloatArray,
     parameters: Sequence[FreeParameter],
     targets: Targets,
     weights: Weights,
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals and priors (M + P,) and their derivatives (M + P, P) in prior standard deviations."""
-    data = fitted_residuals(model.at(values), targets, weights)
-    return (
-        np.concatenate([data.value, scaled(parameters, values)]),
-        np.vstack([data.gradient * deviations(parameters), np.eye(len(parameters))]),
+) -> WeightedResiduals:
+    """Return the residuals of outputs and parameters.
+
+    Parameters
+    ----------
+    model : LocalModel
+        The wing.
+    values : (P,) array
+        Values of the parameters, each in its unit.
+    parameters : sequence of FreeParameter
+        The free parameters.
+    targets : Targets
+        Published outputs.
+    weights : Weights
+        Standard deviations of the residuals.
+    """
+    outputs = fitted_residuals(model.at(values), targets, weights)
+    output_jacobian = outputs.gradient * deviations(parameters)
+    prior_jacobian = np.eye(len(parameters))
+    return WeightedResiduals(
+        np.concatenate([outputs.value, scaled(parameters, values)]),
+        np.vstack([output_jacobian, prior_jacobian]),
     )
+
+
+@dataclass(eq=False)
+class _LocalProblem:
+    """Least-squares problem on a local model, in the parameters that are not held.
+
+    All points are in prior standard deviations from the prior mean.
+
+    Attributes
+    ----------
+    model : LocalModel
+        The wing.
+    parameters : sequence of FreeParameter
+        The P free parameters of the fit.
+    targets : Targets
+        Published outputs.
+    weights : Weights
+        Standard deviations of the residuals.
+    is_varied : (P,) array of bool
+        Whether a parameter is varied; the others are held.
+    point : (P,) array
+        Point of all parameters, of which the problem reads those that are held.
+    """
+
+    model: LocalModel
+    parameters: Sequence[FreeParameter]
+    targets: Targets
+    weights: Weights
+    is_varied: BoolArray
+    point: FloatArray
+    _last: tuple[bytes, WeightedResiduals] | None = field(default=None, init=False)
+
+    def residual(self, varied: FloatArray) -> FloatArray:
+        """Return the residuals at a point of the varied parameters."""
+        return self._evaluate(varied).residual
+
+    def jacobian(self, varied: FloatArray) -> FloatArray:
+        """Return the derivatives of the residuals in the varied parameters."""
+        return self._evaluate(varied).jacobian
+
+    def values_at(self, varied: FloatArray) -> FloatArray:
+        """Return the values (P,) of all parameters, each in its unit."""
+        point = self.point.copy()
+        point[self.is_varied] = varied
+        return np.asarray(prior_means(self.parameters) + deviations(self.parameters) * point)
+
+    def _evaluate(self, varied: FloatArray) -> WeightedResiduals:
+        """Return residuals and derivatives; the last ones are kept, as the solver asks twice."""
+        key = varied.tobytes()
+        if self._last is not None and self._last[0] == key:
+            return self._last[1]
+        try:
+            residuals = self._residuals(self.values_at(varied))
+        except (IdentificationError, np.linalg.LinAlgError):
+            # Too far for the derivatives of the geometry: the solver takes a shorter step.
+            return self._refused()
+        reduced = WeightedResiduals(residuals.residual, residuals.jacobian[:, self.is_varied])
+        self._last = (key, reduced)
+        return reduced
+
+    def _residuals(self, values: FloatArray) -> WeightedResiduals:
+        return weighted_residuals(self.model, values, self.parameters, self.targets, self.weights)
+
+    def _refused(self) -> WeightedResiduals:
+        """Return residuals so large that the solver leaves the point."""
+        count = len(self._residuals(self.model.values).residual)
+        return WeightedResiduals(
+            np.full(count, _REFUSED), np.zeros((count, int(self.is_varied.sum())))
+        )
 
 
 def minimise_local(
@@ -101,56 +217,57 @@ def minimise_local(
     targets: Targets,
     weights: Weights,
     radius: float,
-    held: dict[int, float] | None = None,
+    held: Mapping[int, float] | None = None,
 ) -> FloatArray:
-    """Minimise on a local model within `radius` prior deviations of its point; the values (P,).
+    """Return the values (P,) of the parameters that minimise the objective on a local model.
 
-    A parameter with a stride below one may move less. `held` fixes parameters, by their number, at values.
+    Parameters
+    ----------
+    model : LocalModel
+        The wing.
+    parameters : sequence of FreeParameter
+        The P free parameters.
+    targets : Targets
+        Published outputs.
+    weights : Weights
+        Standard deviations of the residuals.
+    radius : float
+        Largest step of a parameter from the point of the model, in prior standard deviations. A
+        parameter with a stride below one may move less.
+    held : mapping of int to float, optional
+        Parameters that are held at a value, by their number.
     """
-    held = held or {}
     width = deviations(parameters)
-    mean = np.array([parameter.mean for parameter in parameters])
+    mean = prior_means(parameters)
     lower = (np.array([parameter.lower for parameter in parameters]) - mean) / width
     upper = (np.array([parameter.upper for parameter in parameters]) - mean) / width
     start = np.clip(scaled(parameters, model.values), lower, upper)
     reach = radius * np.array([parameter.stride for parameter in parameters])
-    low, high = np.maximum(lower, start - reach), np.minimum(upper, start + reach)
-    free = np.array([number not in held for number in range(len(parameters))])
-    point = start.copy()
-    for number, value in held.items():
-        point[number] = (value - mean[number]) / width[number]
-    first, _ = objective(model, model.values, parameters, targets, weights)
-    cache: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    low = np.maximum(lower, start - reach)
+    high = np.minimum(upper, start + reach)
 
-    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = x.tobytes()
-        if key not in cache:
-            cache.clear()
-            whole = point.copy()
-            whole[free] = x
-            try:
-                residual, jacobian = objective(model, mean + width * whole, parameters, targets, weights)
-            except (IdentificationError, np.linalg.LinAlgError):
-                # Too far for the derivatives of the geometry: the solver takes a shorter step.
-                return np.full_like(first, _REFUSED), np.zeros((len(first), int(free.sum())))
-            cache[key] = residual, jacobian[:, free]
-        return cache[key]
+    is_varied = np.ones(len(parameters), dtype=bool)
+    point = start.copy()
+    for number, value in (held or {}).items():
+        is_varied[number] = False
+        point[number] = (value - mean[number]) / width[number]
+    problem = _LocalProblem(model, parameters, targets, weights, is_varied, point)
 
     # An interior start: the solver refuses to begin on a bound.
     margin = 1e-9 * (high - low)
+    interior_start = np.clip(start, low + margin, high - margin)
     result = least_squares(
-        lambda x: evaluate(x)[0],
-        np.clip(start, low + margin, high - margin)[free],
-        jac=lambda x: evaluate(x)[1],
-        bounds=(low[free], high[free]),
+        problem.residual,
+        interior_start[is_varied],
+        jac=problem.jacobian,
+        bounds=(low[is_varied], high[is_varied]),
         x_scale=1.0,
         xtol=1e-10,
         ftol=1e-12,
         gtol=1e-10,
         max_nfev=100,
     )
-    point[free] = result.x
-    return np.asarray(mean + width * point)
+    return problem.values_at(result.x)
 
 
 def identify(
@@ -168,80 +285,113 @@ def identify(
     Parameters
     ----------
     start : WingDesign
-        Where to begin, and everything that is not free.
+        Design at which the fit begins; everything that is not free stays as in this design.
     parameters : sequence of FreeParameter
-        What is free.
+        The free parameters.
     targets : Targets
         Published outputs.
     weights : Weights, optional
-        What one unit of misfit is.
+        Standard deviations of the residuals.
     largest_count : int
         Largest number of local models.
     tolerance : float
         Largest next step of a converged fit, in prior standard deviations.
     progress : Progress, optional
-        Told of each iteration.
+        Receives a note on each iteration.
 
     Raises
     ------
     IdentificationError
-        If the start lies outside the bounds or is laid out otherwise.
+        If the start lies outside the bounds of a parameter, or lacks a number that is free.
     """
-    weights, progress = weights or Weights(), progress or SilentProgress()
+    weights = weights or Weights()
+    progress = progress or SilentProgress()
     parameters = tuple(parameters)
-    first = values_of(start, parameters)
-    for parameter, value in zip(parameters, first, strict=True):
-        if not parameter.lower <= value <= parameter.upper:
-            raise IdentificationError(
-                f"the start has {value:g} {parameter.unit} for '{parameter.name}', outside its bounds of "
-                f"{parameter.lower:g} to {parameter.upper:g}; begin with another design."
-            )
+    first_values = values_of(start, parameters)
+    _check_start(parameters, first_values)
+    values = first_values
     model = build_local_model(start, parameters, progress)
-    residual, _ = objective(model, first, parameters, targets, weights)
-    cost = 0.5 * float(residual @ residual)
-    radius, iterations, converged = RADIUS, [], False
-    values = first
-    for count in range(largest_count):
+    cost = weighted_residuals(model, values, parameters, targets, weights).objective
+    radius = RADIUS
+    iterations = []
+    converged = False
+    for count in range(1, largest_count + 1):
         proposed = minimise_local(model, parameters, targets, weights, radius)
-        step = float(np.abs(scaled(parameters, proposed) - scaled(parameters, values)).max())
+        distance = scaled(parameters, proposed) - scaled(parameters, values)
+        step = float(np.abs(distance).max())
         misfit = cost - 0.5 * float(np.sum(scaled(parameters, values) ** 2))
         limited = _is_limited(parameters, values, proposed, radius)
         iterations.append(Iteration(cost, misfit, step, limited))
+        remark = " (as far as allowed)" if limited else ""
         progress.note(
-            f"model {count + 1}: objective {cost:.3f}, next step {step:.3f} prior deviations"
-            + (" (as far as allowed)" if limited else "")
+            f"model {count}: objective {cost:.3f}, next step {step:.3f} prior deviations{remark}"
         )
         if step <= tolerance and not limited:
             converged = True
             break
-        if count == largest_count - 1:
+        if count == largest_count:
             break
+        # The full model at the proposed point decides whether the step is taken.
         try:
-            trial = build_local_model(with_values(model.design, parameters, proposed), parameters, progress)
-            residual, _ = objective(trial, proposed, parameters, targets, weights)
-            trial_cost = 0.5 * float(residual @ residual)
+            design = with_values(model.design, parameters, proposed)
+            trial = build_local_model(design, parameters, progress)
+            residuals = weighted_residuals(trial, proposed, parameters, targets, weights)
+            trial_cost = residuals.objective
         except FiniteElementError as error:
             progress.note(f"a step was refused: {error}")
-            trial, trial_cost = model, np.inf
+            trial = model
+            trial_cost = np.inf
         if trial_cost < cost:
-            model, values, cost = trial, proposed, trial_cost
+            model = trial
+            values = proposed
+            cost = trial_cost
             radius = min(RADIUS, 2.0 * radius)
         else:
             radius = 0.25 * min(radius, step)
-            if radius < tolerance:  # no step that is worth one lowers the objective of the full model
+            # No step above the tolerance lowers the objective of the full model.
+            if radius < tolerance:
                 break
-    return DesignFit(model.design, parameters, values, first, model, tuple(iterations), converged)
+    return DesignFit(
+        design=model.design,
+        parameters=parameters,
+        values=values,
+        start=first_values,
+        model=model,
+        iterations=tuple(iterations),
+        converged=converged,
+    )
+
+
+def _check_start(parameters: Sequence[FreeParameter], values: FloatArray) -> None:
+    """Raise `IdentificationError` if a value (P,) lies outside the bounds of its parameter."""
+    for parameter, value in zip(parameters, values, strict=True):
+        if not parameter.lower <= value <= parameter.upper:
+            raise IdentificationError(
+                f"the start has {value:g} {parameter.unit} for '{parameter.name}', outside its "
+                "bounds of "
+                f"{parameter.lower:g} to {parameter.upper:g}; begin with another design."
+            )
 
 
 def _is_limited(
     parameters: Sequence[FreeParameter], values: FloatArray, proposed: FloatArray, radius: float
 ) -> bool:
-    """Whether a step ends at the reach of the derivatives, and not at a bound of its parameter."""
+    """Return whether a step was cut by the radius, and not only by the bounds of parameters.
+
+    Parameters
+    ----------
+    parameters : sequence of FreeParameter
+        The P free parameters.
+    values, proposed : (P,) arrays
+        Values before and after the step, each in its unit.
+    radius : float
+        Largest step of a parameter, in prior standard deviations.
+    """
     change = np.abs(scaled(parameters, proposed) - scaled(parameters, values))
-    at_reach = change >= 0.99 * radius * np.array([parameter.stride for parameter in parameters])
-    width = deviations(parameters)
-    at_bound = [
-        min(value - p.lower, p.upper - value) <= 1e-6 * w
-        for value, p, w in zip(proposed, parameters, width, strict=True)
-    ]
-    return bool(np.any(at_reach & ~np.array(at_bound)))
+    stride = np.array([parameter.stride for parameter in parameters])
+    at_reach = change >= 0.99 * radius * stride
+    lower = np.array([parameter.lower for parameter in parameters])
+    upper = np.array([parameter.upper for parameter in parameters])
+    distance_to_bound = np.minimum(proposed - lower, upper - proposed)
+    at_bound = distance_to_bound <= 1e-6 * deviations(parameters)
+    return bool(np.any(at_reach & ~at_bound))

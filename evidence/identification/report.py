@@ -1,21 +1,28 @@
 """The report of an identification: one self-contained page."""
 
+import itertools
 from collections.abc import Sequence
 
 from reporting.figures import to_svg
 from reporting.page import Page, PageColumn, Table
 
-from .comparison import Comparison
+from .comparison import PERCENT, Comparison
 from .figures import gauge_figure, identifiability_figure, profile_figure
-from .identified import Identification
+from .identified import Identification, RemeshedComparison
 from .parameters import deviations, scaled
 
 SOURCE = (
-    "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
+    "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation "
+    "for "
     "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347. "
     "doi:10.1038/s43588-021-00069-0; data: the repositories UAV-Digital-Twin and "
     "UAV-Experimental-Calibration."
 )
+
+REACHED_TEXT = {True: "yes", False: "no", None: ""}
+"""Text on whether an output keeps its limits; None if it has no limits."""
+WEAK_DIRECTIONS = 6
+"""Number of weak directions in the report."""
 
 
 def report_page(result: Identification) -> str:
@@ -23,7 +30,8 @@ def report_page(result: Identification) -> str:
     fit = result.fit
     page = Page(
         "Identification of the wing design",
-        f"{len(fit.parameters)} numbers of '{fit.design.name}' fitted to outputs of the published model",
+        f"{len(fit.parameters)} numbers of '{fit.design.name}' fitted to outputs of the published "
+        "model",
         footer=(SOURCE, f"Design {fit.design.hash[:16]}."),
     )
     page.add_section("Result")
@@ -31,7 +39,8 @@ def report_page(result: Identification) -> str:
     page.add_section("Free numbers")
     page.add_table(
         _parameter_table(result),
-        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths follow "
+        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths "
+        "follow "
         "from the weights and are to be compared with each other.",
         title="Free numbers before and after",
     )
@@ -50,22 +59,27 @@ def _add_result(page: Page, result: Identification) -> None:
     """Add the outputs beside the published ones, in figures, by gauge and on other meshes."""
     fit = result.fit
     if not fit.converged:
-        page.add_notice("The fit has not converged: its next step is larger than the stated tolerance.")
-    reached = [row for row in result.comparison if row.reached is not None]
+        page.add_notice(
+            "The fit has not converged: its next step is larger than the stated tolerance."
+        )
+    rows_with_limits = [row for row in result.comparison if row.reached is not None]
+    reached_count = sum(bool(row.reached) for row in rows_with_limits)
+    last = fit.iterations[-1]
     page.add_highlights(
         (
-            (f"{sum(bool(row.reached) for row in reached)} of {len(reached)}", "wanted limits kept"),
-            (f"{fit.iterations[-1].objective:.1f}", "objective (half the sum of squares)"),
+            (f"{reached_count} of {len(rows_with_limits)}", "wanted limits kept"),
+            (f"{last.objective:.1f}", "objective (half the sum of squares)"),
             (
                 f"{result.analysis.effective_count:.1f} of {len(fit.parameters)}",
                 "numbers the data determine",
             ),
-            (f"{fit.iterations[-1].largest_step:.3f}", "next step, in prior standard deviations"),
+            (f"{last.largest_step:.3f}", "next step, in prior standard deviations"),
         )
     )
     page.add_table(
         comparison_table(result.comparison, result.before),
-        "Differences, model less published. Fitted: the numbers of the design were fitted to it. Where "
+        "Differences, model less published. Fitted: the numbers of the design were fitted to it. "
+        "Where "
         "levels are mixed, the lines below say which were held out.",
         title="Every output beside the published one",
     )
@@ -87,15 +101,18 @@ def _add_identifiability(page: Page, result: Identification) -> None:
     """Add what the data determine, what the prior does, and the objective about the fit."""
     page.add_figure(
         to_svg(identifiability_figure(result.fit, result.analysis)),
-        "(a) Below one, the prior decides along a direction. (b) One: the data tell nothing of the number.",
+        "(a) Below one, the prior decides along a direction. (b) One: the data tell nothing of the "
+        "number.",
         title="Identifiability",
     )
-    page.add_table(_direction_table(result), "The six that the data tell least of.", title="Weak directions")
+    page.add_table(
+        _direction_table(result), "The six that the data tell least of.", title="Weak directions"
+    )
     if result.analysis.fixed:
         page.add_table(
             Table(
                 (PageColumn("number"), PageColumn("imitated", "%", numeric=True)),
-                [(name, f"{100.0 * share:.1f}") for name, share in result.analysis.fixed],
+                [(name, f"{PERCENT * fraction:.1f}") for name, fraction in result.analysis.fixed],
             ),
             "Which share of the effect of a number that was not free the free ones can imitate.",
             title="Numbers that were held",
@@ -103,13 +120,16 @@ def _add_identifiability(page: Page, result: Identification) -> None:
     if result.profiles:
         page.add_figure(
             to_svg(profile_figure(result.profiles)),
-            "Objective along one number with all others fitted again, on the reduced model of the last step.",
+            "Objective along one number with all others fitted again, on the reduced model of the "
+            "last step.",
             title="Profiles",
         )
 
 
-def comparison_table(rows: Sequence[Comparison], before: Sequence[Comparison]) -> Table:
-    """Return the comparison before and after as a table."""
+def comparison_table(
+    comparison: Sequence[Comparison], comparison_before: Sequence[Comparison]
+) -> Table:
+    """Return the comparison after the fit, and that of the start, as a table."""
     columns = (
         PageColumn("output"),
         PageColumn("unit"),
@@ -121,49 +141,61 @@ def comparison_table(rows: Sequence[Comparison], before: Sequence[Comparison]) -
         PageColumn("kept"),
         PageColumn("fitted"),
     )
-    return Table(
-        columns,
-        [
+    rows = []
+    for row, row_before in zip(comparison, comparison_before, strict=True):
+        rows.append(
             (
                 row.name,
-                row.unit if row.unit != "1" else "",
-                "" if row.wanted_rms is None else f"{row.wanted_rms:g}",
-                "" if row.wanted_largest is None else f"{row.wanted_largest:g}",
-                _pair(old),
-                _pair(row),
+                _unit_text(row.unit),
+                _limit_text(row.wanted_rms),
+                _limit_text(row.wanted_largest),
+                _difference_text(row_before),
+                _difference_text(row),
                 row.where,
-                {True: "yes", False: "no", None: ""}[row.reached],
+                REACHED_TEXT[row.reached],
                 "yes" if row.fitted else "held out",
             )
-            for row, old in zip(rows, before, strict=True)
-        ],
-    )
-
-
-def remeshed_table(remeshed: Sequence[tuple[float, int, Sequence[Comparison]]]) -> Table:
-    """Return the comparison on several meshes, (refinement, unknowns, rows) each, as a table."""
-    first = remeshed[0][2]
-    columns = [PageColumn("output"), PageColumn("unit")]
-    columns += [
-        PageColumn(f"x{refinement:g}", f"{unknowns:,}", numeric=True) for refinement, unknowns, _ in remeshed
-    ]
-    rows = [
-        (row.name, row.unit if row.unit != "1" else "", *(_pair(rows[number]) for _, _, rows in remeshed))
-        for number, row in enumerate(first)
-    ]
+        )
     return Table(columns, rows)
 
 
-def _pair(row: Comparison) -> str:
-    if abs(abs(row.largest) - row.rms) < 1e-9 * abs(row.rms) + 1e-15:
+def remeshed_table(remeshed: Sequence[RemeshedComparison]) -> Table:
+    """Return the comparison on several meshes as a table."""
+    columns = [PageColumn("output"), PageColumn("unit")]
+    for mesh in remeshed:
+        columns.append(PageColumn(f"x{mesh.refinement:g}", f"{mesh.unknowns:,}", numeric=True))
+    rows = []
+    for rows_of_output in zip(*(mesh.comparison for mesh in remeshed), strict=True):
+        output = rows_of_output[0]
+        differences = [_difference_text(row) for row in rows_of_output]
+        rows.append((output.name, _unit_text(output.unit), *differences))
+    return Table(columns, rows)
+
+
+def _unit_text(unit: str) -> str:
+    """Return a unit as it is printed; a fraction has none."""
+    return "" if unit == "1" else unit
+
+
+def _limit_text(limit: float | None) -> str:
+    """Return a limit as it is printed; empty if there is none."""
+    return "" if limit is None else f"{limit:g}"
+
+
+def _difference_text(row: Comparison) -> str:
+    """Return root mean square and largest difference; a single figure with its sign instead."""
+    is_single = abs(abs(row.largest) - row.rms) < 1e-9 * abs(row.rms) + 1e-15
+    if is_single:
         return f"{row.largest:+.3g}".replace("-", "−")
     return f"{row.rms:.3g} / {abs(row.largest):.3g}"
 
 
 def _parameter_table(result: Identification) -> Table:
-    fit, analysis = result.fit, result.analysis
-    shift = scaled(fit.parameters, fit.values)
-    width = analysis.width * deviations(fit.parameters)
+    """Return the free numbers before and after the fit as a table."""
+    fit = result.fit
+    analysis = result.analysis
+    shifts = scaled(fit.parameters, fit.values)
+    deviations_after = analysis.width * deviations(fit.parameters)
     columns = (
         PageColumn("number"),
         PageColumn("unit"),
@@ -173,41 +205,54 @@ def _parameter_table(result: Identification) -> Table:
         PageColumn("width after / before", numeric=True),
         PageColumn("why it is free"),
     )
-    rows = [
-        (
-            parameter.name,
-            parameter.unit if parameter.unit != "1" else "",
-            f"{parameter.mean:.4g} ± {parameter.standard_deviation:.2g}",
-            f"{value:.5g} ± {own:.2g}",
-            f"{moved:+.2f}".replace("-", "−"),
-            f"{ratio:.2f}",
-            parameter.why,
+    rows = []
+    for number, parameter in enumerate(fit.parameters):
+        value = fit.values[number]
+        rows.append(
+            (
+                parameter.name,
+                _unit_text(parameter.unit),
+                f"{parameter.mean:.4g} ± {parameter.standard_deviation:.2g}",
+                f"{value:.5g} ± {deviations_after[number]:.2g}",
+                f"{shifts[number]:+.2f}".replace("-", "−"),
+                f"{analysis.width[number]:.2f}",
+                parameter.why,
+            )
         )
-        for parameter, value, own, moved, ratio in zip(
-            fit.parameters, fit.values, width, shift, analysis.width, strict=True
-        )
-    ]
     return Table(columns, rows)
 
 
 def _direction_table(result: Identification) -> Table:
+    """Return the directions that the data determine least, the weakest first, as a table."""
     analysis = result.analysis
-    weak = range(len(analysis.singular_values) - 1, max(-1, len(analysis.singular_values) - 7), -1)
-    return Table(
-        (PageColumn("singular value", numeric=True), PageColumn("direction, in prior deviations")),
-        [(f"{analysis.singular_values[n]:.3g}", analysis.describe(n)) for n in weak],
+    weakest_first = reversed(range(len(analysis.singular_values)))
+    columns = (
+        PageColumn("singular value", numeric=True),
+        PageColumn("direction, in prior deviations"),
     )
+    rows = []
+    for number in itertools.islice(weakest_first, WEAK_DIRECTIONS):
+        singular_value = analysis.singular_values[number]
+        rows.append((f"{singular_value:.3g}", analysis.describe(number)))
+    return Table(columns, rows)
 
 
 def _iteration_table(result: Identification) -> Table:
+    """Return the iterations of the fit as a table."""
     columns = (
         PageColumn("model"),
         PageColumn("objective", numeric=True),
         PageColumn("of it misfit", numeric=True),
         PageColumn("next step", "prior deviations", numeric=True),
     )
-    rows = [
-        (str(number), f"{row.objective:.2f}", f"{row.misfit:.2f}", f"{row.largest_step:.4f}")
-        for number, row in enumerate(result.fit.iterations, start=1)
-    ]
+    rows = []
+    for number, iteration in enumerate(result.fit.iterations, start=1):
+        rows.append(
+            (
+                str(number),
+                f"{iteration.objective:.2f}",
+                f"{iteration.misfit:.2f}",
+                f"{iteration.largest_step:.4f}",
+            )
+        )
     return Table(columns, rows)

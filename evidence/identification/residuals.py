@@ -1,4 +1,4 @@
-"""Residuals of the fitted outputs in units of their weights, with derivatives and a label each."""
+"""Residuals of the fitted outputs, divided by their weights, with derivatives."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from .responses import ReducedWing, Value
 from .targets import (
+    HEALTHY,
     LEVELS,
     LIBRARY_FACTOR,
     LIMITING_GAUGE,
@@ -20,13 +21,14 @@ FloatArray = NDArray[np.float64]
 
 
 class Residuals(NamedTuple):
-    """Residuals in standard deviations.
+    """Residuals of outputs, in standard deviations.
 
     Attributes
     ----------
-    value : (M,)
-    gradient : (M, P)
-        Per unit of each parameter.
+    value : (M,) array
+        Model minus target, over the standard deviation.
+    gradient : (M, P) array
+        Derivatives of the residuals, per unit of each parameter.
     """
 
     value: FloatArray
@@ -34,42 +36,65 @@ class Residuals(NamedTuple):
 
 
 def fitted_residuals(wing: ReducedWing, targets: Targets, weights: Weights) -> Residuals:
-    """Residuals of everything that is fitted, model less target, over its standard deviation."""
-    parts = [part for group in (_strains, _stiffness, _frequencies) for part in group(wing, targets, weights)]
+    """Return the residuals of all fitted outputs.
+
+    Parameters
+    ----------
+    wing : ReducedWing
+        The model.
+    targets : Targets
+        Published outputs.
+    weights : Weights
+        Standard deviations of the residuals.
+    """
+    groups = (
+        *_strains(wing, targets, weights),
+        *_stiffness(wing, targets, weights),
+        *_frequencies(wing, targets, weights),
+    )
     return Residuals(
-        np.concatenate([part.value for part in parts]), np.concatenate([part.gradient for part in parts])
+        np.concatenate([group.value for group in groups]),
+        np.concatenate([group.gradient for group in groups]),
     )
 
 
-def _part(found: Value, target: FloatArray, deviation: FloatArray | float) -> Residuals:
-    width = np.broadcast_to(deviation, target.shape)
-    return Residuals((found.value - target) / width, found.gradient / width[..., None])
+def _weighted(output: Value, target: FloatArray, deviation: FloatArray | float) -> Residuals:
+    """Return the residuals of an output (M,) with a target (M,) and standard deviations (M,)."""
+    deviations = np.broadcast_to(deviation, target.shape)
+    return Residuals(
+        (output.value - target) / deviations, output.gradient / deviations[..., np.newaxis]
+    )
 
 
 def _strains(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
-    gauges = targets.strain.shape[2]
-    limiting = np.arange(gauges) == LIMITING_GAUGE
-    healthy = wing.strain(LIBRARY_FACTOR, (0.0, 0.0))
-    yield _part(
+    """Yield the residuals of healthy strains, strain ratios of fitted states and slopes."""
+    gauge_count = targets.strain.shape[2]
+    is_limiting = np.arange(gauge_count) == LIMITING_GAUGE
+    healthy = wing.strain(LIBRARY_FACTOR, (LEVELS[0], LEVELS[0]))
+    yield _weighted(
         healthy.log(),
-        np.log(targets.strain[0, 0]),
-        np.where(limiting, weights.limiting_strain, weights.strain),
+        np.log(targets.strain[HEALTHY]),
+        np.where(is_limiting, weights.limiting_strain, weights.strain),
     )
-    for i, j in np.argwhere(fitted_states()):
-        one, two = LEVELS[i], LEVELS[j]
-        yield _part(
-            wing.strain(LIBRARY_FACTOR, (one, two)).over(healthy),
-            targets.ratio[i, j],
-            np.where(limiting & (one > 0.0), weights.limiting_ratio, weights.ratio),
+    for first, second in np.argwhere(fitted_states()):
+        loss = (LEVELS[first], LEVELS[second])
+        first_is_damaged = LEVELS[first] > 0.0
+        yield _weighted(
+            wing.strain(LIBRARY_FACTOR, loss).over(healthy),
+            targets.ratio[first, second],
+            np.where(is_limiting & first_is_damaged, weights.limiting_ratio, weights.ratio),
         )
-    yield _part(wing.strain_slope(LIBRARY_FACTOR), targets.strain_slope, weights.slope)
+    yield _weighted(wing.strain_slope(LIBRARY_FACTOR), targets.strain_slope, weights.slope)
 
 
 def _stiffness(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
-    found = wing.tip_stiffness()
+    """Yield the residuals of tip stiffness, relative, and of its slope."""
+    stiffness_and_slope = wing.tip_stiffness()
     scale = np.array([targets.tip_stiffness, 1.0])
-    relative = Value(found.value / scale, found.gradient / scale[:, None])
-    yield _part(
+    relative = Value(
+        stiffness_and_slope.value / scale, stiffness_and_slope.gradient / scale[:, np.newaxis]
+    )
+    yield _weighted(
         relative,
         np.array([1.0, targets.tip_stiffness_slope]),
         np.array([weights.stiffness, weights.stiffness_slope]),
@@ -77,12 +102,14 @@ def _stiffness(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterato
 
 
 def _frequencies(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
+    """Yield the residuals of the frequencies in the fitted rows, and of their slopes."""
     rows = np.flatnonzero(targets.fitted_row)
-    found = wing.log_frequency(
+    log_frequency = wing.log_frequency(
         targets.young_modulus_factor[rows], targets.servo_mass[rows], targets.pitot_mass[rows]
     )
-    flat = Value(found.value.ravel(), found.gradient.reshape(2 * len(rows), -1))
-    yield _part(flat, np.log(targets.frequency[rows]).ravel(), weights.frequency)
-    _, factor_slope, mass_slope = wing.frequency_slopes()
-    yield _part(factor_slope, targets.frequency_slope, weights.frequency_slope)
-    yield _part(mass_slope, targets.mass_slope, weights.mass_slope)
+    log_targets = np.log(targets.frequency[rows]).ravel()
+    flat = Value(log_frequency.value.ravel(), log_frequency.gradient.reshape(len(log_targets), -1))
+    yield _weighted(flat, log_targets, weights.frequency)
+    regression = wing.frequency_slopes()
+    yield _weighted(regression.factor_slope, targets.frequency_slope, weights.frequency_slope)
+    yield _weighted(regression.mass_slope, targets.mass_slope, weights.mass_slope)

@@ -1,14 +1,16 @@
-"""The box and the sandwich plate side by side: two idealisations of one design, nothing fitted to either."""
+"""The box and the sandwich plate side by side: two idealisations of one design, neither fitted."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_compliant_modes
-from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, AffineWing, assemble, point_masses
+from fe.wing.parts import Defect
 
 from .sandwich_plate import assemble_plate
 
@@ -23,25 +25,25 @@ MODES = 6
 
 @dataclass(frozen=True)
 class WingResults:
-    """What a model says about a wing.
+    """Results of a model of a wing.
 
     Attributes
     ----------
     unknowns : int
-        Free unknowns of the model.
+        Number of free unknowns of the model.
     tip_stiffness : float
-        Of the static test at e = 1 [N/m].
+        Stiffness [N/m] k in the static test at e = 1.
     tip_stiffness_slope : float
         d ln k / d ln e at e = 1.
-    frequency : (6,) Hz
-        Lowest frequencies at the nominal masses.
+    frequency : (6,) array
+        Lowest frequencies [Hz] at the nominal masses.
     first_bending, second_bending : float
-        Those of the flapwise bending modes [Hz].
-    strain : (gauges,) dimensionless
-        At the load factor of the design's lift.
-    strain_slope : (gauges,)
+        Frequencies [Hz] of the flapwise bending modes.
+    strain : (gauges,) array
+        Strains [1] at the load factor of the design's lift.
+    strain_slope : (gauges,) array
         d ln strain / d ln e at e = 1.
-    damage_ratio : (2, gauges)
+    damage_ratio : (2, gauges) array
         Strain with a loss of `DAMAGE` in either defect, over the healthy strain.
     """
 
@@ -58,14 +60,16 @@ class WingResults:
 
 @dataclass(frozen=True)
 class PlateAgreement:
-    """Box and plate of one design on the same mesh lines; differences are plate against box.
+    """Results of box and plate of one design on the same mesh lines.
+
+    Differences are those of the plate from the box.
 
     Attributes
     ----------
     box, plate : WingResults
-        What either says.
-    at_edges : (gauges,) bool
-        `gauges_at_edges` of the design.
+        Results of either model.
+    at_edges : (gauges,) array of bool
+        Whether the patch of a gauge comes near an edge of a defect; see `gauges_at_edges`.
     """
 
     box: WingResults
@@ -73,8 +77,10 @@ class PlateAgreement:
     at_edges: BoolArray
 
     def relative(self, name: str) -> float:
-        """Plate over box, less one, of a single figure of `WingResults`."""
-        return float(getattr(self.plate, name) / getattr(self.box, name) - 1.0)
+        """Return the relative difference of a figure of `WingResults`, given its name."""
+        plate_figure = getattr(self.plate, name)
+        box_figure = getattr(self.box, name)
+        return float(plate_figure / box_figure - 1.0)
 
     @property
     def tip_stiffness_slope(self) -> float:
@@ -102,16 +108,16 @@ def compare_with_plate(
 ) -> PlateAgreement:
     """Evaluate both models of a design.
 
-    The box's section is straight between its mesh lines, along the straight edges that are nearest to the
-    airfoil in the sense of least squares (`fe.wing.mesh.straight_edged`). With the same section in the plate,
-    what is left is the idealisation alone.
+    The section of the box is straight between its mesh lines, along the straight edges that are
+    nearest to the airfoil in the sense of least squares (`fe.wing.mesh.straight_edged`). If the
+    plate has the same section, the differences come from the idealisation alone.
 
     Parameters
     ----------
     design : WingDesign
         The wing.
     box : AffineOperators, optional
-        Its box, where that is at hand.
+        Box of the design; assembled if not given.
     straight_section : bool
         Whether the plate has the section of the box, or the true one.
 
@@ -122,54 +128,103 @@ def compare_with_plate(
     SolutionError
         If a solution is not accurate.
     """
-    solid = assemble(design) if box is None else box
+    box = assemble(design) if box is None else box
     plate = assemble_plate(design, straight_section=straight_section)
     return PlateAgreement(
-        wing_results(solid, design),
-        wing_results(plate, design),
-        gauges_at_edges(design),
+        box=wing_results(box, design),
+        plate=wing_results(plate, design),
+        at_edges=gauges_at_edges(design),
     )
 
 
+class _Interval(NamedTuple):
+    """An interval of positions [m], from low to high."""
+
+    low: float
+    high: float
+
+    def holds(self, position: float) -> bool:
+        """Return whether a position lies in the interval."""
+        return self.low <= position <= self.high
+
+    def overlap(self, low: float, high: float) -> "_Interval":
+        """Return the overlap with another interval; its low exceeds its high if there is none."""
+        return _Interval(max(self.low, low), min(self.high, high))
+
+    def touches(self, positions: tuple[float, float]) -> bool:
+        """Return whether the interval between two positions, in any order, touches this one."""
+        return min(positions) <= self.high and max(positions) >= self.low
+
+
 def gauges_at_edges(design: WingDesign) -> BoolArray:
-    """Whether the patch of each gauge (gauges,) comes near an edge of a defect region.
+    """Return whether the patch of each gauge (gauges,) comes near an edge of a defect region.
 
-    Near is `mesh.edge_size`, whatever the refinement, so that the answer is the same on every mesh; without
-    it, the largest cell along the span and along the chord. Over an edge the stiffness of the skin jumps, and
-    strain with it; at a corner two idealisations do not agree on how it does.
+    Near means within `mesh.edge_size` at any refinement, so that the answer is the same on every
+    mesh. If the design has no such size, it means within the largest cell along the span and along
+    the chord. Over an edge the stiffness of the skin jumps, and the strain with it. At a corner,
+    two idealisations do not agree on the jump.
     """
-    plan, gauges, mesh = design.planform, design.gauges, design.mesh
-
-    def chordwise(chord_fraction: float, distance: float) -> float:
-        return (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
-
-    found = np.zeros(len(gauges.positions), dtype=bool)
+    plan = design.planform
+    gauges = design.gauges
+    mesh = design.mesh
+    at_edge = np.zeros(len(gauges.positions), dtype=bool)
     for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
-        local_chord = plan.chord(distance / plan.semi_span)
-        near_span = mesh.span_size if mesh.edge_size is None else mesh.edge_size
-        near_chord = mesh.chord_size * local_chord if mesh.edge_size is None else mesh.edge_size
+        if mesh.edge_size is None:
+            near_span = mesh.span_size
+            near_chord = mesh.chord_size * plan.chord(distance / plan.semi_span)
+        else:
+            near_span = mesh.edge_size
+            near_chord = mesh.edge_size
         half_span = 0.5 * gauges.averaging_spanwise + near_span
         half_chord = 0.5 * gauges.averaging_chordwise + near_chord
-        inner, outer = distance - half_span, distance + half_span
-        middle = chordwise(chord_fraction, distance)
+        middle = _chordwise_position(design, chord_fraction, distance)
+        span = _Interval(distance - half_span, distance + half_span)
+        chord = _Interval(middle - half_chord, middle + half_chord)
+        at_edge[gauge] = any(
+            chord.touches(edge)
+            for defect in design.defects
+            for edge in _edges_within(design, defect, span)
+        )
+    return at_edge
 
-        def reached(ends: tuple[float, float], low: float, high: float) -> bool:
-            return min(ends) <= high and max(ends) >= low
 
-        for defect in design.defects:
-            start, end = max(inner, defect.span_start), min(outer, defect.span_end)
-            if start > end:
-                continue
-            chords = defect.chord_start, defect.chord_end
-            # Front and rear edge over the shared part of the span, then the inner and the outer edge.
-            edges = [(chordwise(chord, start), chordwise(chord, end)) for chord in chords]
-            edges += [
-                (chordwise(chords[0], place), chordwise(chords[1], place))
-                for place in (defect.span_start, defect.span_end)
-                if inner <= place <= outer
-            ]
-            found[gauge] |= any(reached(edge, middle - half_chord, middle + half_chord) for edge in edges)
-    return found
+def _edges_within(
+    design: WingDesign, defect: Defect, span: _Interval
+) -> Iterator[tuple[float, float]]:
+    """Yield the chordwise positions [m] of both ends of each edge of a defect within a span.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    defect : Defect
+        The defect.
+    span : _Interval
+        Interval of distances from the root [m].
+    """
+    overlap = span.overlap(defect.span_start, defect.span_end)
+    if overlap.low > overlap.high:
+        return
+    # Front and rear edge over the overlap
+    for fraction in (defect.chord_start, defect.chord_end):
+        yield (
+            _chordwise_position(design, fraction, overlap.low),
+            _chordwise_position(design, fraction, overlap.high),
+        )
+    # Inner and outer edge
+    for distance in (defect.span_start, defect.span_end):
+        if span.holds(distance):
+            yield (
+                _chordwise_position(design, defect.chord_start, distance),
+                _chordwise_position(design, defect.chord_end, distance),
+            )
+
+
+def _chordwise_position(design: WingDesign, chord_fraction: float, distance: float) -> float:
+    """Return the position aft of the straight chord line [m] at a chord fraction and a distance."""
+    plan = design.planform
+    chord = plan.chord(distance / plan.semi_span)
+    return (chord_fraction - plan.straight_chord_line) * chord
 
 
 def wing_results(model: AffineWing, design: WingDesign) -> WingResults:
@@ -184,31 +239,37 @@ def wing_results(model: AffineWing, design: WingDesign) -> WingResults:
     """
     loads = np.column_stack((model.load_tip, design.lift.load_factor * model.load_lift))
 
-    def strain(found: FloatArray) -> FloatArray:
-        return np.asarray(model.gauge_output @ found[:, 1])
-
-    def damaged(loss: Losses) -> FloatArray:
-        return strain(Factorisation(model.stiffness(None, loss)).solve(loads))
-
+    # Both load cases, and their derivatives at e = 1, where K = e K_skin + ...
     factors = Factorisation(model.stiffness())
-    found = factors.solve(loads)
-    # K = e K_skin + ...: the derivative of the solution with respect to e, at e = 1
-    slope = -factors.solve(model.stiffness_terms[0].matrix @ found)
-    tip, healthy = float(model.load_tip @ found[:, 0]), strain(found)
+    solutions = factors.solve(loads)
+    slopes = -factors.solve(model.stiffness_terms[0].matrix @ solutions)
+    under_tip_force, in_turn = solutions.T
+    slope_under_tip_force, slope_in_turn = slopes.T
+    tip_flexibility = float(model.load_tip @ under_tip_force)
+    tip_flexibility_slope = float(model.load_tip @ slope_under_tip_force)
+    healthy_strain = np.asarray(model.gauge_output @ in_turn)
+    strain_slope = np.asarray(model.gauge_output @ slope_in_turn)
+
+    damage_ratios = []
+    for loss in DAMAGE * np.eye(len(model.regions)):
+        damaged = Factorisation(model.stiffness(None, tuple(loss)))
+        _, damaged_in_turn = damaged.solve(loads).T
+        damage_ratios.append(np.asarray(model.gauge_output @ damaged_in_turn) / healthy_strain)
+
+    # Modes
     mass = model.mass(point_masses(design.masses.servo, design.masses.pitot))
-    values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
-    frequency = np.sqrt(values) / (2.0 * np.pi)
-    first, second = frequency[most_compliant_modes(model.load_tip, values, shapes)]
+    eigenvalues, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
+    frequency = np.sqrt(eigenvalues) / (2.0 * np.pi)
+    bending_modes = most_compliant_modes(model.load_tip, eigenvalues, shapes)
+    first_bending, second_bending = frequency[bending_modes]
     return WingResults(
         unknowns=model.unknowns,
-        tip_stiffness=1.0 / tip,
-        tip_stiffness_slope=-float(model.load_tip @ slope[:, 0]) / tip,
+        tip_stiffness=1.0 / tip_flexibility,
+        tip_stiffness_slope=-tip_flexibility_slope / tip_flexibility,
         frequency=frequency,
-        first_bending=float(first),
-        second_bending=float(second),
-        strain=healthy,
-        strain_slope=strain(slope) / healthy,
-        damage_ratio=np.stack(
-            [damaged(tuple(loss)) / healthy for loss in DAMAGE * np.eye(len(model.regions))]
-        ),
+        first_bending=float(first_bending),
+        second_bending=float(second_bending),
+        strain=healthy_strain,
+        strain_slope=strain_slope / healthy_strain,
+        damage_ratio=np.stack(damage_ratios),
     )

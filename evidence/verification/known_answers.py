@@ -1,5 +1,7 @@
 """The element and the assembly against known answers, on bodies of their own."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -13,13 +15,30 @@ from fe.structure.nodal_loads import face_areas
 
 FloatArray = NDArray[np.float64]
 
+AXES = 3
+X, Y, Z = range(AXES)
 _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]]) * 1e-3
+
+
+class PatchTestErrors(NamedTuple):
+    """Largest relative errors of the patch test.
+
+    Attributes
+    ----------
+    displacement : float
+        Error at the interior nodes.
+    strain : float
+        Error at the centres of the cells.
+    """
+
+    displacement: float
+    strain: float
 
 
 def brick(
     lengths: tuple[float, float, float], cells: tuple[int, int, int], distortion: float = 0.0
 ) -> CellMesh:
-    """Brick of 20-node hexahedra with positive Jacobians.
+    """Return a brick of 20-node hexahedra with positive Jacobians.
 
     Parameters
     ----------
@@ -28,83 +47,118 @@ def brick(
     cells : tuple of int
         Number of cells along each edge.
     distortion : float
-        Interior vertices move by up to this fraction of a cell.
+        Largest move of the interior vertices, as a fraction of a cell.
     """
-    grid = np.indices([n + 1 for n in cells]).reshape(3, -1).T / np.array(cells)
-    corner = np.indices(cells).reshape(3, -1).T[:, None] + np.array(HEXAHEDRA_20.corners)
-    numbers = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(n + 1 for n in cells))
-    inside = np.all((grid > 1e-9) & (grid < 1.0 - 1e-9), axis=1)
-    shift = np.random.default_rng(0).uniform(-distortion, distortion, grid.shape) / np.array(cells)
-    points = (grid + shift * inside[:, None]) * np.array(lengths)
-    return hexahedra_20(points, numbers)
+    vertex_counts = tuple(count + 1 for count in cells)
+    grid = np.indices(vertex_counts).reshape(len(cells), -1).T / np.array(cells)
+    cell_index = np.indices(cells).reshape(len(cells), -1).T
+    corner_index = cell_index[:, np.newaxis] + np.array(HEXAHEDRA_20.corners)
+    i, j, k = np.moveaxis(corner_index, 2, 0)
+    corners = np.ravel_multi_index((i, j, k), vertex_counts)
+    is_inside = np.all((grid > 1e-9) & (grid < 1.0 - 1e-9), axis=1)
+    random = np.random.default_rng(0)
+    shift = random.uniform(-distortion, distortion, grid.shape) / np.array(cells)
+    points = (grid + shift * is_inside[:, np.newaxis]) * np.array(lengths)
+    return hexahedra_20(points, corners)
 
 
-def _uniform_stiffness(body: CellMesh, young_modulus: float, poisson_ratio: float) -> sparse.csr_array:
+def _uniform_stiffness(
+    body: CellMesh, young_modulus: float, poisson_ratio: float
+) -> sparse.csr_array:
+    """Return the stiffness of a body of one isotropic material."""
     elasticity = np.asarray(
         np.linalg.inv(isotropic_compliance(young_modulus, poisson_ratio)), dtype=np.float64
     )
     return body.stiffness(np.arange(len(body.cells)), elasticity)
 
 
-def patch_test() -> tuple[float, float]:
-    """Impose a linear displacement on the surface of a distorted brick; it must hold inside.
+def patch_test() -> PatchTestErrors:
+    """Return the errors inside a distorted brick with a linear displacement of its surface.
 
-    Returns
-    -------
-    displacement, strain : float
-        Largest errors over the interior nodes and over the centres of the cells, relative.
+    The linear displacement is the solution inside, too.
     """
-    body = brick((1.0, 0.8, 1.2), (3, 3, 3), 0.25)
+    lengths = (1.0, 0.8, 1.2)
+    body = brick(lengths, (3, 3, 3), 0.25)
     stiffness = _uniform_stiffness(body, 1.0, 0.3)
-    points = body.points
-    exact = (points @ _PATCH_GRADIENT.T).ravel()
-    edge = np.isclose(points, 0.0) | np.isclose(points, [1.0, 0.8, 1.2])
-    free = np.flatnonzero(np.repeat(~edge.any(axis=1), 3))
+    exact = (body.points @ _PATCH_GRADIENT.T).ravel()
+    on_surface = np.isclose(body.points, 0.0) | np.isclose(body.points, lengths)
+    free = np.flatnonzero(np.repeat(~on_surface.any(axis=1), AXES))
     fixed = np.setdiff1d(np.arange(body.unknowns), free)
-    found = exact.copy()
-    found[free] = Factorisation(stiffness[free][:, free]).solve(-stiffness[free][:, fixed] @ exact[fixed])
-    strain = body.strains(found.reshape(-1, 3))[:, 0]
-    symmetric = _PATCH_GRADIENT + _PATCH_GRADIENT.T
-    expected = np.array([*(0.5 * np.diag(symmetric)), symmetric[1, 2], symmetric[0, 2], symmetric[0, 1]])
-    moved, strained = np.abs(found - exact).max(), np.abs(strain - expected).max()
-    return float(moved / np.abs(exact).max()), float(strained / np.abs(expected).max())
+    displacement = exact.copy()
+    load = -stiffness[free][:, fixed] @ exact[fixed]
+    displacement[free] = Factorisation(stiffness[free][:, free]).solve(load)
+
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = _PATCH_GRADIENT + _PATCH_GRADIENT.T
+    exact_strain = np.array([0.5 * xx, 0.5 * yy, 0.5 * zz, yz, xz, xy])
+    strain, *_ = np.moveaxis(body.strains(displacement.reshape(-1, AXES)), 1, 0)
+    displacement_error = np.abs(displacement - exact).max() / np.abs(exact).max()
+    strain_error = np.abs(strain - exact_strain).max() / np.abs(exact_strain).max()
+    return PatchTestErrors(float(displacement_error), float(strain_error))
 
 
 def rigid_body_values() -> FloatArray:
-    """Eigenvalues (n,) of the stiffness of an unsupported distorted brick over the largest, rising."""
+    """Return the eigenvalues (n,) of the stiffness of an unsupported distorted brick.
+
+    They rise, and are relative to the largest.
+    """
     body = brick((1.0, 0.8, 1.2), (2, 2, 2), 0.25)
-    values = np.linalg.eigvalsh(_uniform_stiffness(body, 1.0, 0.3).toarray())
-    return np.asarray(values / values[-1])
+    eigenvalues = np.linalg.eigvalsh(_uniform_stiffness(body, 1.0, 0.3).toarray())
+    return np.asarray(eigenvalues / eigenvalues[-1])
 
 
 def cantilever_check(cells_along: int = 10) -> float:
-    """Bend a clamped beam of square section by a shear force: deflection over Timoshenko's, less one.
+    """Return the relative difference of a beam's tip deflection to Timoshenko's.
 
-    Poisson's ratio is zero, so that the clamp does not hold back the section and the beam theory with the
-    shear coefficient 5/6 is the solution to compare with.
+    A shear force bends a clamped beam of square section. Poisson's ratio is zero, so that the clamp
+    does not hold back the section. Then the beam theory with the shear coefficient 5/6 is the
+    solution to compare with.
+
+    Parameters
+    ----------
+    cells_along : int
+        Number of cells along the beam.
     """
-    length, side, modulus, force = 2.0, 0.1, 70e9, 100.0
+    length = 2.0
+    side = 0.1
+    young_modulus = 70e9
+    force = 100.0
     body = brick((side, length, side), (2, cells_along, 2))
     second_moment = side**4 / 12.0
-    bending = force * length**3 / (3.0 * modulus * second_moment)
-    shear = force * length / (5.0 / 6.0 * 0.5 * modulus * side**2)
-    bent = force * _end_deflection(body, modulus, 0.0, length, 2)
-    return bent / (bending + shear) - 1.0
+    bending = force * length**3 / (3.0 * young_modulus * second_moment)
+    shear = force * length / (5.0 / 6.0 * 0.5 * young_modulus * side**2)
+    deflection = force * _end_deflection(body, young_modulus, 0.0, length, Z)
+    return deflection / (bending + shear) - 1.0
 
 
 def _end_deflection(
     body: CellMesh, young_modulus: float, poisson_ratio: float, length: float, component: int
 ) -> float:
-    """Mean displacement of the end y = `length` along a unit force there; the other end is clamped."""
+    """Return the mean displacement of the end of a beam along a unit force at this end.
+
+    Parameters
+    ----------
+    body : CellMesh
+        The beam, clamped at y = 0.
+    young_modulus, poisson_ratio : float
+        Young's modulus [Pa] and Poisson's ratio.
+    length : float
+        Length [m]; the force is at y = `length`.
+    component : int
+        Direction of the force and of the displacement.
+    """
     stiffness = _uniform_stiffness(body, young_modulus, poisson_ratio)
-    on_end = np.flatnonzero(np.isclose(body.corners[:, :, 1].max(axis=1), length))
-    _, shares = face_areas(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
-    shares /= shares.sum()
-    free = np.flatnonzero(np.repeat(body.points[:, 1] > 1e-9, 3))
-    load, found = np.zeros(body.unknowns), np.zeros(body.unknowns)
-    load[component::3] = shares
-    found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
-    return float(found[component::3] @ shares)
+    _, corner_y, _ = np.moveaxis(body.corners, -1, 0)
+    end_cells = np.flatnonzero(np.isclose(corner_y.max(axis=1), length))
+    end = Surface(end_cells, np.full(len(end_cells), _END_FACE))
+    _, weights = face_areas(body, end)
+    weights /= weights.sum()
+    _, y, _ = body.points.T
+    free = np.flatnonzero(np.repeat(y > 1e-9, AXES))
+    load = np.zeros(body.unknowns)
+    load[component::AXES] = weights
+    displacement = np.zeros(body.unknowns)
+    displacement[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
+    return float(displacement[component::AXES] @ weights)
 
 
 _END_FACE = 4  # of a hexahedron, where its second coordinate is one
@@ -112,26 +166,36 @@ MACNEAL_HARDER_SHAPES: tuple[str, ...] = ("regular", "trapezoid", "parallelogram
 
 
 def macneal_harder_beam(shape: str, *, across_depth: bool) -> float:
-    """Tip deflection of MacNeal and Harder's straight slender beam over the exact one.
+    """Return the tip deflection of MacNeal and Harder's straight slender beam over the exact one.
 
-    Six cells along 6 x 0.2 x 0.1, E = 1e7, nu = 0.3, a unit shear force at the end; R. H. MacNeal and
-    R. L. Harder, "A proposed standard set of problems to test finite element accuracy", Finite Elements in
-    Analysis and Design 1 (1985), table 3.
+    The beam has six cells along 6 x 0.2 x 0.1, E = 1e7, nu = 0.3, and a unit shear force at its
+    end. See R. H. MacNeal and R. L. Harder, "A proposed standard set of problems to test finite
+    element accuracy", Finite Elements in Analysis and Design 1 (1985), table 3.
 
     Parameters
     ----------
     shape : str
         One of `MACNEAL_HARDER_SHAPES`; the sides of the cells lean by 45 degrees.
     across_depth : bool
-        Bend across the depth of 0.2 (in the plane of the lean), otherwise across the width of 0.1.
+        Whether the beam bends across its depth of 0.2, in the plane of the lean, or across its
+        width of 0.1.
     """
-    length, depth, width = 6.0, 0.2, 0.1
+    length = 6.0
+    depth = 0.2
+    width = 0.1
     regular = brick((depth, length, width), (1, 6, 1))
-    points = regular.points[: regular.cells[:, :8].max() + 1].copy()
-    line = np.rint(points[:, 1]).astype(int)
-    lean = {"regular": 0.0 * line, "trapezoid": (-1.0) ** line, "parallelogram": 1.0 + 0.0 * line}[shape]
-    inside = (line > 0) & (line < 6)
-    points[:, 1] += np.where(inside, lean * (points[:, 0] - 0.5 * depth), 0.0)
-    body = hexahedra_20(points, regular.cells[:, :8])
-    component, exact = (0, 0.1081) if across_depth else (2, 0.4321)
-    return _end_deflection(body, 1e7, 0.3, length, component) / exact
+    corners = regular.cells[:, : len(HEXAHEDRA_20.corners)]
+    points = regular.points[: corners.max() + 1].copy()
+    x, y, _ = points.T
+    line = np.rint(y).astype(int)
+    lean_of_shape = {
+        "regular": 0.0 * line,
+        "trapezoid": (-1.0) ** line,
+        "parallelogram": 1.0 + 0.0 * line,
+    }
+    is_inner_line = (line > 0) & (line < 6)
+    points[:, Y] += np.where(is_inner_line, lean_of_shape[shape] * (x - 0.5 * depth), 0.0)
+    body = hexahedra_20(points, corners)
+    if across_depth:
+        return _end_deflection(body, 1e7, 0.3, length, X) / 0.1081
+    return _end_deflection(body, 1e7, 0.3, length, Z) / 0.4321

@@ -20,6 +20,9 @@ from .kinds import HEXAHEDRA_20, ElementKind, Rule
 
 BATCH = 512
 """Cells whose arrays are contracted at once."""
+AXES = 3
+STRAINS = len(VOIGT)
+_MOST_FACE_CORNERS = 4
 _SUMMED_ENTRIES = 4_000_000  # entries of element arrays that are summed at once, of 16 bytes each
 
 
@@ -67,8 +70,10 @@ def gradients(
     """
     jacobian = jacobians(kind, nodes, local)
     _, local_gradients = kind.shape_functions(local)
-    spatial_gradients = local_gradients[None] @ np.linalg.inv(jacobian)
-    return np.asarray(spatial_gradients), np.asarray(np.linalg.det(jacobian))
+    inverse_jacobian = np.linalg.inv(jacobian)
+    spatial_gradients = local_gradients[np.newaxis] @ inverse_jacobian
+    determinants = np.linalg.det(jacobian)
+    return np.asarray(spatial_gradients), np.asarray(determinants)
 
 
 def strain_matrix(gradients: FloatArray) -> FloatArray:
@@ -84,13 +89,13 @@ def strain_matrix(gradients: FloatArray) -> FloatArray:
     (..., 6, 3 k) array
         The strains per nodal displacement [1/m].
     """
-    nodes = gradients.shape[-2]
-    B = np.zeros((*gradients.shape[:-2], 6, nodes, 3))
-    for row, (i, j) in enumerate(VOIGT):
-        B[..., row, :, i] += gradients[..., j]
+    *points_shape, node_count, _ = gradients.shape
+    B = np.zeros((*points_shape, STRAINS, node_count, AXES))
+    for strain, (i, j) in enumerate(VOIGT):
+        B[..., strain, :, i] += gradients[..., j]
         if i != j:
-            B[..., row, :, j] += gradients[..., i]
-    return B.reshape(*B.shape[:-2], 3 * nodes)
+            B[..., strain, :, j] += gradients[..., i]
+    return B.reshape((*points_shape, STRAINS, AXES * node_count))
 
 
 def stiffness_blocks(
@@ -121,12 +126,15 @@ def stiffness_blocks(
     spatial_gradients, determinant = gradients(kind, nodes, rule.points)
     B = strain_matrix(spatial_gradients)
     measure = rule.weights * determinant * factor
-    n, q = measure.shape
-    width = 3 * kind.node_count
+    cell_count, point_count = measure.shape
+    row_count = point_count * STRAINS
+    unknown_count = AXES * kind.node_count
     # the sum over integration points and strains as one matrix product
-    B_transposed = B.reshape(n, q * 6, width).swapaxes(1, 2)
-    stress_matrix = (elasticity.reshape(-1, 1, 6, 6) @ B) * measure[..., None, None]
-    blocks = B_transposed @ stress_matrix.reshape(n, q * 6, width)
+    stress_matrix = elasticity.reshape(-1, 1, STRAINS, STRAINS) @ B
+    stress_matrix = stress_matrix * measure[..., np.newaxis, np.newaxis]
+    stress_rows = stress_matrix.reshape(cell_count, row_count, unknown_count)
+    strain_rows = B.reshape(cell_count, row_count, unknown_count)
+    blocks = strain_rows.swapaxes(1, 2) @ stress_rows
     # symmetric but for rounding errors, which this removes
     return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
 
@@ -151,8 +159,10 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
         The element mass [kg].
     """
     values, _ = kind.shape_functions(rule.points)
-    volume = np.linalg.det(jacobians(kind, nodes, rule.points)) * rule.weights
-    mass = volume * np.reshape(density, (-1, 1))
+    determinant = np.linalg.det(jacobians(kind, nodes, rule.points))
+    volume = determinant * rule.weights
+    density_of_cell = np.reshape(density, (-1, 1))
+    mass = volume * density_of_cell
     return np.asarray(np.einsum("nq,qa,qb->nab", mass, values, values, optimize=True))
 
 
@@ -195,7 +205,7 @@ class CellMesh:
     @property
     def unknowns(self) -> int:
         """Number of displacements; that of a component of a node is 3 node + component."""
-        return 3 * len(self.points)
+        return AXES * len(self.points)
 
     @cached_property
     def nodes(self) -> FloatArray:
@@ -218,8 +228,10 @@ class CellMesh:
         faces = []
         for face in self.kind.faces:
             corners = np.sort(self.cells[:, list(face)], axis=1)
-            missing_corners = 4 - len(face)  # one for a triangle
-            faces.append(np.pad(corners, ((0, 0), (missing_corners, 0)), constant_values=-1))
+            missing_corners = _MOST_FACE_CORNERS - len(face)  # one for a triangle
+            no_rows = (0, 0)
+            columns_before = (missing_corners, 0)
+            faces.append(np.pad(corners, (no_rows, columns_before), constant_values=-1))
         all_faces = np.vstack(faces)
         _, first_index, count = np.unique(all_faces, axis=0, return_index=True, return_counts=True)
         outer_index = np.sort(first_index[count == 1])
@@ -229,8 +241,8 @@ class CellMesh:
 
     def unknowns_of(self, cells: IntArray, components: int = 3) -> IntArray:
         """Return the unknowns (n, components k) of cells (n,), for one or three components."""
-        first_unknown = components * self.cells[cells][:, :, None]
-        unknowns = first_unknown + np.arange(components)
+        first_unknown = components * self.cells[cells]
+        unknowns = first_unknown[..., np.newaxis] + np.arange(components)
         return np.asarray(unknowns.reshape(len(cells), -1))
 
     def positions(self, cells: IntArray, local: FloatArray) -> FloatArray:
@@ -259,7 +271,7 @@ class CellMesh:
             Strains xx, yy, zz, yz, xz, xy, with engineering shear strains.
         """
         if local is None:
-            local = self.kind.centre[None]
+            local = self.kind.centre[np.newaxis]
         spatial_gradients, _ = gradients(self.kind, self.nodes, local)
         cell_displacement = displacement[self.cells].reshape(len(self.cells), -1)
         B = strain_matrix(spatial_gradients)
@@ -303,12 +315,14 @@ class CellMesh:
         gradient_along_direction = np.einsum(
             "pai,pij,pj->pa", local_gradients, inverse_jacobians, direction
         )
-        weighted_gradient = np.asarray(weight)[:, None] * gradient_along_direction
-        values = weighted_gradient[:, :, None] * direction[:, None, :]
-        row_of_entry = np.repeat(row, 3 * self.kind.node_count)
-        rows_and_columns = (row_of_entry, self.unknowns_of(cells).ravel())
-        shape = (int(row_of_entry.max(initial=-1)) + 1, self.unknowns)
-        return sparse.coo_array((values.ravel(), rows_and_columns), shape).tocsr()
+        weight_column = np.asarray(weight)[:, np.newaxis]
+        weighted_gradient = weight_column * gradient_along_direction
+        values = weighted_gradient[..., np.newaxis] * direction[:, np.newaxis]
+        row_of_entry = np.repeat(row, AXES * self.kind.node_count)
+        column_of_entry = self.unknowns_of(cells).ravel()
+        row_count = int(row_of_entry.max(initial=-1)) + 1
+        entries = (values.ravel(), (row_of_entry, column_of_entry))
+        return sparse.coo_array(entries, (row_count, self.unknowns)).tocsr()
 
     def stiffness(
         self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
@@ -329,14 +343,15 @@ class CellMesh:
         csr (3 nn, 3 nn)
             The stiffness [N/m].
         """
-        elasticities = np.broadcast_to(elasticity, (len(cells), 6, 6))
-        factors = np.broadcast_to(factor, (len(cells), len(self.kind.stiffness_rule.weights)))
+        point_count = len(self.kind.stiffness_rule.weights)
+        elasticities = np.broadcast_to(elasticity, (len(cells), STRAINS, STRAINS))
+        factors = np.broadcast_to(factor, (len(cells), point_count))
 
-        def blocks(part: slice) -> FloatArray:
-            nodes = self.nodes[cells[part]]
-            return stiffness_blocks(self.kind, nodes, elasticities[part], factors[part])
+        def blocks(batch: slice) -> FloatArray:
+            nodes = self.nodes[cells[batch]]
+            return stiffness_blocks(self.kind, nodes, elasticities[batch], factors[batch])
 
-        return self._assembled(cells, blocks, components=3)
+        return self._assembled(cells, blocks, components=AXES)
 
     def mass(
         self, cells: IntArray, density: ArrayLike, rule: Rule | None = None
@@ -360,8 +375,9 @@ class CellMesh:
         densities = np.broadcast_to(density, len(cells))
         mass_rule = rule or self.kind.mass_rule
 
-        def blocks(part: slice) -> FloatArray:
-            return mass_blocks(self.kind, self.nodes[cells[part]], densities[part], mass_rule)
+        def blocks(batch: slice) -> FloatArray:
+            nodes = self.nodes[cells[batch]]
+            return mass_blocks(self.kind, nodes, densities[batch], mass_rule)
 
         return self._assembled(cells, blocks, components=1)
 
@@ -391,13 +407,14 @@ class CellMesh:
         for start in range(0, len(cells), cells_at_once):
             end = min(start + cells_at_once, len(cells))
             unknowns = self.unknowns_of(cells[start:end], components).astype(np.int32)
-            batches = [slice(first, min(first + BATCH, end)) for first in range(start, end, BATCH)]
-            values = [blocks(batch) for batch in batches]
+            element_matrices = []
+            for first in range(start, end, BATCH):
+                batch = slice(first, min(first + BATCH, end))
+                element_matrices.append(blocks(batch))
+            values = np.concatenate(element_matrices).ravel()
             rows = np.repeat(unknowns, width, axis=1).ravel()
             columns = np.tile(unknowns, (1, width)).ravel()
-            summed = sparse.coo_array(
-                (np.concatenate(values).ravel(), (rows, columns)), shape=total.shape
-            )
+            summed = sparse.coo_array((values, (rows, columns)), shape=total.shape)
             total = total + summed.tocsr()
         return total
 
@@ -417,7 +434,8 @@ def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:
     CellMesh
         The mesh; the mid-edge nodes follow the vertices.
     """
-    edge_ends = np.sort(cells[:, np.array(HEXAHEDRA_20.edges)], axis=2)
+    ends_in_cell = np.array(HEXAHEDRA_20.edges)
+    edge_ends = np.sort(cells[:, ends_in_cell], axis=2)
     edges, edge_of_cell = np.unique(edge_ends.reshape(-1, 2), axis=0, return_inverse=True)
     mid_edge_nodes = len(points) + edge_of_cell.reshape(len(cells), -1)
     mid_edge_points = points[edges].mean(axis=1)

@@ -10,7 +10,15 @@ from fe.runtime.arrays import FloatArray
 
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Indices ij of the strains in Voigt order."""
-_VOIGT_NUMBER = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
+_PAIRS_OF_AXES = ((0, 1), (0, 2), (1, 2))
+"""Axes ij of Poisson's ratios and shear moduli."""
+_VOIGT_NUMBER = np.array(
+    [
+        [0, 5, 4],
+        [5, 1, 3],
+        [4, 3, 2],
+    ]
+)
 """Number in Voigt order of the strain ij."""
 
 
@@ -33,11 +41,15 @@ def orthotropic_compliance(
     (6, 6) array
         The compliance [1/Pa].
     """
-    young, ratio, shear = (np.broadcast_to(values, 3) for values in (moduli, ratios, shear_moduli))
-    compliance = np.diag(1.0 / np.concatenate((young, shear[::-1])))
-    for (i, j), ratio_ij in zip(((0, 1), (0, 2), (1, 2)), ratio, strict=True):
-        compliance[i, j] = -ratio_ij / young[i]
-        compliance[j, i] = compliance[i, j]
+    young = np.broadcast_to(moduli, 3)
+    # The shear moduli are 12, 13, 23, and Voigt order is 23, 13, 12.
+    shear = np.broadcast_to(shear_moduli, 3)[::-1]
+    compliance = np.diag(1.0 / np.concatenate((young, shear)))
+    ratio_of_axes = zip(_PAIRS_OF_AXES, np.broadcast_to(ratios, 3), strict=True)
+    for (i, j), ratio in ratio_of_axes:
+        coupling = -ratio / young[i]
+        compliance[i, j] = coupling
+        compliance[j, i] = coupling
     return compliance
 
 
@@ -67,8 +79,10 @@ def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
         Rows: along the first vector, at right angles to it in the plane, normal to the plane.
     """
     along = np.asarray(first, dtype=np.float64)
-    normal = np.cross(along, np.asarray(second, dtype=np.float64))
-    return unit_vector([along, np.cross(normal, along), normal])
+    in_plane = np.asarray(second, dtype=np.float64)
+    normal = np.cross(along, in_plane)
+    across = np.cross(normal, along)
+    return unit_vector([along, across, normal])
 
 
 def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
@@ -86,9 +100,11 @@ def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
     (n, 6, 6) array
         Elasticity in space [Pa].
     """
-    tensor = elasticity[:, _VOIGT_NUMBER[:, :, None, None], _VOIGT_NUMBER]
+    first_pair = _VOIGT_NUMBER[:, :, np.newaxis, np.newaxis]
+    tensor = elasticity[:, first_pair, _VOIGT_NUMBER]
     rotated = np.einsum(
         "nabcd,nai,nbj,nck,ndl->nijkl", tensor, axes, axes, axes, axes, optimize=True
     )
     i, j = np.transpose(VOIGT)
-    return np.asarray(rotated[:, i, j][:, :, i, j])
+    rows = rotated[:, i, j]
+    return np.asarray(rows[:, :, i, j])

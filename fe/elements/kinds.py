@@ -52,9 +52,26 @@ class FaceFrames(NamedTuple):
     tangents: FloatArray
 
 
-_TETRAHEDRON_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
-_TETRAHEDRON_EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
-_TETRAHEDRON_FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
+_TETRAHEDRON_CORNERS = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+)
+_TETRAHEDRON_EDGES = (
+    (0, 1),
+    (1, 2),
+    (2, 0),
+    (0, 3),
+    (1, 3),
+    (2, 3),
+)
+_TETRAHEDRON_FACES = (
+    (0, 1, 2),
+    (0, 3, 1),
+    (1, 3, 2),
+    (2, 3, 0),
+)
 _HEXAHEDRON_CORNERS = (
     (0, 0, 0),
     (1, 0, 0),
@@ -77,9 +94,32 @@ _HEXAHEDRON_FACES = (
     (2, 6, 7, 3),
     (3, 7, 4, 0),
 )
-_WEDGE_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
-_WEDGE_EDGES = ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5))
-_WEDGE_FACES = ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0))
+_WEDGE_CORNERS = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 0, 1),
+    (0, 1, 1),
+)
+_WEDGE_EDGES = (
+    (0, 1),
+    (1, 2),
+    (2, 0),
+    (3, 4),
+    (4, 5),
+    (5, 3),
+    (0, 3),
+    (1, 4),
+    (2, 5),
+)
+_WEDGE_FACES = (
+    (0, 1, 2),
+    (3, 5, 4),
+    (0, 3, 4, 1),
+    (1, 4, 5, 2),
+    (2, 5, 3, 0),
+)
 
 # Exponents of the monomials x^i y^j z^k that span the shape functions.
 _POWERS = tuple(itertools.product(range(3), repeat=3))
@@ -104,9 +144,11 @@ def gauss_points(order: int, dimensions: int = 3) -> Rule:
         The dimensions of the cube.
     """
     roots, root_weights = np.polynomial.legendre.leggauss(order)
-    points = np.array([*itertools.product(0.5 * (roots + 1.0), repeat=dimensions)])
-    weights = np.array([*itertools.product(0.5 * root_weights, repeat=dimensions)])
-    return Rule(points, weights.prod(axis=1))
+    line_points = 0.5 * (roots + 1.0)
+    line_weights = 0.5 * root_weights
+    points = list(itertools.product(line_points, repeat=dimensions))
+    factors = list(itertools.product(line_weights, repeat=dimensions))
+    return Rule(np.array(points), np.array(factors).prod(axis=1))
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
@@ -119,9 +161,11 @@ def _wedge_rule(triangle_order: int, line_order: int) -> Rule:
     """Return the product of a rule on the triangle and a Gauss rule along the wedge."""
     triangle = _simplex_rule(RefTri, triangle_order)
     line = gauss_points(line_order, dimensions=1)
-    pairs = itertools.product(line.points, triangle.points)
-    points = [(*position, height) for (height,), position in pairs]
-    return Rule(np.array(points), np.outer(line.weights, triangle.weights).ravel())
+    points = []
+    for (height,), position in itertools.product(line.points, triangle.points):
+        points.append((*position, height))
+    weights = np.outer(line.weights, triangle.weights)
+    return Rule(np.array(points), weights.ravel())
 
 
 @dataclass(frozen=True)
@@ -181,9 +225,10 @@ class ElementKind:
         Each function is one at its own node and zero at the others, so that the coefficients are
         the inverse of the matrix of the monomials at the nodes.
         """
-        monomials = self.node_positions[:, None, :] ** np.array(self.exponents)
+        powers = self.node_positions[:, np.newaxis] ** np.array(self.exponents)
+        monomials = np.prod(powers, axis=2)
         # they are integers on these reference cells: rounding removes the error of the inverse
-        return np.rint(np.linalg.inv(np.prod(monomials, axis=2)))
+        return np.rint(np.linalg.inv(monomials))
 
     @cached_property
     def face_nodes(self) -> tuple[tuple[int, ...], ...]:
@@ -192,15 +237,20 @@ class ElementKind:
 
     def _mid_edge_nodes(self, face: tuple[int, ...]) -> list[int]:
         """Return the mid-edge nodes of a face with the given corners."""
-        first = len(self.corners)
-        return [first + number for number, edge in enumerate(self.edges) if {*edge} <= {*face}]
+        corners_of_face = set(face)
+        nodes = []
+        for node, edge in enumerate(self.edges, start=len(self.corners)):
+            if corners_of_face.issuperset(edge):
+                nodes.append(node)
+        return nodes
 
     @property
     def med_order(self) -> IntArray:
         """Number (k,) of the node that MED has at each position; its cells are mirrored."""
         x, y, z = self.node_positions.T
         mirrored = np.column_stack((y, x, z))
-        distance = np.abs(self.node_positions[:, None] - mirrored).sum(axis=2)
+        difference = self.node_positions[:, np.newaxis] - mirrored
+        distance = np.abs(difference).sum(axis=2)
         return np.asarray(distance.argmin(axis=1))
 
     def contains(self, local: FloatArray, tolerance: float) -> BoolArray:
@@ -208,7 +258,8 @@ class ElementKind:
         frames = self.face_frames
         along_first, along_second = np.moveaxis(frames.tangents, 1, 0)
         outward = np.cross(along_first, along_second)
-        distance = ((local[:, None] - frames.corner) * outward).sum(axis=2)
+        from_corner = local[:, np.newaxis] - frames.corner
+        distance = (from_corner * outward).sum(axis=2)
         return np.asarray((distance <= tolerance).all(axis=1))
 
     def shape_functions(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -228,29 +279,34 @@ class ElementKind:
         """
         exponents = np.array(self.exponents)
         # powers 0, 1, 2 of each coordinate (q, 3, 3), and their derivatives
-        powers = np.stack((np.ones_like(local), local, local**2), axis=2)
-        slopes = np.stack((np.zeros_like(local), np.ones_like(local), 2.0 * local), axis=2)
+        zero = np.zeros_like(local)
+        one = np.ones_like(local)
+        powers = np.stack((one, local, local**2), axis=2)
+        slopes = np.stack((zero, one, 2.0 * local), axis=2)
         x, y, z = (powers[:, axis, exponents[:, axis]] for axis in range(3))
         dx, dy, dz = (slopes[:, axis, exponents[:, axis]] for axis in range(3))
         # monomials and their derivatives, combined
         values = x * y * z @ self._coefficients
-        derivatives = (dx * y * z, x * dy * z, x * y * dz)
-        gradients = [derivative @ self._coefficients for derivative in derivatives]
-        return np.asarray(values), np.stack(gradients, axis=2)
+        slope_x = dx * y * z @ self._coefficients
+        slope_y = x * dy * z @ self._coefficients
+        slope_z = x * y * dz @ self._coefficients
+        gradients = np.stack((slope_x, slope_y, slope_z), axis=2)
+        return np.asarray(values), gradients
 
     @cached_property
     def face_frames(self) -> FaceFrames:
         """Local frames of the faces."""
 
         def corner_positions(number_in_face: int) -> FloatArray:
-            return np.array(
-                [self.corners[face[number_in_face]] for face in self.faces], dtype=np.float64
-            )
+            positions = [self.corners[face[number_in_face]] for face in self.faces]
+            return np.array(positions, dtype=np.float64)
 
         # Seen from outside, the corners of a face turn clockwise in Abaqus, so that the tangent to
         # the last corner is the first one.
-        first, second, last = corner_positions(0), corner_positions(1), corner_positions(-1)
-        return FaceFrames(first, np.stack((last - first, second - first), axis=1))
+        first = corner_positions(0)
+        to_last = corner_positions(-1) - first
+        to_second = corner_positions(1) - first
+        return FaceFrames(corner=first, tangents=np.stack((to_last, to_second), axis=1))
 
     def face_rule(self, face: int) -> Rule:
         """Return an integration rule on a face, exact for products of two shape functions."""

@@ -24,6 +24,9 @@ CUT_FRACTIONS = (0.4, 0.5, 0.6)
 LARGEST_HALF = 0.8
 """Largest fraction of a part that a cut may leave on one side."""
 _IMBALANCE_WEIGHT = 1.2
+_HALVES = 2
+_SEPARATOR = 2  # number of the separator among the blocks of a part, after both halves
+_BLOCKS = 3
 
 
 class Cuts(NamedTuple):
@@ -68,11 +71,12 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
             # cut each part where this fraction of its weight is reached
             median = order[np.searchsorted(cumulative, weight_before + fraction * total)]
             is_above = coordinate > coordinate[median][part]
-            edge_is_above = is_above[edges]
-            crosses = edge_is_above[0] != edge_is_above[1]
+            first_is_above, second_is_above = is_above[edges]
+            crossing_edges = edges[:, first_is_above != second_is_above]
             for half in (True, False):  # the vertices on either side of the cut separate the halves
+                is_in_half = is_above[crossing_edges] == half
                 on_cut = np.zeros(len(part), dtype=bool)
-                on_cut[edges[:, crosses][edge_is_above[:, crosses] == half]] = True
+                on_cut[crossing_edges[is_in_half]] = True
                 cost = _cut_costs(part, weight, total, on_cut, is_above)
                 # keep what is better than before
                 is_better = cost < lowest_cost
@@ -198,8 +202,9 @@ def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight:
         # keep the edges inside parts, and number the vertices anew
         index = np.full(size, -1)
         index[parts.vertices] = np.arange(len(parts.vertices))
-        is_inside = (index[edges] >= 0).all(axis=0) & (position[edges[0]] == position[edges[1]])
-        edges = edges[:, is_inside]
+        in_parts = (index[edges] >= 0).all(axis=0)
+        first_position, second_position = position[edges]
+        edges = edges[:, in_parts & (first_position == second_position)]
         cuts = best_cuts(parts.part, weight[parts.vertices], index[edges])
         parts = _halves(parts, cuts, position)
 
@@ -235,17 +240,20 @@ def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
     in_cut_part = cuts.is_cut[parts.part]
     vertices = parts.vertices[in_cut_part]
     new_number = np.cumsum(cuts.is_cut) - 1
-    block_in_part = np.where(cuts.separator, 2, cuts.side)
-    block = (3 * new_number[parts.part] + block_in_part)[in_cut_part]
+    block_in_part = np.where(cuts.separator, _SEPARATOR, cuts.side)
+    block = (_BLOCKS * new_number[parts.part] + block_in_part)[in_cut_part]
     # the blocks of a part follow one another from its start
-    count = np.bincount(block, minlength=3 * int(cuts.is_cut.sum())).reshape(-1, 3)
-    block_starts = parts.starts[cuts.is_cut, None] + np.cumsum(count, axis=1) - count
+    block_count = _BLOCKS * int(cuts.is_cut.sum())
+    count = np.bincount(block, minlength=block_count).reshape(-1, _BLOCKS)
+    count_before = np.cumsum(count, axis=1) - count
+    block_starts = parts.starts[cuts.is_cut, np.newaxis] + count_before
     position[vertices] = block_starts.ravel()[block]
     # the halves are the next parts
-    is_half = block % 3 < 2
-    half_starts, _ = np.split(block_starts, [2], axis=1)
+    cut_part, number_in_part = np.divmod(block, _BLOCKS)
+    is_half = number_in_part < _SEPARATOR
+    half_number = cut_part * _HALVES + number_in_part
     return _Parts(
-        starts=half_starts.ravel(),
+        starts=block_starts[:, :_HALVES].ravel(),
         vertices=vertices[is_half],
-        part=(block // 3 * 2 + block % 3)[is_half],
+        part=half_number[is_half],
     )

@@ -280,19 +280,23 @@ def _assembled_pivot_rows(
     """
     pivots = front.end - front.start
     pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))
-    entries = slice(rows.indptr[front.start], rows.indptr[front.end])
-    counts = np.diff(rows.indptr[front.start : front.end + 1])
-    row = np.repeat(np.arange(pivots), counts)
+    row_starts = rows.indptr[front.start : front.end + 1]
+    entries = slice(row_starts[0], row_starts[-1])
+    row_of_entry = np.repeat(np.arange(pivots), np.diff(row_starts))
     column = columns[entries]
     is_later = column >= front.start
-    pivot_rows[row[is_later], local[column[is_later]]] = rows.data[entries][is_later]
+    row_in_front = row_of_entry[is_later]
+    column_in_front = local[column[is_later]]
+    pivot_rows[row_in_front, column_in_front] = rows.data[entries][is_later]
     return pivot_rows
 
 
 def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> None:
     """Solve L x = v, or L' x = v, in place for contiguous values (m, k)."""
-    if values.shape[1] == 1:
-        values[:, 0] = blas.dtrsv(lower, values[:, 0], lower=1, trans=int(transposed))
+    row_count, column_count = values.shape
+    if column_count == 1:
+        column = values.reshape(row_count)
+        column[:] = blas.dtrsv(lower, column, lower=1, trans=int(transposed))
     else:
         # BLAS takes the transpose of C-ordered values without a copy: x' L' = v'.
         solution = blas.dtrsm(1.0, lower, values.T, side=1, lower=1, trans_a=int(not transposed))
@@ -334,7 +338,8 @@ def most_compliant_modes(load: FloatArray, squares: FloatArray, shapes: FloatArr
         Numbers of the modes, ascending.
     """
     compliance = (load @ shapes) ** 2 / squares
-    return np.asarray(np.sort(np.argsort(compliance)[-2:]))
+    ascending = np.argsort(compliance)
+    return np.asarray(np.sort(ascending[-2:]))
 
 
 def lowest_eigenpairs(
@@ -386,8 +391,10 @@ def _check_modes(
     stiffness: sparse.csr_array, mass: sparse.sparray, squares: FloatArray, shapes: FloatArray
 ) -> None:
     """Raise `SolutionError` if the residual of a mode exceeds `MODE_RESIDUAL_LIMIT`."""
-    scale = float(norm(stiffness, np.inf)) * np.abs(shapes).max(axis=0)
-    residual = np.abs(stiffness @ shapes - (mass @ shapes) * squares).max(axis=0) / scale
+    largest_row = float(norm(stiffness, np.inf))
+    scale = largest_row * np.abs(shapes).max(axis=0)
+    imbalance = stiffness @ shapes - (mass @ shapes) * squares
+    residual = np.abs(imbalance).max(axis=0) / scale
     is_accurate = residual.max() <= MODE_RESIDUAL_LIMIT
     if not is_accurate:
         raise SolutionError(

@@ -36,14 +36,18 @@ class Spot(tables.DesignSection):
     """A place of a gauge: the strain is the mean over `length` along it and `width` across it."""
 
     point: tables.Vector
+    """Place of its middle [unit of length]."""
     length: float = Field(default=0.0, ge=0.0)
+    """Length along it over which the strain is averaged [unit of length]."""
     width: float = Field(default=0.0, ge=0.0)
+    """Width across it over which the strain is averaged [unit of length]."""
 
 
 class Gauge(tables.Named, Spot):
     """Strain gauge on the surface: mean strain along `direction`, positive in tension."""
 
     direction: tables.Direction
+    """Direction of the strain, as a vector [1]."""
 
 
 def _span_a_plane(
@@ -65,8 +69,11 @@ class Rosette(Spot):
     """Gauges NAME_a, NAME_b, ... at one point, at `angles` [degrees] from axis 1 towards axis 2."""
 
     name: Annotated[str, Field(max_length=30, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    """Name, to which a letter is added for each gauge."""
     axes: Axes
+    """Two vectors: axis 1, and another vector in the plane of the surface, towards axis 2 [1]."""
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
+    """Angle of each gauge from axis 1 towards axis 2 [degrees]."""
 
     def gauges(self) -> list[Gauge]:
         """Return the gauges of the rosette."""
@@ -85,6 +92,7 @@ class Gauged(tables.DesignSection):
 
     gauge: tuple[Gauge, ...] = ()
     rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
+    """Rosettes of gauges, which come behind the single ones."""
 
     @model_validator(mode="after")
     def _add_gauges_of_rosettes(self) -> "Gauged":
@@ -97,7 +105,7 @@ class Gauged(tables.DesignSection):
 
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
-Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
+Spring = Annotated[float, Field(ge=0.0, le=1e15)]
 Springs = tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring]
 
 
@@ -105,8 +113,11 @@ class NamedSet(tables.DesignSection):
     """Set of nodes, or of cells by their centres, in a box: two corners [unit of length]."""
 
     name: SetName
+    """Name of the set."""
     of: Literal["nodes", "cells"]
+    """What the set contains."""
     box: tuple[tables.Vector, tables.Vector]
+    """Two opposite corners of the box, the lower one first [unit of length]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield a fault if the box has its corners in the wrong order."""
@@ -124,15 +135,25 @@ class MeshMaterial(tables.AlternativeKeys):
     """
 
     name: tables.Name
+    """Name of the material."""
     set: SetName = "all"
-    density: float = Field(ge=0.0, le=3e4, description="kg/m^3")
+    """Set of the cells."""
+    density: float = Field(ge=0.0, le=3e4)
+    """Density [kg/m^3]."""
     young_modulus: tables.Modulus | None = None
+    """Young's modulus, isotropic [Pa]."""
     poisson_ratio: Poisson | None = None
+    """Poisson's ratio, isotropic [1]."""
     young_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
+    """Young's moduli along axes 1, 2 and 3 [Pa]."""
     poisson_ratios: tables.Vector | None = None
+    """Poisson's ratios 12, 13 and 23 [1]."""
     shear_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
+    """Shear moduli 12, 13 and 23 [Pa]."""
     axes: Axes | None = None
+    """Two vectors: axis 1, and another vector in the plane of axes 1 and 2 [1]."""
     scaled_by: tables.Name | None = None
+    """Name of the parameter that scales the stiffness."""
     alternatives = (
         ("young_modulus", "poisson_ratio"),
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
@@ -179,9 +200,14 @@ class Support(tables.DesignSection):
     """
 
     set: SetName
+    """Set of nodes or faces."""
     hold: tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...] = ()
+    """Motions that are held."""
     springs: Springs | None = None
+    """Stiffness of springs against x, y and z, and of a rigid set also rx, ry and rz [N/m and N
+    m/rad]."""
     rigid_about: tables.Vector | None = None
+    """Point about which the set moves as a rigid body [unit of length]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield faults of a support that holds nothing, or holds a motion twice."""
@@ -211,9 +237,13 @@ class MeshLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """
 
     set: SetName | None = None
+    """Set of nodes or faces on which the load acts."""
     point: tables.Vector | None = None
+    """Point at which the force acts [unit of length]."""
     force: tables.Direction | None = None
+    """Force, as a vector [N]."""
     pressure: float | None = None
+    """Pressure against the faces of the set [Pa]."""
 
     alternatives = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
@@ -222,19 +252,23 @@ class Damage(tables.Region):
     """A region that may lose stiffness: the cells of a set."""
 
     set: SetName
+    """Set of the cells."""
 
 
 class MeshMass(tables.ChosenMass):
     """A mass at a point of the structure."""
 
     point: tables.Vector
+    """Place of the mass [unit of length]."""
 
 
 class PointOutput(tables.Named):
     """An output of the structure: displacement or acceleration of a point along a direction."""
 
     point: tables.Vector
+    """Place [unit of length]."""
     direction: tables.Direction
+    """Direction, as a vector [1]."""
 
 
 class MeshPort(tables.AlternativeKeys, tables.Named):
@@ -244,8 +278,11 @@ class MeshPort(tables.AlternativeKeys, tables.Named):
     """
 
     direction: tables.Direction
+    """Direction of the force, as a vector [1]."""
     set: SetName | None = None
+    """Set of nodes or faces on which the force acts."""
     point: tables.Vector | None = None
+    """Point at which the force acts [unit of length]."""
 
     alternatives = (("set",), ("point",))
 
@@ -254,9 +291,13 @@ class MeshDesign(tables.StructureDesign, Gauged):
     """A structure from a mesh."""
 
     mesh: str = Field(min_length=1)
+    """Mesh file, relative to this file."""
     set: tuple[NamedSet, ...] = ()
+    """Further sets of nodes or cells."""
     material: tuple[MeshMaterial, ...] = Field(min_length=1)
+    """Materials, which cover every cell once."""
     support: tuple[Support, ...] = Field(min_length=1)
+    """Supports."""
     load: tuple[MeshLoad, ...] = ()
     damage: tuple[Damage, ...] = Field(default=(), max_length=MOST_REGIONS)
     mass: tuple[MeshMass, ...] = ()

@@ -16,7 +16,10 @@ FileName = Annotated[str, Field(min_length=1)]
 Files = Annotated[
     tuple[FileName, ...],
     Field(min_length=1),
-    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
+    BeforeValidator(
+        lambda files: (files,) if isinstance(files, str) else files,
+        json_schema_input_type=FileName | tuple[FileName, ...],
+    ),
 ]
 
 
@@ -27,7 +30,9 @@ class MatrixSupport(tables.DesignSection):
     """Motions of nodes that are held: `rx`, `ry`, `rz` are the components 4, 5 and 6."""
 
     nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
+    """Numbers of the nodes."""
     hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
+    """Motions that are held."""
 
 
 class StiffnessPart(tables.AlternativeKeys):
@@ -38,10 +43,16 @@ class StiffnessPart(tables.AlternativeKeys):
     """
 
     matrix: FileName | None = None
+    """File with the stiffness matrix of the part."""
     changed: FileName | None = None
+    """File with the stiffness matrix of the whole structure in which the part's modulus is
+    changed."""
     times: float | None = Field(default=None, ge=0.0, lt=1.0)
+    """Number by which the part's modulus is multiplied in `changed` [1]."""
     scaled_by: tables.Name | None = None
+    """Name of the parameter that scales the part."""
     damage: tables.Name | None = None
+    """Name of the region that takes stiffness from the part."""
 
     alternatives = (("matrix",), ("changed", "times"))
 
@@ -50,8 +61,11 @@ class MatrixLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """A load: its own `vector`, a `force` [N] at a node, or an `acceleration` [m/s^2]."""
 
     vector: FileName | None = None
+    """File with the load of each row."""
     node: Node | None = None
+    """Number of the node at which the force acts."""
     force: tables.Direction | None = None
+    """Force, as a vector [N]."""
 
     alternatives = (("vector",), ("node", "force"), ("acceleration",))
 
@@ -60,7 +74,9 @@ class MatrixMass(tables.AlternativeKeys, tables.ChosenMass):
     """Mass at a `node`, or times the `matrix` of 1 kg."""
 
     node: Node | None = None
+    """Number of the node at which the mass sits."""
     matrix: FileName | None = None
+    """File with the mass matrix of 1 kg."""
 
     alternatives = (("node",), ("matrix",))
 
@@ -69,9 +85,13 @@ class Extension(tables.AlternativeKeys, tables.Named):
     """Strain: its own `vector`, or how far two nodes move apart along a direction over a length."""
 
     vector: FileName | None = None
+    """File with a row, whose product with the displacements is the strain."""
     nodes: tuple[Node, Node] | None = None
+    """Numbers of the two nodes that move apart."""
     direction: tables.Direction | None = None
+    """Direction of the strain, as a vector [1]."""
     length: float | None = Field(default=None, gt=0.0)
+    """Length over which the nodes move apart [unit of length]."""
 
     alternatives = (("vector",), ("nodes", "direction", "length"))
 
@@ -80,8 +100,11 @@ class NodeOutput(tables.AlternativeKeys, tables.Named):
     """Displacement, acceleration or port: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
+    """File with a row, whose product with the displacements is the output."""
     node: Node | None = None
+    """Number of the node."""
     direction: tables.Direction | None = None
+    """Direction, as a vector [1]."""
 
     alternatives = (("vector",), ("node", "direction"))
 
@@ -95,10 +118,15 @@ class MatrixDesign(tables.StructureDesign):
     """
 
     stiffness_matrix: Files
+    """File with the stiffness matrix, or a list of files whose matrices are summed."""
     mass_matrix: Files
+    """File with the mass matrix, or a list of files whose matrices are summed."""
     unknowns: FileName | None = None
+    """File with node and component of each row; not needed if the matrices name nodes."""
     part: tuple[StiffnessPart, ...] = ()
+    """Parts of the stiffness that a parameter scales or a region may lose."""
     support: tuple[MatrixSupport, ...] = ()
+    """Nodes that are held."""
     load: tuple[MatrixLoad, ...] = ()
     damage: tuple[tables.Region, ...] = Field(default=(), max_length=MOST_REGIONS)
     mass: tuple[MatrixMass, ...] = ()

@@ -14,7 +14,7 @@ from reporting.toml_file import Fault, Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
+Modulus = Annotated[float, Field(ge=1e6, le=1e13)]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
@@ -55,6 +55,7 @@ class Named(DesignSection):
     """A table with a name, by which it is chosen or read."""
 
     name: Name
+    """Name, of letters, digits and underscores, a letter first."""
 
 
 class AlternativeKeys(DesignSection):
@@ -77,7 +78,9 @@ class Ranged(Named):
     """A quantity that can be chosen, with the range in which the reduced model is valid."""
 
     minimum: float | None = None
+    """Least value for which the reduced model is valid [unit of the nominal value]."""
     maximum: float | None = None
+    """Largest value for which the reduced model is valid [unit of the nominal value]."""
 
     usual: ClassVar[tuple[float, float]]
     """The default ends of the range, as multiples of the nominal value."""
@@ -113,7 +116,10 @@ class StiffnessParameter(Ranged):
     """A factor on the stiffness of materials, to be calibrated; by default 1."""
 
     nominal: float = Field(default=1.0, gt=0.0, le=1e3)
+    """Nominal value of the factor [1]."""
     minimum: float | None = Field(default=None, gt=0.0)
+    """Least value for which the reduced model is valid; by default 0.9 times the nominal one
+    [1]."""
 
     usual = (0.9, 1.1)
 
@@ -122,7 +128,9 @@ class LoadControl(Ranged):
     """A control, which scales loads: a load is its numbers times the value of its control."""
 
     unit: str = Field(default="1", pattern=r"^\S+$")
+    """Unit of the control."""
     nominal: float = 1.0
+    """Nominal value [unit of the control]."""
 
     usual = (-10.0, 10.0)
 
@@ -140,13 +148,16 @@ class ControlledLoad(Named):
     """A load, constant or times the value of a control."""
 
     control: Name | None = None
+    """Name of the control that scales the load; without it the load is constant."""
     acceleration: Direction | None = None
+    """Acceleration of everything that has mass, as a vector [m/s^2]."""
 
 
 class Region(Named):
     """A region that may lose stiffness, up to `largest_loss`; its loss has its name."""
 
     largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
+    """Largest loss of stiffness for which the reduced model is valid, as a fraction [1]."""
 
     @property
     def range(self) -> tuple[float, float]:
@@ -158,8 +169,11 @@ class ChosenMass(Ranged):
     """A mass [kg]; a `free` one is calibrated or chosen later."""
 
     mass: float = Field(ge=0.0, lt=1e6)
+    """Nominal mass [kg]."""
     free: bool = False
+    """Whether the mass is calibrated or chosen later."""
     minimum: float | None = Field(default=None, ge=0.0)
+    """Least mass for which the reduced model is valid; by default half the nominal one [kg]."""
 
     usual = (0.5, 1.5)
     nominal_key = "mass"
@@ -168,15 +182,19 @@ class ChosenMass(Ranged):
 class RayleighDamping(DesignSection):
     """Rayleigh damping V = alpha M + beta K."""
 
-    alpha: float = Field(default=0.0, ge=0.0, description="1/s")
-    beta: float = Field(default=0.0, ge=0.0, description="s")
+    alpha: float = Field(default=0.0, ge=0.0)
+    """Factor on the mass matrix [1/s]."""
+    beta: float = Field(default=0.0, ge=0.0)
+    """Factor on the stiffness matrix [s]."""
 
 
 class ReductionLimits(DesignSection):
     """The accuracy of the reduced model, and the number of full solutions that it may take."""
 
-    tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
+    tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1)
+    """Largest error of the reduced model, as a fraction of the largest output [1]."""
     most_solutions: int = Field(default=401, ge=1, le=2000)
+    """Largest number of solutions of the full model that the reduction may take."""
 
 
 class StructureDesign(DesignSection):
@@ -189,18 +207,31 @@ class StructureDesign(DesignSection):
     """
 
     name: str = Field(min_length=1)
+    """Name of the structure."""
     length_unit: Literal["m", "cm", "mm", "um", "in", "ft"]
+    """Unit of length of the mesh or matrices, and of places and lengths in this file."""
     parameter: tuple[StiffnessParameter, ...] = ()
+    """Factors on stiffness, to be calibrated."""
     control: tuple[LoadControl, ...] = ()
+    """Controls, which scale loads."""
     load: tuple[ControlledLoad, ...] = ()
+    """Loads."""
     damage: tuple[Region, ...] = Field(default=(), max_length=MOST_REGIONS)
+    """Regions that may lose stiffness."""
     mass: tuple[ChosenMass, ...] = ()
+    """Point masses."""
     gauge: tuple[Named, ...] = ()
+    """Strain gauges."""
     displacement: tuple[Named, ...] = ()
+    """Displacements that are outputs."""
     acceleration: tuple[Named, ...] = ()
+    """Accelerations that are outputs."""
     port: tuple[Named, ...] = ()
+    """Ports, where a force that the model lacks may act."""
     damping: RayleighDamping = RayleighDamping()
+    """Rayleigh damping."""
     reduction: ReductionLimits = ReductionLimits()
+    """Accuracy and cost of the reduced model."""
 
     what: ClassVar[str]
     """The content of its files: "mesh" or "matrix"."""

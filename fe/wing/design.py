@@ -60,21 +60,37 @@ class WingDesign(DesignSection):
     """
 
     name: str = Field(min_length=1)
+    """Name of the wing."""
     planform: parts.Planform
+    """Span and chords."""
     airfoil: parts.Airfoil
+    """Section of the wing."""
     skin: parts.Skin
+    """Shell of the wing."""
     webs: tuple[parts.Web, ...] = Field(min_length=2)
+    """Spanwise webs of the box, from the front to the rear."""
     ribs: tuple[parts.Rib, ...] = ()
+    """Ribs."""
     rods: tuple[parts.Rod, ...] = ()
+    """Round rods in webs."""
     added_density: tuple[parts.AddedDensity, ...] = ()
+    """Density of glue, paint or wiring."""
     root: parts.Root
+    """Springs at the root."""
     masses: parts.Masses
+    """Nominal masses of servos and pitot tube."""
     point_masses: tuple[parts.PointMassPlace, ...] = ()
+    """Places of servos and pitot tube."""
     gauges: parts.Gauges
+    """Strain gauges on the upper skin."""
     defects: tuple[parts.Defect, ...] = Field(min_length=1, max_length=MOST_REGIONS)
+    """Damage regions."""
     lift: parts.Lift
+    """Load of a level turn."""
     tip_load: parts.TipLoad
+    """Place of the static test load."""
     mesh: parts.MeshSettings
+    """Sizes of the finite elements."""
 
     def __repr__(self) -> str:
         return brief(

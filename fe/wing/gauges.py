@@ -45,10 +45,12 @@ def averaging_points(middle: float, length: float, lines: FloatArray) -> LinePoi
         return LinePoints(np.array([middle]), np.array([1.0]))
     start = middle - 0.5 * length
     end = middle + 0.5 * length
-    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
+    is_inside = (lines > start) & (lines < end)
+    breaks = np.array([start, *lines[is_inside], end])
     roots, root_weights = np.polynomial.legendre.leggauss(3)
-    intervals = np.diff(breaks)[:, None]
-    positions = breaks[:-1, None] + 0.5 * (1.0 + roots) * intervals
+    intervals = np.diff(breaks)[:, np.newaxis]
+    starts = breaks[:-1, np.newaxis]
+    positions = starts + 0.5 * (1.0 + roots) * intervals
     weights = 0.5 * root_weights * intervals / length
     return LinePoints(positions.ravel(), weights.ravel())
 
@@ -124,16 +126,20 @@ def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
     aft_of_straight_line = (chord_fraction - planform.straight_chord_line) * local_chord
     points = []
     span_points = averaging_points(distance, gauges.averaging_spanwise, mesh.span_lines)
-    for station, station_weight in zip(*span_points, strict=True):
-        straight_line = planform.straight_chord_line * planform.chord(station / planform.semi_span)
+    stations = zip(span_points.positions, span_points.weights, strict=True)
+    for station, station_weight in stations:
+        chord = planform.chord(station / planform.semi_span)
+        straight_line = planform.straight_chord_line * chord
         chord_points = averaging_points(
             aft_of_straight_line + straight_line,
             gauges.averaging_chordwise,
             mesh.chord_positions(station),
         )
-        for distance_aft, chord_weight in zip(*chord_points, strict=True):
+        positions = zip(chord_points.positions, chord_points.weights, strict=True)
+        for distance_aft, chord_weight in positions:
             cell, local = mesh.skin_point(station, distance_aft)
-            points.append(_SkinPoint(gauge, station_weight * chord_weight, cell, local))
+            weight = station_weight * chord_weight
+            points.append(_SkinPoint(gauge, weight, cell, local))
     return points
 
 
@@ -159,5 +165,6 @@ def _directions_in_skin(
     along_chord, along_span, _ = np.moveaxis(mesh.jacobians_at(cells, local), 2, 0)
     normal = unit_vector(np.cross(along_chord, along_span))
     _, span_component, _ = np.split(normal, 3, axis=1)
-    along = unit_vector(np.array([0.0, 1.0, 0.0]) - span_component * normal)
+    span_direction = np.array([0.0, 1.0, 0.0])
+    along = unit_vector(span_direction - span_component * normal)
     return along, np.cross(along, normal)

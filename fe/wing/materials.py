@@ -10,9 +10,12 @@ from fe.elements.elasticity import (
     unit_vector,
 )
 from fe.elements.kinds import gauss_points
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import BoolArray, FloatArray
 
 from .mesh import WingMesh
+from .parts import Rod
+
+_SPANWISE = 1  # of the local axes, and of the strains in them
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
@@ -46,19 +49,30 @@ def _set_skin_elasticity(mesh: WingMesh, local: FloatArray) -> None:
     skin_unit_elasticity = unit_elasticity((in_plane_ratio, transverse_ratio, transverse_ratio))
     wall_unit_elasticity = unit_elasticity((transverse_ratio, transverse_ratio, in_plane_ratio))
     is_skin = mesh.is_skin
-    modulus = skin.young_modulus(mesh.centre_stations)[is_skin, None, None]
-    is_wall = mesh.leading_edge[is_skin, None, None]
-    local[is_skin] = np.where(is_wall, wall_unit_elasticity, skin_unit_elasticity) * modulus
+    modulus = skin.young_modulus(mesh.centre_stations)[is_skin]
+    is_wall = mesh.leading_edge[is_skin]
+    unit_elasticities = np.where(
+        is_wall[:, np.newaxis, np.newaxis], wall_unit_elasticity, skin_unit_elasticity
+    )
+    local[is_skin] = unit_elasticities * modulus[:, np.newaxis, np.newaxis]
 
 
 def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
     """Add the flapwise bending stiffness of rods to their webs, in local axes (nc, 6, 6) [Pa]."""
     for rod in mesh.design.rods:
-        has_rod = (mesh.web == rod.web) & (mesh.centre_stations < rod.reach)
+        has_rod = _cells_with_rod(mesh, rod)
+        height = _web_height(mesh)[has_rod]
         thickness = mesh.design.webs[rod.web].thickness
         # an additional spanwise modulus E with E I = the rod's bending stiffness, I that of the web
-        second_moment = thickness * _web_height(mesh)[has_rod] ** 3 / 12.0
-        local[has_rod, 1, 1] += rod.bending_stiffness / second_moment
+        second_moment = thickness * height**3 / 12.0
+        local[has_rod, _SPANWISE, _SPANWISE] += rod.bending_stiffness / second_moment
+
+
+def _cells_with_rod(mesh: WingMesh, rod: Rod) -> BoolArray:
+    """Return whether each cell (nc,) belongs to the web of a rod, within the reach of the rod."""
+    on_web = mesh.web == rod.web
+    within_reach = mesh.centre_stations < rod.reach
+    return np.asarray(on_web & within_reach)
 
 
 def cell_axes(mesh: WingMesh) -> FloatArray:
@@ -94,7 +108,8 @@ def modulus_variation(mesh: WingMesh) -> FloatArray:
     _, y, _ = np.moveaxis(mesh.positions(skin_cells, rule.points), 2, 0)
     stations = y / mesh.design.planform.semi_span
     central_modulus = skin.young_modulus(mesh.centre_stations[skin_cells])
-    factor[skin_cells] = skin.young_modulus(stations) / central_modulus[:, None]
+    modulus = skin.young_modulus(stations)
+    factor[skin_cells] = modulus / central_modulus[:, np.newaxis]
     return factor
 
 
@@ -115,9 +130,11 @@ def cell_density(mesh: WingMesh) -> FloatArray:
     for index, rib in enumerate(design.ribs):
         density[mesh.rib == index] = rib.density
     for added in design.added_density:
-        density[(station > added.start) & (station < added.end)] += added.density
+        is_inside = (station > added.start) & (station < added.end)
+        density[is_inside] += added.density
     for rod in design.rods:
-        has_rod = (mesh.web == rod.web) & (station < rod.reach)
-        web_area = design.webs[rod.web].thickness * _web_height(mesh)[has_rod]
+        has_rod = _cells_with_rod(mesh, rod)
+        height = _web_height(mesh)[has_rod]
+        web_area = design.webs[rod.web].thickness * height
         density[has_rod] += rod.mass_per_length / web_area
     return density

@@ -188,10 +188,12 @@ def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float
     root_width = width.T[0]
     is_wide = root_width > _NARROW * root_width.max()
     group = np.concatenate([[0], np.cumsum(is_wide)])
-    in_group = (group[:, None] == np.arange(group[-1] + 1)).astype(np.float64)
+    group_numbers = np.arange(group[-1] + 1)
+    in_group = (group[:, np.newaxis] == group_numbers).astype(np.float64)
     # normal equations of the least squares for the offset of each group
-    right_hand_side = (moment @ in_group)[..., None]
-    offset = np.linalg.solve(in_group.T @ gram @ in_group, right_hand_side).squeeze(axis=-1)
+    right_hand_side = (moment @ in_group)[..., np.newaxis]
+    group_gram = in_group.T @ gram @ in_group
+    offset = np.linalg.solve(group_gram, right_hand_side).squeeze(axis=-1)
     return np.asarray(on_airfoil + in_group @ offset.T)
 
 
@@ -243,14 +245,16 @@ def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: flo
     height_on_lines = _half_thickness(behind, chord, thickness_ratio)
     line_count, station_count = behind.shape
     moments = np.zeros((station_count, line_count))
-    for abscissa, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True):
+    abscissas, weights = np.polynomial.legendre.leggauss(5)
+    for abscissa, weight in zip(abscissas, weights, strict=True):
         # shape functions of the cell's rear and front line, and the gap there
         rear = 0.5 * (1.0 + abscissa)
         front = 1.0 - rear
         height = _half_thickness(behind[:-1] + rear * width, chord, thickness_ratio)
         gap = height - front * height_on_lines[:-1] - rear * height_on_lines[1:]
-        moments[:, :-1] += (front * gap * width * (0.5 * weight)).T
-        moments[:, 1:] += (rear * gap * width * (0.5 * weight)).T
+        fraction = 0.5 * weight
+        moments[:, :-1] += (front * gap * width * fraction).T
+        moments[:, 1:] += (rear * gap * width * fraction).T
     return moments
 
 
@@ -285,9 +289,11 @@ def _grid_points(
     slope = four_digit_slope(behind / chord, thickness_ratio)
     inner = outer - design.skin.thickness * np.sqrt(1.0 + slope**2)
     levels = np.linspace(-1.0, 1.0, height_cells + 1)
-    z = np.concatenate([-outer[..., None], inner[..., None] * levels, outer[..., None]], axis=2)
-    x = (behind - planform.straight_chord_line * chord)[..., None]
-    y = across[None, :, None]
+    upper_surface = outer[..., np.newaxis]
+    inner_levels = inner[..., np.newaxis] * levels
+    z = np.concatenate([-upper_surface, inner_levels, upper_surface], axis=2)
+    x = (behind - planform.straight_chord_line * chord)[..., np.newaxis]
+    y = across[np.newaxis, :, np.newaxis]
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
@@ -363,10 +369,11 @@ def build_mesh(design: WingDesign) -> WingMesh:
     grid_cells = _grid_cells(design, across, along, height_cells)
     # number the vertices that the kept cells use
     grid_index = np.argwhere(grid_cells.is_kept)
-    vertices = grid_index[:, None, :] + np.array(HEXAHEDRA_20.corners)
-    vertex_numbers = np.ravel_multi_index(tuple(np.moveaxis(vertices, 2, 0)), grid.shape[:3])
-    used, cells = np.unique(vertex_numbers, return_inverse=True)
-    mesh = hexahedra_20(grid.reshape(-1, 3)[used], cells.reshape(vertex_numbers.shape))
+    i, j, k = np.moveaxis(grid_index[:, np.newaxis] + np.array(HEXAHEDRA_20.corners), 2, 0)
+    vertex_numbers = np.ravel_multi_index((i, j, k), grid.shape[:3])
+    used_vertices, cells = np.unique(vertex_numbers, return_inverse=True)
+    vertices = grid.reshape(-1, 3)[used_vertices]
+    mesh = hexahedra_20(vertices, cells.reshape(vertex_numbers.shape))
     return WingMesh(
         kind=mesh.kind,
         points=mesh.points,

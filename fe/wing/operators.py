@@ -130,7 +130,9 @@ def root_support(mesh: WingMesh) -> Supports:
     root = mesh.design.root
     no_springs = np.zeros(mesh.points.shape)
     _, span_position, _ = mesh.points.T
-    root_nodes = np.flatnonzero(np.abs(span_position) < 1e-9 * mesh.design.planform.semi_span)
+    tolerance = 1e-9 * mesh.design.planform.semi_span
+    root_nodes = np.flatnonzero(np.abs(span_position) < tolerance)
+    # of translations and rotations along and about x, y, z
     springs = np.array([0.0, 0.0, root.transverse_spring, root.flap_spring, 0.0, root.yaw_spring])
     rib = RigidSet(root_nodes, point=np.zeros(3), held=springs == 0.0, springs=springs)
     nothing_held = no_springs.astype(bool)
@@ -156,7 +158,7 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
     weights = np.zeros(len(mesh.points))
     for upper in (True, False):
         cell, local = mesh.skin_point(distance, distance_aft, upper=upper)
-        (values,), _ = mesh.kind.shape_functions(local[None])
+        (values,), _ = mesh.kind.shape_functions(local[np.newaxis])
         weights[mesh.cells[cell]] += 0.5 * values
     return weights
 
@@ -173,7 +175,7 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
     weights_of_pitots = [np.zeros((0, len(mesh.points)))]
     for point_mass in design.point_masses:
         distance = point_mass.station * design.planform.semi_span
-        weights = section_displacement(mesh, distance, point_mass.chord)[None]
+        weights = section_displacement(mesh, distance, point_mass.chord)[np.newaxis]
         if point_mass.kind == "servo":
             weights_of_servos.append(weights)
         else:
@@ -233,7 +235,8 @@ def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None
     span_distribution = DISTRIBUTIONS[lift.distribution](planform, station)
     chord_distribution = (1.0 - chord_fraction) ** lift.chordwise_exponent
     pressure = span_distribution * chord_distribution / chord
-    np.add.at(load, mesh.cells[cells], (pressure * area * face.weights) @ shape_values)
+    force_at_points = pressure * area * face.weights
+    np.add.at(load, mesh.cells[cells], force_at_points @ shape_values)
 
 
 def turn_load(body: Body[WingMesh]) -> FloatArray:
@@ -246,7 +249,8 @@ def turn_load(body: Body[WingMesh]) -> FloatArray:
     if body.mesh.design.lift.inertia_relief:
         weight = STANDARD_GRAVITY * body.nodal_mass
         lift = load[2::3].copy()
-        load[2::3] += lift * (weight.sum() / lift.sum()) - weight
+        weight_over_lift = weight.sum() / lift.sum()
+        load[2::3] += lift * weight_over_lift - weight
     return load
 
 

@@ -42,7 +42,8 @@ def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float)
     """
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 0.0, 1.0)
     a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
-    polynomial = a0 * np.sqrt(xi) + xi * (a1 + xi * (a2 + xi * (a3 + xi * a4)))
+    cubic = a1 + xi * (a2 + xi * (a3 + xi * a4))
+    polynomial = a0 * np.sqrt(xi) + xi * cubic
     return np.asarray(5.0 * thickness_ratio * polynomial)
 
 
@@ -50,50 +51,62 @@ def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> Float
     """Return the slope of the upper surface, the derivative of `four_digit_half_thickness`."""
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 1e-6, 1.0)
     a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
-    derivative = 0.5 * a0 / np.sqrt(xi) + a1 + xi * (2.0 * a2 + xi * (3.0 * a3 + 4.0 * xi * a4))
+    slope_of_root = 0.5 * a0 / np.sqrt(xi)
+    quadratic = 2.0 * a2 + xi * (3.0 * a3 + 4.0 * xi * a4)
+    derivative = slope_of_root + a1 + xi * quadratic
     return np.asarray(5.0 * thickness_ratio * derivative)
 
 
 _Numbers = TypeVar("_Numbers", float, FloatArray)
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
+Thickness = Annotated[float, Field(gt=0.0, lt=0.1)]
 PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
 ShearRatio = Annotated[float, Field(gt=0.0, le=1.0)]
-Density = Annotated[float, Field(ge=0.0, le=3e4, description="kg/m^3")]
+Density = Annotated[float, Field(ge=0.0, le=3e4)]
 Spring = Annotated[float, Field(gt=0.0, le=1e15)]
 
 
 class Planform(DesignSection):
     """Straight-tapered half-wing; the chord line `straight_chord_line` is the spanwise axis."""
 
-    semi_span: float = Field(gt=0.05, lt=60.0, description="m")
-    root_chord: float = Field(gt=0.01, lt=15.0, description="m")
-    tip_chord: float = Field(gt=0.01, lt=15.0, description="m")
+    semi_span: float = Field(gt=0.05, lt=60.0)
+    """Length of the half-wing [m]."""
+    root_chord: float = Field(gt=0.01, lt=15.0)
+    """Chord at the root [m]."""
+    tip_chord: float = Field(gt=0.01, lt=15.0)
+    """Chord at the tip [m]."""
     straight_chord_line: Fraction
+    """Fraction of the chord whose line is the spanwise axis [1]."""
 
     def chord(self, station: _Numbers) -> _Numbers:
         """Return the chord (...,) [m] at fractions (...,) of the semi-span."""
-        return self.root_chord + (self.tip_chord - self.root_chord) * station
+        taper = self.tip_chord - self.root_chord
+        return self.root_chord + taper * station
 
 
 class Airfoil(DesignSection):
     """Symmetric four-digit section."""
 
     thickness_ratio: float = Field(ge=0.02, le=0.4)
+    """Largest thickness over the chord [1]."""
 
 
 class SkinBand(DesignSection):
     """Young's modulus [Pa] of the skin from the previous band's end to `end`, in spans."""
 
     end: Fraction
+    """End of the band, as a fraction of the span [1]."""
     young_modulus: Modulus
+    """Young's modulus of the skin from the previous band's end to this one [Pa]."""
 
 
 class SkinStation(DesignSection):
     """Young's modulus [Pa] of the skin at a fraction of the span."""
 
     station: Fraction
+    """Place, as a fraction of the span [1]."""
     young_modulus: Modulus
+    """Young's modulus of the skin at this place [Pa]."""
 
 
 class Skin(DesignSection):
@@ -104,13 +117,21 @@ class Skin(DesignSection):
     """
 
     thickness: Thickness
+    """Thickness [m]."""
     density: Density
+    """Density [kg/m^3]."""
     poisson_ratio: PoissonRatio
+    """Poisson's ratio [1]."""
     in_plane_shear_ratio: ShearRatio
+    """In-plane shear modulus over Young's modulus [1]."""
     transverse_shear_ratio: ShearRatio
+    """Transverse shear modulus over Young's modulus [1]."""
     closed_leading_edge: bool = True
+    """Whether the skin closes the leading edge in front of the box."""
     bands: tuple[SkinBand, ...] = ()
+    """Bands along the span, each of one Young's modulus."""
     stations: tuple[SkinStation, ...] = ()
+    """Places along the span, between which Young's modulus is linear."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the faults of Young's modulus along the span."""
@@ -148,22 +169,29 @@ class Wall(DesignSection):
     """A wall between the skins."""
 
     thickness: Thickness
+    """Thickness [m]."""
     young_modulus: Modulus
+    """Young's modulus [Pa]."""
     poisson_ratio: PoissonRatio
+    """Poisson's ratio [1]."""
     density: Density
+    """Density [kg/m^3]."""
 
 
 class Web(Wall):
     """Spanwise web at a chordwise place; the first and the last close the box."""
 
     chord: Fraction
+    """Place, as a fraction of the chord [1]."""
     shear_modulus: Modulus
+    """Shear modulus [Pa]."""
 
 
 class Rib(Wall):
     """Rib at a fraction of the span, isotropic, over the whole height and width of the box."""
 
     station: Fraction
+    """Place, as a fraction of the span [1]."""
 
 
 class Rod(DesignSection):
@@ -173,10 +201,15 @@ class Rod(DesignSection):
     """
 
     web: int = Field(ge=0)
+    """Number of the web in which the rod lies, counted from 0."""
     reach: float = Field(gt=0.0, le=1.0)
+    """End of the rod, as a fraction of the span [1]."""
     diameter: Thickness
+    """Diameter [m]."""
     young_modulus: Modulus
+    """Young's modulus [Pa]."""
     density: Density
+    """Density [kg/m^3]."""
 
     @property
     def bending_stiffness(self) -> float:
@@ -193,31 +226,42 @@ class AddedDensity(DesignSection):
     """Density [kg/m^3] of glue, paint or wiring, added between two fractions of the span."""
 
     start: Fraction
+    """Start, as a fraction of the span [1]."""
     end: Fraction
+    """End, as a fraction of the span [1]."""
     density: Density
+    """Density that is added [kg/m^3]."""
 
 
 class Root(DesignSection):
     """Springs that carry the rigid root rib; its other motions are held."""
 
-    transverse_spring: Spring = Field(description="N/m")
-    flap_spring: Spring = Field(description="N m/rad")
-    yaw_spring: Spring = Field(description="N m/rad")
+    transverse_spring: Spring
+    """Stiffness against displacement [N/m]."""
+    flap_spring: Spring
+    """Stiffness against rotation in bending [N m/rad]."""
+    yaw_spring: Spring
+    """Stiffness against rotation in the plane of the wing [N m/rad]."""
 
 
 class PointMassPlace(DesignSection):
     """Location of a point mass of a kind; its mass is `masses.<kind>` until it is calibrated."""
 
     kind: Literal["servo", "pitot"]
+    """What the mass is."""
     station: Fraction
+    """Place, as a fraction of the span [1]."""
     chord: Fraction
+    """Place, as a fraction of the chord [1]."""
 
 
 class Masses(DesignSection):
     """Nominal masses [kg] of one servo and of the pitot tube."""
 
     servo: float = Field(ge=0.0, lt=1e3)
+    """Mass of one servo [kg]."""
     pitot: float = Field(ge=0.0, lt=1e3)
+    """Mass of the pitot tube [kg]."""
 
 
 class Gauges(DesignSection):
@@ -229,10 +273,14 @@ class Gauges(DesignSection):
     supports does not show.
     """
 
-    averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
-    averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0, description="m")
+    averaging_chordwise: float = Field(ge=0.0, lt=1.0)
+    """Width over which a gauge averages, along the chord [m]."""
+    averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Length over which a gauge averages, along the span [m]."""
     surface: Literal["outer", "middle"] = "outer"
+    """Whether gauges read the strain of the outer surface, or of the middle of the skin."""
     positions: tuple[tuple[float, float], ...] = Field(min_length=1)
+    """Distance from the root and fraction of the chord of each gauge [m and 1]."""
 
 
 class Defect(DesignSection):
@@ -243,10 +291,15 @@ class Defect(DesignSection):
     """
 
     name: str | None = Field(default=None, max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    """Name of the region; by default z and its number, counted from 1."""
     span_start: float = Field(ge=0.0)
+    """Start, as a distance from the root [m]."""
     span_end: float = Field(gt=0.0)
+    """End, as a distance from the root [m]."""
     chord_start: Fraction
+    """Start, as a fraction of the chord [1]."""
     chord_end: Fraction
+    """End, as a fraction of the chord [1]."""
 
 
 class Lift(DesignSection):
@@ -259,18 +312,27 @@ class Lift(DesignSection):
     """
 
     distribution: Literal["schrenk", "lifting_line"]
+    """Method by which the lift is distributed along the span."""
     force: float = Field(gt=0.0, lt=1e6)
+    """Lift of the half-wing at `load_factor` [N]."""
     forward_force: float = Field(ge=0.0, lt=1e6)
+    """Force along the chord on the half-wing at `load_factor` [N]."""
     load_factor: float = Field(gt=0.0, lt=20.0)
+    """Load factor at which the forces are given [1]."""
     chordwise_exponent: float = Field(default=1.0, ge=0.0, le=10.0)
+    """Exponent p of the weight (1 - xi)^p of the lift along the chord [1]."""
     inertia_relief: bool = False
+    """Whether the weight of structure and masses acts against the lift where they are; `force`
+    stays the net total."""
 
 
 class TipLoad(DesignSection):
     """Point of the static test load: distance from the tip [m] and chord fraction."""
 
     distance_from_tip: float = Field(ge=0.0)
+    """Distance from the tip [m]."""
     chord: Fraction
+    """Place, as a fraction of the chord [1]."""
 
 
 class MeshSettings(DesignSection):
@@ -281,9 +343,13 @@ class MeshSettings(DesignSection):
     """
 
     span_size: float = Field(gt=1e-3, lt=10.0)
+    """Largest cell along the span [m]."""
     chord_size: float = Field(gt=0.005, le=1.0)
+    """Largest cell along the chord, as a fraction of it [1]."""
     edge_size: float | None = Field(default=None, gt=1e-3, lt=1.0)
+    """Largest cell beside edges of damage regions; by default as elsewhere [m]."""
     refinement: float = Field(default=1.0, ge=0.25, le=8.0)
+    """Number by which all sizes are divided [1]."""
 
 
 def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
@@ -302,8 +368,10 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
         Lift per length over total lift [1/m].
     """
     eta = np.asarray(station, dtype=float)
-    trapezoid = 2.0 * planform.chord(eta) / (planform.root_chord + planform.tip_chord)
-    ellipse = 4.0 / np.pi * np.sqrt(np.clip(1.0 - eta**2, 0.0, None))
+    chord_sum = planform.root_chord + planform.tip_chord
+    trapezoid = 2.0 * planform.chord(eta) / chord_sum
+    circle = np.sqrt(np.clip(1.0 - eta**2, 0.0, None))
+    ellipse = 4.0 / np.pi * circle
     return np.asarray(0.5 * (trapezoid + ellipse) / planform.semi_span)
 
 
@@ -333,13 +401,18 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
     n = 2.0 * np.arange(terms) + 1.0
     chord = planform.chord(np.cos(theta))
     mu = chord * 2.0 * np.pi / (8.0 * planform.semi_span)
-    sine = np.sin(np.outer(theta, n))
-    system = sine * (n * mu[:, None] + np.sin(theta)[:, None])
-    amplitude = np.linalg.solve(system, mu * np.sin(theta))
+    sine_of_theta = np.sin(theta)
+    harmonics = np.sin(np.outer(theta, n))
+    system = harmonics * (n * mu[:, np.newaxis] + sine_of_theta[:, np.newaxis])
+    amplitude = np.linalg.solve(system, mu * sine_of_theta)
     # Only n = 1 contributes to the integral over the half-wing, A_1 pi/4 times the semi-span.
-    scale = 1.0 / (amplitude[0] * np.pi / 4.0 * planform.semi_span)
-    angle = np.arccos(np.clip(np.asarray(station, dtype=float), 0.0, 1.0))
-    return np.asarray(scale * np.tensordot(np.sin(angle[..., None] * n), amplitude, axes=1))
+    integral = amplitude[0] * np.pi / 4.0 * planform.semi_span
+    # the circulation at the stations
+    fraction = np.clip(np.asarray(station, dtype=float), 0.0, 1.0)
+    angle = np.arccos(fraction)
+    harmonics_at_stations = np.sin(angle[..., np.newaxis] * n)
+    circulation = np.tensordot(harmonics_at_stations, amplitude, axes=1)
+    return np.asarray(1.0 / integral * circulation)
 
 
 DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}

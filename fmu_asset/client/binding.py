@@ -89,13 +89,14 @@ class BindingHeader(Section):
         Interface by which it is run; co-simulation if it offers that.
     tolerance : float, optional
         Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
-        that the FMU declares for its default experiment (ours is never looser than 1e-6 then).
+        that the FMU declares for its default experiment, and at most 1e-6 for ours [1].
     interpolation : {"zero-order", "linear"}
         Course of inputs between communication points: held, or, where the FMU can follow and both
         ends are continuous, in a straight line to the value given for a step, which they reach at
         its end.
     structural_parameters : dict of str to float
-        Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow.
+        Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow
+        [unit of the FMU].
     state : {"auto", "serialised", "replay"}
         How `save_state` keeps the state; auto trusts what the FMU declares.
     description : str

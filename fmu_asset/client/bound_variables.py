@@ -74,7 +74,10 @@ def expand(pattern: str) -> tuple[str, ...]:
     return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
 
 
-_Names = Annotated[tuple[_Text, ...], BeforeValidator(_with_expanded_patterns)]
+_Names = Annotated[
+    tuple[_Text, ...],
+    BeforeValidator(_with_expanded_patterns, json_schema_input_type=_Text | tuple[_Text, ...]),
+]
 
 
 class ScalarBinding(Section):
@@ -85,14 +88,18 @@ class ScalarBinding(Section):
     """
 
     variable: _Text
+    """Name of the variable in the FMU."""
     unit: _Text
+    """Unit in which the caller gives or takes the value."""
 
 
 class InputBinding(ScalarBinding):
     """An input with a range of its own, in `unit`, within that of the FMU."""
 
     minimum: Number | None = None
+    """Least value that may be given [unit of the entry]."""
     maximum: Number | None = None
+    """Largest value that may be given [unit of the entry]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield a minimum above the maximum."""
@@ -116,6 +123,8 @@ class ParameterBinding(InputBinding):
     """
 
     value: Number | str | None = None
+    """Value that is set at every reset unless the caller gives another; a text for a text
+    parameter, or the name of an item of an enumeration [unit of the entry]."""
 
 
 class VectorBinding(Section):
@@ -125,7 +134,9 @@ class VectorBinding(Section):
     """
 
     variables: Annotated[_Names, Field(min_length=1)]
+    """Names of variables in the FMU, in order; `{a..b}` stands for all numbers from a to b."""
     unit: _Text | _Texts
+    """Unit of all variables, or a list with that of each."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -171,8 +182,11 @@ class PortBinding(Section):
     """
 
     force: VectorBinding
+    """Force or moment at the port."""
     displacement: VectorBinding | None = None
+    """Displacement or angle of the port."""
     velocity: VectorBinding | None = None
+    """Velocity or angular velocity of the port."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the faults of a port: no motion, or a unit that its quantity cannot have."""
@@ -210,3 +224,4 @@ class RecordBinding(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
     variables: _Names = ()
+    """Names of variables in the FMU; `{a..b}` stands for all numbers from a to b."""

@@ -1,5 +1,6 @@
 """Commands of benchmarks and evidence: each answers `--help`; each study names the page of its figures."""
 
+import ast
 import inspect
 import re
 from importlib import import_module
@@ -41,8 +42,9 @@ def studies() -> list[Path]:
 
 @pytest.mark.parametrize("file", studies(), ids=lambda file: file.stem)
 def test_a_study_names_the_page_of_its_figures_and_the_page_names_its_command(file):
-    first_line = file.read_text(encoding="utf-8").splitlines()[0]
-    pages = re.findall(r"docs/\w+\.md", first_line)
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
+    assert docstring is not None
+    pages = re.findall(r"docs/[\w/]+\.md", docstring)
     assert pages
     for page in pages:
         assert f"python -m benchmarks.studies.{file.stem}" in (ROOT / page).read_text(encoding="utf-8")

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
+REFERENCE = (
+    Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
+)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def reference() -> Path:
     if not REFERENCE.is_dir():
         pytest.skip(f"the authors' calibration folder is not at {REFERENCE}")

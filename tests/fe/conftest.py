@@ -12,7 +12,9 @@ from tests.kept import FE, kept
 @pytest.fixture(scope="session")
 def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperators) -> Reduction:
     with threadpool_limits(1):
-        return kept("coarse-reduction", lambda: reduce_structure(coarse_operators), FE, coarse_design.hash)
+        return kept(
+            "coarse-reduction", lambda: reduce_structure(coarse_operators), FE, coarse_design.hash
+        )
 
 
 @pytest.fixture(scope="session")

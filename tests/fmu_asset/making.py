@@ -15,7 +15,13 @@ import pytest
 
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, parse_binding
-from fmu_asset.coupling.structure import Component, Connection, Connector, SystemStructure, expand_connection
+from fmu_asset.coupling.structure import (
+    Component,
+    Connection,
+    Connector,
+    SystemStructure,
+    expand_connection,
+)
 from tests.kept import packed
 
 ROOT = Path(__file__).parents[2]
@@ -37,7 +43,9 @@ def archive_of(path: Path, contents: Mapping[str, str | bytes]) -> Path:
     """Write an archive; the inverse of `members`."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
-            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)  # equal each time
+            archive.writestr(
+                zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED
+            )  # equal each time
     return path
 
 
@@ -53,7 +61,9 @@ def edited(archive: Path, target: Path, *changes: tuple[str, str]) -> Path:
 
 def parameters_of(fmu: Path) -> dict[str, float]:
     """Return the parameters of an FMU with the start values that it declares."""
-    return {v.name: float(v.start or 0.0) for v in read_fmu(fmu).variables if v.causality == "parameter"}
+    return {
+        v.name: float(v.start or 0.0) for v in read_fmu(fmu).variables if v.causality == "parameter"
+    }
 
 
 def run_python(program: str, *arguments: object, **options: Any) -> str:
@@ -77,11 +87,15 @@ def bound(step_size: float, observation: Ends, **roles: Any) -> Binding:
     keys = "variable", "unit", "minimum", "maximum"
     for role, ends in roles.items():
         parts[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
-    observed = {name: {"variables": names, "unit": unit} for name, (names, unit) in observation.items()}
+    observed = {
+        name: {"variables": names, "unit": unit} for name, (names, unit) in observation.items()
+    }
     return parse_binding({"binding": header, "observation": observed, **parts})
 
 
-def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **tables: Any) -> Binding:
+def changed(
+    binding: Binding, *, header: Mapping[str, object] | None = None, **tables: Any
+) -> Binding:
     """Return a binding with further keys of its header, and some tables replaced."""
     record = binding.model_dump(exclude_none=True, mode="json")
     return parse_binding(record | {"binding": record["binding"] | dict(header or {})} | tables)
@@ -102,10 +116,14 @@ def system(
     return SystemStructure(name, tuple(components), tuple(connectors), tuple(joined))
 
 
-def watch(*names: str, step_size: float = 1.0, inputs: Sequence[str] = (), **header: object) -> Binding:
+def watch(
+    *names: str, step_size: float = 1.0, inputs: Sequence[str] = (), **header: object
+) -> Binding:
     """Return a binding that observes ends of a system, all without unit."""
     control = {name: (name, "1") for name in inputs}
-    return bound(step_size, {"all": (list(names), "1")}, control=control, header={"name": "watch", **header})
+    return bound(
+        step_size, {"all": (list(names), "1")}, control=control, header={"name": "watch", **header}
+    )
 
 
 # ---------------------------------------------------------------- others' FMUs
@@ -134,7 +152,9 @@ class Workshop:
         key = (model, defines)
         if key not in self._built:
             path = self._folder / f"{'_'.join([model, *defines]).lower()}.fmu"
-            self._built[key] = packed(path, lambda: self._build(path, model, defines), (FOREIGN,), defines)
+            self._built[key] = packed(
+                path, lambda: self._build(path, model, defines), (FOREIGN,), defines
+            )
         return self._built[key]
 
     def _build(self, path: Path, model: str, defines: tuple[str, ...]) -> None:

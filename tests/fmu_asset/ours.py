@@ -44,13 +44,17 @@ def wing_model(name: str = "wing") -> ReducedModel:
     """Return the reduced model of a design."""
     design = DESIGNS[name]
     with threadpool_limits(1):
-        return kept("coarse-reduction", lambda: reduce_structure(assemble(design)), FE, design.hash).model
+        return kept(
+            "coarse-reduction", lambda: reduce_structure(assemble(design)), FE, design.hash
+        ).model
 
 
 @cache
 def wing_arrays() -> PatchArrays:
     """Return that wing for patches."""
-    return kept("coarse-patches", lambda: build_patch_arrays(DESIGNS["wing"]), FE, DESIGNS["wing"].hash)
+    return kept(
+        "coarse-patches", lambda: build_patch_arrays(DESIGNS["wing"]), FE, DESIGNS["wing"].hash
+    )
 
 
 class OurFmus:

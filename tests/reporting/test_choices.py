@@ -21,7 +21,8 @@ from reporting.errors import InvalidChoiceError
 
 def test_a_word_that_is_not_allowed_is_told_beside_the_nearest():
     with pytest.raises(
-        InvalidChoiceError, match=r"`kind` must be 'ambient' or 'decay', and 'Decai' came; .*'decay'"
+        InvalidChoiceError,
+        match=r"`kind` must be 'ambient' or 'decay', and 'Decai' came; .*'decay'",
     ):
         require_one_of("Decai", ("ambient", "decay"), "kind")
 
@@ -54,7 +55,7 @@ def literal_values(hint: object) -> Iterator[tuple[object, ...]]:
 
 
 def arguments(function: object) -> dict[str, object]:
-    """Return the type hints of a function's arguments; those of a TypedDict of options one by one."""
+    """Return the type hints of a function's arguments, of a TypedDict of options one by one."""
     modules = {"xr": xarray}  # imported for type checkers alone where it takes long
     hints = get_type_hints(function, localns=modules)
     hints.pop("return", None)
@@ -84,7 +85,9 @@ CHOICES = [
 ]
 
 CALLS = {
-    "GaussianSensorModel.__init__": partial(uav_twin.GaussianSensorModel, np.zeros((1, 2, 1, 1)), 1.0),
+    "GaussianSensorModel.__init__": partial(
+        uav_twin.GaussianSensorModel, np.zeros((1, 2, 1, 1)), 1.0
+    ),
     "Twin.__init__": partial(uav_twin.Twin, "twin", None, None, None),
     "build_fmu": partial(uav_twin.build_fmu, None, "never_written.fmu"),
     "calibrate": uav_twin.calibrate,

@@ -8,7 +8,11 @@ from reporting import former_names
 from reporting.errors import DamagedFileError
 from reporting.former_names import FormerNameWarning, with_present_names
 
-PRESENT_NAMES = {"turn": "step", "group.inspections_a_turn": "inspections_per_step", "assets.*.turn": "step"}
+PRESENT_NAMES = {
+    "turn": "step",
+    "group.inspections_a_turn": "inspections_per_step",
+    "assets.*.turn": "step",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +29,8 @@ def test_former_names_are_replaced_where_they_stand_and_nowhere_else():
         "other": {"turn": 4},
     }
     sentence = (
-        "^a.toml: `turn` is now called `step` and `inspections_a_turn` is now called `inspections_per_step`. "
+        "^a.toml: `turn` is now called `step` and "
+        "`inspections_a_turn` is now called `inspections_per_step`. "
         "The former names are still read.$"
     )
     with pytest.warns(FormerNameWarning, match=sentence):

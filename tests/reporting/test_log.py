@@ -15,7 +15,11 @@ def test_notes_of_library_code_are_records_of_the_log(caplog):
     with caplog.at_level(logging.INFO, logger="uav_twin"):
         progress.reporter().note("The run is finished.")
     ((name, level, message),) = caplog.record_tuples
-    assert (name.split(".")[0], level, message) == ("uav_twin", logging.INFO, "The run is finished.")
+    assert (name.split(".")[0], level, message) == (
+        "uav_twin",
+        logging.INFO,
+        "The run is finished.",
+    )
 
 
 def test_a_command_shows_warnings_line_by_line_and_leaves_the_logger_as_it_was():

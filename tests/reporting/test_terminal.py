@@ -9,32 +9,65 @@ from rich.console import Console
 from reporting.progress import Progress, RichProgress, SilentProgress
 from reporting.terminal import console_table
 
+# ---------------------------------------------------------------- tables
 
-def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
-    console = Console(file=StringIO(), width=width, highlight=False, markup=False)
+
+def print_table(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
+    """Return the lines of a table on a terminal of some columns."""
+    stream = StringIO()
+    console = Console(file=stream, width=width, highlight=False, markup=False)
     console.print(console_table(headings, rows, width))
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue().splitlines()
+    return stream.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("width", [80, 100, 200])
-def test_a_table_can_be_read_at_any_width(width):
-    """No number breaks beside a long title, identifiers do where a reader expects it; empty columns go."""
-    rows = [
-        ("posterior mean of the Young modulus factor of the wing box", "", "1.008", "1.0073 (1)"),
-        ("temperature_dependent_modulus", "", "4.1592 points", "3.8 points (2)"),
-        ("asset, per step", "", "0.281 ms (largest 3.14 ms)", ""),
-    ]
-    lines = printed(("figure", "unit", "this run", "reference"), rows, width)
+ROWS = [
+    ("posterior mean of the Young modulus factor of the wing box", "", "1.008", "1.0073 (1)"),
+    ("temperature_dependent_modulus", "", "4.1592 points", "3.8 points (2)"),
+    ("asset, per step", "", "0.281 ms (largest 3.14 ms)", ""),
+]
+
+
+@pytest.fixture(params=[80, 100, 200])
+def width(request):
+    return request.param
+
+
+@pytest.fixture
+def lines(width):
+    """The lines of `ROWS`, with a column of units that is empty."""
+    return print_table(("figure", "unit", "this run", "reference"), ROWS, width)
+
+
+def test_a_table_fits_its_terminal(lines, width):
     assert max(map(len, lines)) <= width
-    for number in ("1.008", "1.0073 (1)", "4.1592 points", "3.8 points (2)"):
-        assert sum(number in line for line in lines) == 1, lines
-    assert any(line.split()[:1] == ["dependent_modulus"] for line in lines) == (width < 110)
+
+
+@pytest.mark.parametrize("number", ["1.008", "1.0073 (1)", "4.1592 points", "3.8 points (2)"])
+def test_no_number_breaks_beside_a_long_title(lines, number):
+    assert sum(number in line for line in lines) == 1, lines
+
+
+def test_an_identifier_breaks_at_an_underscore(lines, width):
+    is_broken = any(line.split()[:1] == ["dependent_modulus"] for line in lines)
+
+    assert is_broken == (width < 110)
+
+
+def test_an_empty_column_is_left_out(lines):
     assert "unit" not in "".join(lines)
-    assert "unit" in "".join(printed(("parameter", "unit", "value"), [("length", "m", "2")], width))
+
+
+def test_a_column_with_a_value_stays(width):
+    lines = print_table(("parameter", "unit", "value"), [("length", "m", "2")], width)
+
+    assert "unit" in "".join(lines)
+
+
+# ---------------------------------------------------------------- progress
 
 
 def fly(progress: Progress) -> None:
+    """Report three steps of a flight, a stage inside of each, and a note."""
     with progress.stage("Flying [the wing]", total=3, unit="steps") as stage:
         for step in range(3):
             with progress.stage("Inside"):
@@ -43,15 +76,22 @@ def fly(progress: Progress) -> None:
         progress.note("half way [there]")
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-def test_stages_and_notes_are_shown_and_standard_output_stays_free(terminal, monkeypatch, capsys):
-    monkeypatch.setenv("FORCE_COLOR" if terminal else "NO_COLOR", "1")
+def test_silent_progress_says_nothing(capsys):
     fly(SilentProgress())
+
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "NO_COLOR"])
+def test_stages_and_notes_are_shown_and_standard_output_stays_free(variable, monkeypatch, capsys):
+    monkeypatch.setenv(variable, "1")
+
     fly(RichProgress())
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert all(words in told.err for words in ("Flying [the wing]", "steps", "half way [there]", "Inside"))
+
+    written = capsys.readouterr()
+    assert written.out == ""
+    for text in ("Flying [the wing]", "steps", "half way [there]", "Inside"):
+        assert text in written.err
 
 
 def test_an_exception_passes_and_the_terminal_is_given_back():
@@ -65,9 +105,14 @@ def test_an_exception_passes_and_the_terminal_is_given_back():
 
     with pytest.raises(KeyError):
         fail()
-    assert stream.getvalue().rstrip().endswith("\x1b[?25h")  # the cursor is visible again
+
+    show_cursor = "\x1b[?25h"
+    assert stream.getvalue().rstrip().endswith(show_cursor)
     assert "1/4" in stream.getvalue()
-    fly(progress)
+    fly(progress)  # a next stage begins as if nothing had happened
+
+
+# ---------------------------------------------------------------- progress on a pipe
 
 
 def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
@@ -75,11 +120,14 @@ def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
     monkeypatch.setattr("reporting.progress.time.perf_counter", lambda: next(seconds))
     stream = StringIO()
     progress = RichProgress(Console(file=stream, width=40))
+
     with progress.stage("Checking a wing that has a long name", total=4, unit="checks") as stage:
-        assert stream.getvalue() == "Checking a wing that has a long name, 4 checks ...\n"
+        at_begin = stream.getvalue()
         for number in range(4):
             stage.advance(detail=f"check {number}")
-    assert stream.getvalue().splitlines()[1:] == [
+
+    assert at_begin == "Checking a wing that has a long name, 4 checks ...\n"
+    assert stream.getvalue().removeprefix(at_begin).splitlines() == [
         "Checking a wing that has a long name: 2 of 4 checks, check 1, 12 s ...",
         "Checking a wing that has a long name: 4 of 4 checks, check 3, 23 s ...",
         "Checking a wing that has a long name: done, 23.5 s",
@@ -87,22 +135,30 @@ def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch):
 
 
 def test_a_stage_that_fails_does_not_look_finished():
-    told = StringIO()
-    with pytest.raises(KeyError), RichProgress(Console(file=told), lines=True).stage("Failing"):
+    stream = StringIO()
+    progress = RichProgress(Console(file=stream), lines=True)
+
+    with pytest.raises(KeyError), progress.stage("Failing"):
         raise KeyError
-    assert told.getvalue() == "Failing ...\n"
+
+    assert stream.getvalue() == "Failing ...\n"
 
 
 def test_a_stage_that_reports_nothing_shows_its_last_detail_again(monkeypatch):
     monkeypatch.setattr("reporting.progress.LONGEST_SILENCE", 0.1)
     stream = StringIO()
+    detail = "estimating friction"
+
     with RichProgress(Console(file=stream, width=80)).stage("Searching") as stage:
-        stage.advance(0, "estimating friction")
+        stage.advance(0, detail)
         limit = time.monotonic() + 60.0
-        while stream.getvalue().count("estimating friction") < 2 and time.monotonic() < limit:
+        while stream.getvalue().count(detail) < 2 and time.monotonic() < limit:
             time.sleep(0.01)
-    first, *silent, last = stream.getvalue().splitlines()
+
+    first, *repeated, last = stream.getvalue().splitlines()
     assert first == "Searching ..."
-    assert len(silent) >= 2
-    assert all(line.startswith("Searching: estimating friction, ") for line in silent)
+    assert [line.startswith(f"Searching: {detail}, ") for line in repeated] == [True] * len(
+        repeated
+    )
+    assert len(repeated) >= 2
     assert last.startswith("Searching: done")

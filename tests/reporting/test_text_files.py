@@ -1,4 +1,4 @@
-"""The readers of JSON, TOML and tables guess nothing; whatever is wrong is one sentence of the caller's."""
+"""The readers of JSON, TOML and tables guess nothing; what is wrong is one sentence."""
 
 import re
 
@@ -37,11 +37,14 @@ def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path, kind):
     (read, parse), file, (text, content) = READERS[kind], tmp_path / "file", CONTENTS[kind]
     for encoding in ("utf-8", "utf-8-sig"):
         file.write_text(text, encoding=encoding)
-        assert read(file, WrongFileError) == parse(file.read_bytes(), "It", WrongFileError) == content
+        assert (
+            read(file, WrongFileError) == parse(file.read_bytes(), "It", WrongFileError) == content
+        )
 
 
 @pytest.mark.parametrize(
-    ("kind", "pieces", "sentence"), [(kind, *row) for kind in READERS for row in INPUTS.refused(kind)]
+    ("kind", "pieces", "sentence"),
+    [(kind, *row) for kind in READERS for row in INPUTS.refused(kind)],
 )
 def test_what_is_wrong_is_one_sentence(tmp_path, kind, pieces, sentence):
     content = "".join(text * count for text, count in pieces).encode("latin-1")
@@ -70,7 +73,9 @@ def test_the_deepest_document_that_is_allowed_is_read():
     with refused(WrongFileError, r"^the draft is nested deeper"):
         parse_toml(text.replace("[", "[[").replace("]", "]]"), "the draft", WrongFileError)
     words = "one.two." * 20
-    told = parse_toml(f'# {words}\ntext = "{words}"\nlines = """\n{words}"""', "the draft", WrongFileError)
+    told = parse_toml(
+        f'# {words}\ntext = "{words}"\nlines = """\n{words}"""', "the draft", WrongFileError
+    )
     assert told == {"text": words, "lines": words}  # these are no keys
 
 
@@ -93,11 +98,15 @@ def test_blanks_separate_and_names_are_given():
     table = parse_table("0.0\t 1\n\n0.1\t -2\n", "x.dat", ERRORS, **given)
     assert table.numbers("signal", "the test").tolist() == [1.0, -2.0]
     assert table.lines == (1, 3)
-    with refused(WrongFileError, r"^x\.dat, line 2: 1 cell came, and 2 columns \(time, signal\) are"):
+    with refused(
+        WrongFileError, r"^x\.dat, line 2: 1 cell came, and 2 columns \(time, signal\) are"
+    ):
         parse_table("0.0\t1\n0.1\n", "x.dat", ERRORS, **given)
 
 
-@pytest.mark.parametrize("text", ["٩٫٨١", "٩.٨١", "９.81", "1_000", "9,81", "", "0x10", "9.81 N", "−1"])
+@pytest.mark.parametrize(
+    "text", ["٩٫٨١", "٩.٨١", "９.81", "1_000", "9,81", "", "0x10", "9.81 N", "−1"]
+)
 def test_what_is_no_number_in_plain_digits_is_refused(text):
     with refused(ValueError, r"digits|convert"):
         plain_number(text)

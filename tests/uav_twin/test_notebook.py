@@ -70,7 +70,7 @@ def test_a_fleet_shows_how_its_twins_fared_and_their_courses(library_file, tmp_p
     assert "rms error of the estimated z1" in text
     panels = flown.plot()
     assert [panel.get_ylabel() for panel in panels] == ["z1 (SI)", "z2 (SI)"]
-    believed = uav_twin.open_fleet(flown.folder)["growing_damage"]["mean"].values[..., 0]
+    believed = uav_twin.open_fleet(flown.folder)["growing_damage/filtered/mean"].values[..., 0]
     np.testing.assert_allclose(panels[0].get_lines()[0].get_ydata(), np.median(believed, axis=0))
 
 

@@ -39,12 +39,16 @@ class ComponentSection(FileSection):
     """One FMU of a coupled asset: a file, a companion by its name, or packed from a wing design."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$")]
+    """Name of the component in connections."""
     fmu: str | None = None
+    """An FMU, or the name of a companion that is shipped: `damage_growth` or `strain_gauges`."""
     design: str | None = None
+    """A wing design from which the component is packed, or the name of a shipped one."""
     substeps: Count = 1
     """Steps that it makes in one step of the system."""
     parameters: dict[str, Flag | Number | str] = Field(default_factory=dict)
-    """By the FMU's names and in its units; `gain[{1..4}]` stands for four of them."""
+    """Values of parameters by the FMU's names and in its units; `gain[{1..4}]` stands for four of
+    them [unit of the FMU]."""
 
     def copies(self) -> Mapping[str, str]:
         """Return the paths of the copies of FMU and design inside a run folder."""
@@ -76,18 +80,27 @@ class ConnectionSection(Section):
     """A connection between two FMUs of a coupled asset, or between one and the asset itself."""
 
     source: Annotated[str, Field(min_length=1)]
+    """Output of a component, `component.variable`, or an input of the asset."""
     target: Annotated[str, Field(min_length=1)]
+    """Input of a component, `component.variable`, or an output of the asset."""
     factor: Number = 1.0
+    """Factor on the value of the source [1]."""
     offset: Number = 0.0
+    """Number that is added to the product [unit of the target]."""
     delayed: Flag = False
+    """Whether the target gets the value of the step before."""
 
 
 class SeveralSection(FmuSection):
     """The keys of an asset of several FMUs."""
 
     algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
+    """Whether the components step one after another with the newest values, or all with those of
+    the step before."""
     iterations: Count = 1
+    """Largest number of iterations of a step; 1 makes each step once."""
     tolerance: Positive = 1e-9
+    """Relative change of connected values at which iterations end [1]."""
 
 
 class SspSection(SeveralSection):
@@ -95,6 +108,7 @@ class SspSection(SeveralSection):
 
     kind: Literal["ssp"] = "ssp"
     file: str
+    """The SSP file."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
 
@@ -108,7 +122,9 @@ class CoupledSection(SeveralSection):
 
     kind: Literal["coupled"] = "coupled"
     component: Annotated[tuple[ComponentSection, ...], Field(min_length=1)]
+    """The FMUs."""
     connection: tuple[ConnectionSection, ...] = ()
+    """Their connections."""
 
     def all_files(self) -> dict[str, Path]:
         """Return the files to copy into a run folder, by the paths of their copies.

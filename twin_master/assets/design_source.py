@@ -54,6 +54,7 @@ class DesignSection(FmuSection):
 
     kind: Literal["design", "calibration"] = "design"
     design: str
+    """A wing design, or the name of a shipped one."""
     patch: str | None = None
     """A patch file: missing effects that the FMU carries. They are switched on from the start
     unless `parameters` says otherwise. The twin does not know them."""
@@ -77,6 +78,7 @@ class CalibrationSection(DesignSection):
 
     kind: Literal["calibration"] = "calibration"
     design: Literal["calibration"] = "calibration"
+    """The design that the calibration file holds."""
 
 
 class DesignBelief(BeliefSection):
@@ -84,6 +86,7 @@ class DesignBelief(BeliefSection):
 
     kind: Literal["design", "calibration"] = "design"
     design: str
+    """A wing design, or the name of a shipped one."""
     patch: str | None = None
     """A patch file: effects that the model carries."""
 
@@ -99,6 +102,7 @@ class CalibrationBelief(DesignBelief):
 
     kind: Literal["calibration"] = "calibration"
     design: Literal["calibration"] = "calibration"
+    """The design that the calibration file holds."""
 
 
 class _Wing(NamedStructure):

@@ -60,11 +60,15 @@ class FmuSection(AssetSection):
 
     is_fmu: ClassVar[bool] = True
     binding: str
+    """A binding file, or the name of a shipped one."""
     isolated: Flag = True
+    """Whether the FMU runs in a process of its own, so that its crash ends no mission."""
     step_timeout: Positive | None = None
     """Limit of the wall-clock time of a step [s]; by default that of the binding."""
     parameters: dict[str, Number] = Field(default_factory=dict)
+    """True values of parameters, by the names of the binding [unit of the binding]."""
     load: dict[str, Number] = Field(default_factory=dict)
+    """Constant values of load inputs, by the names of the binding [unit of the binding]."""
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding whose values are drawn from the seed of the run."""
 
@@ -84,6 +88,7 @@ class FmuFileSection(FmuSection):
 
     kind: Literal["fmu"] = "fmu"
     file: str
+    """The FMU."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
 
@@ -97,6 +102,7 @@ class ScriptSection(FmuSection):
 
     kind: Literal["script"] = "script"
     script: str
+    """A script, or the name of a shipped one."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
 

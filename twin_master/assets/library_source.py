@@ -337,6 +337,7 @@ class LibraryBelief(BeliefSection):
 
     kind: Literal["library"] = "library"
     file: str
+    """An observation library."""
     design: str | None = None
     """A wing design, whose stiffness curve the calibration uses and whose field is drawn."""
 

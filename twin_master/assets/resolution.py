@@ -313,11 +313,16 @@ class LearntFile(Section):
     """What replaces tables of a scenario: for a new asset, and for groups of assets."""
 
     format: Literal[1]
+    """Version of the format."""
     source: Table = Field(default_factory=dict)
+    """The fleet from which it was learnt."""
     transition: Table | None = None
+    """Keys of the table `transition` of a scenario: probabilities to worsen."""
     observation: Table | None = None
+    """Keys of the table `observation` of a scenario: noise of the sensors."""
     calibration: Table | None = None
-    """Distribution of the parameter over the assets, with which a new one begins."""
+    """Keys of the table `calibration` of a scenario: the distribution of the parameter over the
+    assets, with which a new one begins."""
     group: dict[str, dict[str, Table]] = Field(default_factory=dict)
     """The tables of each group of assets, by its name."""
 

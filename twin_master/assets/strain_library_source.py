@@ -198,6 +198,7 @@ class StrainLibrarySection(AssetSection):
     kind: Literal["strain_library"] = "strain_library"
     has_unique_model: ClassVar = True
     file: str | None = None
+    """The strain library, `UAVconfig.json` of its authors."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
@@ -225,6 +226,7 @@ class StrainLibraryBelief(BeliefSection):
     kind: Literal["strain_library"] = "strain_library"
     has_unique_model: ClassVar = True
     file: str
+    """The strain library, `UAVconfig.json` of its authors."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 

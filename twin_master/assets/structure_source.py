@@ -64,6 +64,7 @@ class StructureSection(StructureFiles, FmuSection):
 
     kind: Literal["structure"] = "structure"
     structure: str
+    """A structure file, or the name of a shipped one."""
     binding: str = ""
     """A binding of the user; by default it follows from the structure file."""
     packed: Literal["python", "compiled"] = "python"
@@ -81,6 +82,7 @@ class StructureBelief(StructureFiles, BeliefSection):
 
     kind: Literal["structure"] = "structure"
     structure: str
+    """A structure file, or the name of a shipped one."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
 

@@ -7,7 +7,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group
-from twin_master.fleet.store import dimension_sizes
+from twin_master.fleet.store_layout import dimension_sizes
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed

@@ -89,7 +89,8 @@ class FleetOutcome:
 
     def _repr_html_(self) -> str:
         """Return how the twins of each group fared, for a notebook."""
-        figures = {name: group_figures(group) for name, group in open_fleet(self.folder).items()}
+        groups = open_fleet(self.folder).children
+        figures = {name: group_figures(group) for name, group in groups.items()}
         title = f"Fleet of {self.twins} twins in {self.folder}"
         return html_table(title, ("result", *figures), figure_rows(figures))
 
@@ -340,7 +341,7 @@ class _FleetFlight:
         self._fleet = fleet
         self._folder = folder
         self._journal = journal
-        self._arrays_of = cache(self._open_arrays)
+        self._store_of = cache(self._open_group)
         self._packed_kit = lru_cache(maxsize=_PACKED_KITS)(self._pack_kit)
 
     def fly(self, engine: Engine, progress: Progress) -> _ShardCounts:
@@ -407,8 +408,9 @@ class _FleetFlight:
         first = members[0].row
         end = members[-1].row + 1
         with explained_write_errors(self._folder / STORE_NAME):
-            for name, values in result.variables.items():
-                self._arrays_of(group.name)[name][first:end] = values
+            store = self._store_of(group.name)
+            for path, values in result.variables.items():
+                store[path][first:end] = values
         self._journal.append(
             {
                 "group": group_number,
@@ -418,13 +420,14 @@ class _FleetFlight:
             }
         )
 
-    def _open_arrays(self, group_name: str) -> "dict[str, zarr.Array[Any]]":
-        """Return the arrays of a group in the store."""
+    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[Any]]":
+        """Return the arrays of a group in the store, by their paths."""
         import zarr
 
         store = self._folder / STORE_NAME
         group = zarr.open_group(store, mode="r+", path=group_name, use_consolidated=False)
-        return dict(group.arrays())
+        members = group.members(max_depth=1)
+        return {path: member for path, member in members if isinstance(member, zarr.Array)}
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:

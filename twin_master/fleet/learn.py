@@ -37,6 +37,7 @@ from twin_master.fleet.posterior import (
 )
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.store import open_group
+from twin_master.fleet.store_layout import observation_rows
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
@@ -275,7 +276,7 @@ class _WeighedSteps(NamedTuple):
 
 
 def _learn_group(
-    record: dict[str, Any], group: "xr.Dataset", flown: Sequence[TwinsOfScenario]
+    record: dict[str, Any], group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
@@ -286,7 +287,7 @@ def _learn_group(
     ----------
     record : dict
         The record of the group in `config.json`.
-    group : Dataset
+    group : DataTree
         The stored results of the group.
     flown : sequence of TwinsOfScenario
         The twins that have flown, by scenario.
@@ -331,10 +332,10 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     return TransitionFamily.learnable(scenario)
 
 
-def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
+def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
-    observed = group["observed"].values.astype(np.float64)
-    control = group["control_index"].values.astype(np.int64)
+    observed = observation_rows(group, flown[0].knowledge.scenario)
+    control = group["observed/control_index"].values.astype(np.int64)
     # Steps that were not flown have the control -1. They have no observations, so that the
     # evidence does not depend on their control: the first control takes its place.
     control = np.maximum(control, 0)
@@ -343,9 +344,9 @@ def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list
     ]
 
 
-def _followed_controls(group: "xr.Dataset", rows: Index, control_names: Sequence[str]) -> set[str]:
+def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
     """Return the controls under which a twin in the rows has flown a step that is not its last."""
-    control = group["control_index"].values.astype(np.int64)[rows]
+    control = group["observed/control_index"].values.astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
 

@@ -47,7 +47,9 @@ class Spread(Section):
     """A parameter of the true assets that is normally distributed over the group."""
 
     mean: Number
+    """Mean of the parameter [unit of the binding]."""
     standard_deviation: NotNegative = 0.0
+    """Standard deviation of the parameter over the group [unit of the binding]."""
 
 
 PRESENT_NAMES = {"group.inspections_a_turn": "inspections_per_step"}
@@ -58,8 +60,11 @@ class GroupSection(Section):
     """Assets that share a scenario, as a fleet file names them."""
 
     name: Name
+    """Name of the group."""
     scenario: Text
+    """A scenario file beside the fleet file, or the name of a shipped scenario."""
     count: Annotated[int, Field(strict=True, ge=1, le=LARGEST)] | None = None
+    """Number of assets."""
     fmus: Text | None = None
     """A pattern of files: one asset for each FMU."""
     calibrations: Text | None = None
@@ -67,21 +72,24 @@ class GroupSection(Section):
     observations: Text | None = None
     """A pattern of recordings, or `mqtt://HOST/TOPIC/+`: one real asset for each file or topic."""
     fmu: str | None = None
+    """An FMU that all assets fly in the place of the scenario's."""
     binding: str | None = None
+    """A binding that all assets use in the place of the scenario's."""
     calibration: str | None = None
+    """A calibration file that all twins use in the place of the scenario's."""
     in_process: Flag = False
-    """Whether FMUs run in the process that flies the shard, without a worker of their own.
-
-    This is faster, but a crash ends that process.
-    """
+    """Whether FMUs run in the process that flies the shard, without a worker of their own. This is
+    faster, but a crash ends that process."""
     learnt: str | None = None
     """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
+    """Number of steps of each mission, in the place of the scenario's."""
     parameters: dict[str, Spread] = Field(default_factory=dict)
+    """Distributions of true parameters of the assets, by the names of the binding."""
     inspections_per_step: Count | None = None
     """The value of `planner.inspections_per_step` in this group, which then flies in one shard."""
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """The value of `truth.probability` in this group."""
+    """The value of `truth.probability` in this group [1]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the fault that the group has no kind of members, or several."""
@@ -105,17 +113,24 @@ class FleetSection(Section):
     """The fleet as a whole, as a fleet file describes it."""
 
     name: Name
+    """Name of the fleet."""
     title: str = ""
+    """Title in the report; by default the name."""
     seed: Seed = 0
+    """Seed from which the seed of each mission follows."""
     shard: Annotated[int, Field(strict=True, ge=1, le=4096)] = SHARD
+    """Number of twins that are flown in one piece."""
 
 
 class FleetFile(Section):
     """A fleet file."""
 
     format: Literal[1]
+    """Version of the format."""
     fleet: FleetSection
+    """The fleet as a whole."""
     group: Annotated[tuple[GroupSection, ...], Field(min_length=1)]
+    """The groups of assets."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield the fault that two groups have one name."""

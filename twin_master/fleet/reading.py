@@ -15,11 +15,12 @@ from twin_master.fleet.store import (
     ENDED,
     FAILED,
     FLOWN,
-    NOTICE_KINDS,
     WITHIN,
+    check_installed,
     flown_rows,
     open_group,
 )
+from twin_master.fleet.store_layout import NOTICE_KINDS
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability
@@ -89,7 +90,9 @@ class Outcomes:
         delay = values("delay")
         delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
         early = values("early")  # 1: early, 0: not early, -1: not defined
-        error = np.ma.masked_invalid(values("mean") - values("state"))  # masked: steps not flown
+        error = np.ma.masked_invalid(
+            values("filtered/mean") - values("truth/state")
+        )  # masked: steps not flown
         # Means over the steps of each mission: (N, T, F) becomes (F, N).
         mean_square = (error**2).mean(axis=1).filled(np.nan).T
         mean_error = error.mean(axis=1).filled(np.nan).T
@@ -98,7 +101,7 @@ class Outcomes:
             early_fallbacks=_fraction(early[early >= 0.0] > 0.0),
             rms=tuple(_root(_mean(factor)) for factor in mean_square),
             bias=tuple(_mean(factor) for factor in mean_error),
-            log_evidence=_mean(np.nanmean(values("log_evidence"), axis=1)),
+            log_evidence=_mean(np.nanmean(values("filtered/log_evidence"), axis=1)),
             credible_coverage=_mean(values("credible")),
         )
 
@@ -130,13 +133,20 @@ def _root(mean_square: Estimated) -> Estimated:
     return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
 
-def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
-    """Return the groups in the store of a fleet, by their names.
+def open_fleet(folder: Path | str) -> "xr.DataTree":
+    """Return everything that a fleet has stored, as labelled arrays that are read at first use.
 
     Parameters
     ----------
     folder : Path or str
         The folder of the fleet.
+
+    Returns
+    -------
+    xarray.DataTree
+        A node for each group of the fleet, with the groups `observed`, `filtered`, `truth` and
+        `notice` as in a run, whose variables have the dimension `twin` as well. The layout is in
+        `docs/reference/stores.md`.
 
     Raises
     ------
@@ -144,28 +154,32 @@ def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
         If the folder does not hold a fleet, or if its store cannot be read.
     """
     groups = fleet_config(Path(folder))["fleet"]["groups"]
-    return {group["name"]: open_group(Path(folder), group["name"]) for group in groups}
+    check_installed("zarr")
+    import xarray as xr
+
+    nodes = {group["name"]: open_group(Path(folder), group["name"]) for group in groups}
+    return xr.DataTree(children=nodes)
 
 
-def notice_counts(group: "xr.Dataset", kind: str) -> Index:
+def notice_counts(group: "xr.DataTree", kind: str) -> Index:
     """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
-    return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
+    return np.asarray(group["notice/count"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
-def believed_means(group: "xr.Dataset") -> Float:
+def believed_means(group: "xr.DataTree") -> Float:
     """Return the mean states of B twins in T steps, a (B, T, F) array in SI units.
 
     They are NaN in steps in which the probability that no state of the model explains the
     observations is above `BELIEVED`.
     """
-    is_unexplained = group["unexplained"].values > BELIEVED
-    return np.where(is_unexplained[..., np.newaxis], np.nan, group["mean"].values)
+    is_unexplained = group["notice/none_of_these"].values > BELIEVED
+    return np.where(is_unexplained[..., np.newaxis], np.nan, group["filtered/mean"].values)
 
 
-def last_steps(group: "xr.Dataset") -> Index:
+def last_steps(group: "xr.DataTree") -> Index:
     """Return the number of the last flown step of each twin, a (B,) array; 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
-    flown_steps = (group["control_index"].values >= 0).sum(axis=1)
+    flown_steps = (group["observed/control_index"].values >= 0).sum(axis=1)
     last: Index = np.maximum(flown_steps - 1, 0)
     return last
 
@@ -259,7 +273,7 @@ class TwinsOfScenario(NamedTuple):
 
 
 def flown_twins(
-    folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
+    folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
 ) -> Iterator[TwinsOfScenario]:
     """Yield the twins of a group that have flown, scenario by scenario.
 
@@ -269,7 +283,7 @@ def flown_twins(
         The folder of the fleet.
     record : mapping
         The group in `config.json`.
-    group : Dataset
+    group : DataTree
         The group in the store.
 
     Raises
@@ -288,7 +302,7 @@ def flown_twins(
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
-def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
+def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.DataTree") -> Float:
     """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters
@@ -297,7 +311,7 @@ def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Da
         The folder of the fleet.
     record : mapping
         The record of the group in `config.json`.
-    group : Dataset
+    group : DataTree
         The stored results of the group, with a row for each twin.
 
     Returns
@@ -313,8 +327,8 @@ def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Da
     """
     twin_count = group.sizes["twin"]
     at_last_step = (np.arange(twin_count), last_steps(group))
-    belief = group["belief"].values.astype(np.float64)
-    control_in_force = group["control_index"].values[at_last_step]
+    belief = group["filtered/last_probability"].values.astype(np.float64)
+    control_in_force = group["observed/control_index"].values[at_last_step]
     probability = np.full(twin_count, np.nan)
     for scenario_twins in flown_twins(folder, record, group):
         for control_index in np.unique(control_in_force[scenario_twins.rows]).tolist():
@@ -323,11 +337,11 @@ def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Da
                 scenario_twins.knowledge, belief[rows], control_index
             )
     # `unexplained` is the filter's probability that no state explains the observations.
-    probability[group["unexplained"].values[at_last_step] > BELIEVED] = np.nan
+    probability[group["notice/none_of_these"].values[at_last_step] > BELIEVED] = np.nan
     return probability
 
 
-def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
+def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
     """Return counts of the twins of a group, and figures of their outcomes, by title.
 
     The figures are means over the twins with their standard errors; a group without a flown twin
@@ -348,7 +362,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
         if not np.isnan(outcomes.early_fallbacks.value):
             figures["early fallback"] = outcomes.early_fallbacks
         for name, rms, bias in zip(
-            group.attrs["factors"], outcomes.rms, outcomes.bias, strict=True
+            group["filtered/region"].values, outcomes.rms, outcomes.bias, strict=True
         ):
             figures[f"filtered rms error of {name}"] = rms
             figures[f"bias of {name}"] = bias
@@ -358,7 +372,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     return figures
 
 
-def _counts_of_twins(group: "xr.Dataset") -> dict[str, Estimated | int]:
+def _counts_of_twins(group: "xr.DataTree") -> dict[str, Estimated | int]:
     """Return the numbers of twins that flew, failed, ended early, or gave notices, by title."""
     status = group["status"].values
     figures: dict[str, Estimated | int] = {

@@ -29,7 +29,8 @@ from twin_master.fleet.reading import (
     leaving_probabilities,
 )
 from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
-from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, flown_rows, open_group
+from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows, open_group
+from twin_master.fleet.store_layout import NOTICE_KINDS
 from twin_master.fleet.watched_asset import counts_of, read_standing
 from twin_master.report.reading import PrintedFactor, printed_factors
 
@@ -144,12 +145,14 @@ def _add_flown_fleet(
         _add_attention_table(page, standing, most_assets)
     page.add_section("How the twins fared")
     figures = {name: group_figures(group) for name, group in groups.items()}
-    WORDS.add_table(page, "fared", figure_rows(figures), more=list(figures))
+    WORDS.add_table(
+        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
+    )
     _add_lessons(page, folder)
 
 
 def _leaving_or_explanation(
-    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
+    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
 ) -> Float | None:
     """Return the probability that each flown twin of a group changes its control.
 
@@ -164,7 +167,7 @@ def _leaving_or_explanation(
     return probabilities[flown_rows(group["status"].values)]
 
 
-def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> str:
+def _opening(standings: Sequence[Standing], groups: "Sequence[xr.DataTree]") -> str:
     """Return the opening sentences: on flights, alarms, fallbacks and the most severe damage."""
     asset_count = sum(group.sizes["twin"] for group in groups)
     flown_count = sum(len(standing.names) for standing in standings)
@@ -177,11 +180,11 @@ def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> s
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _alarm_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
+def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the number of assets with an alarm and the first step of one; empty without alarms."""
     alarm_column = NOTICE_KINDS.index("alarm")
     first_alarm = np.concatenate(
-        [group["first_notice"].values[:, alarm_column] for group in groups]
+        [group["notice/first_step"].values[:, alarm_column] for group in groups]
     )
     steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
     if not len(steps):
@@ -189,7 +192,7 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
     return f"{counted(len(steps), 'asset')} raised an alarm, first in {step_word} {min(steps)}."
 
 
-def _fallback_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
+def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
     delay = np.concatenate([group["delay"].values for group in groups])
     called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
@@ -286,12 +289,12 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
     page.add_report_figure(WORDS.figure("map", figure, failed=failed_sentence))
 
 
-def _add_courses(page: Page, standing: Standing, group: "xr.Dataset") -> None:
+def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
     """Add the figure of the assets' states over time, if any step has an estimated state."""
     flown = flown_rows(group["status"].values)
     mean = believed_means(group)[flown]
     if standing.names and not np.isnan(mean).all():
-        figure = course_figure(standing.scenario, mean, group["state"].values[flown])
+        figure = course_figure(standing.scenario, mean, group["truth/state"].values[flown])
         page.add_report_figure(WORDS.figure("course", figure))
 
 

@@ -67,7 +67,7 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standing:
+def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standing:
     """Return state, control and alarms of the flown twins of a group after their last steps.
 
     The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
@@ -77,7 +77,7 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standin
     ----------
     record : mapping
         The record of the group in `config.json`.
-    group : Dataset
+    group : DataTree
         The stored results of the group, with a row for each twin.
     """
     # All scenarios of a group come from one scenario file, with equal states and controls.
@@ -85,7 +85,7 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standin
     flown = flown_rows(group["status"].values)
     last_step = last_steps(group)[flown]
     at_last_step = (flown, last_step)
-    last_control = group["control_index"].values[at_last_step]
+    last_control = group["observed/control_index"].values[at_last_step]
     names = [name for name, _seed, _scenario_number in record["members"]]
     return Standing(
         group=record["name"],
@@ -93,7 +93,7 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standin
         names=[names[row] for row in flown],
         step=last_step,
         mean=believed_means(group)[at_last_step],
-        deviation=group["standard_deviation"].values[at_last_step],
+        deviation=group["filtered/standard_deviation"].values[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm")[flown],
         leaving=np.full(len(flown), np.nan),

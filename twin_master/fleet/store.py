@@ -1,6 +1,6 @@
 """The store of a fleet: arrays with a row for each twin, in chunks of one shard."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +12,20 @@ from reporting.arrays import Float, Index
 from reporting.files import explained_write_errors
 from reporting.former_names import warn_of_former_names
 from twin_master.errors import FleetError
+from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.plan import Fleet, Group, Member
+from twin_master.fleet.store_layout import (
+    NOTICE_KINDS,
+    Coordinate,
+    coordinates_of_groups,
+    dimension_sizes,
+    former_names_used,
+    in_present_layout,
+    is_former_layout,
+    observed_columns,
+    store_coordinates,
+    stored_layout,
+)
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
@@ -25,8 +38,6 @@ if TYPE_CHECKING:
     import zarr
 
 
-NOTICE_KINDS = ("alarm", "gauge_left_out")
-"""The kinds of notices that are kept of each twin."""
 CREDIBILITY = 0.9
 """Probability of the credible set of states for which coverage of the true state is counted."""
 _TOLERANCE = 1e-9
@@ -47,56 +58,9 @@ _NOT_DEFINED = -1
 """Value of `early` if the policy does not depend on the level of one factor alone."""
 
 
-_FILL_VALUES = {"control_index": _NO_CONTROL, "first_notice": _NO_STEP}
-"""Values of twins that have not flown, for variables in which 0 has a meaning."""
-
-
-class _Variable(NamedTuple):
-    """A variable of the store.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Its dimensions beside `twin`.
-    unit, title : str
-        Its unit and its name in words.
-    dtype : str
-        The type of its values, such as "f4".
-    """
-
-    axes: tuple[str, ...]
-    unit: str
-    title: str
-    dtype: str
-
-    @property
-    def fill_value(self) -> float:
-        """The value of twins that have not flown."""
-        return np.nan if self.dtype[0] == "f" else 0
-
-
-def _schema() -> dict[str, _Variable]:
-    """Return the variables of the store, by name."""
-    variables = {}
-    for name, (axes, unit, title, dtype) in SCHEMA["fleet"].items():
-        variables[name] = _Variable(tuple(axes.split()), unit, title, dtype)
-    return variables
-
-
 def flown_rows(status: NDArray[Any]) -> Index:
     """Return the rows of the twins that flew to the end of the mission or of their assets."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
-
-
-def dimension_sizes(scenario: Scenario) -> dict[str, int]:
-    """Return the sizes of the store's dimensions for a scenario, by name."""
-    return {
-        "step": scenario.mission.steps,
-        "sensor": scenario.row_width,
-        "factor": len(scenario.state),
-        "notice_kind": len(NOTICE_KINDS),
-        "level": int(np.prod([len(factor.levels) for factor in scenario.state])),
-    }
 
 
 def stored_variables(
@@ -125,26 +89,32 @@ def stored_variables(
     values: dict[str, Any] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
-        "observed": flights.observation_rows,
-        "control_index": flights.control_index,
-        "state": flights.state,
-        "mean": mean,
-        "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
-        "log_evidence": flights.log_evidence,
-        "unexplained": flights.unexplained,
-        "belief": _last_belief(flights, has_failed),
+        **_observed_variables(knowledge.scenario, flights.observation_rows),
+        "observed/control_index": flights.control_index,
+        "truth/state": flights.state,
+        "filtered/mean": mean,
+        "filtered/standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
+        "filtered/log_evidence": flights.log_evidence,
+        "notice/none_of_these": flights.unexplained,
+        "filtered/last_probability": _last_belief(flights, has_failed),
         "delay": np.where(has_failed, np.nan, fallbacks.delay),
         "early": np.where(has_failed, _NOT_DEFINED, fallbacks.early),
-        "notices": notices.number,
-        "first_notice": notices.first_step,
+        "notice/count": notices.number,
+        "notice/first_step": notices.first_step,
         "credible": np.where(has_failed, np.nan, _credible_fraction(knowledge, flights)),
     }
-    variables = {}
-    for name, variable in _schema().items():
-        variables[name] = np.ascontiguousarray(values[name], variable.dtype)
-    for name in members[0].parameters:
-        variables[name] = np.array([member.parameters[name] for member in members])
-    return variables
+    parameters = list(members[0].parameters)
+    for name in parameters:
+        values[f"truth/{name}"] = [member.parameters[name] for member in members]
+    return {
+        path: np.ascontiguousarray(values[path], variable.dtype)
+        for path, variable in stored_layout(knowledge.scenario, parameters).items()
+    }
+
+
+def _observed_variables(scenario: Scenario, rows: Float) -> dict[str, Float]:
+    """Return the observed variables, by their paths, from the rows of observations (B, T, W)."""
+    return {path: rows[..., columns] for path, columns in observed_columns(scenario).items()}
 
 
 def _steps_flown(flights: Flights) -> Index:
@@ -304,8 +274,6 @@ def in_credible_set(
 
 STORE_NAME = "fleet.zarr"
 """The folder of the store in the folder of a fleet."""
-FORMER_DIMENSION = "turn"
-"""The name of the dimension `step` in the stores of earlier versions."""
 
 
 def check_installed(*packages: str) -> None:
@@ -321,8 +289,10 @@ def check_installed(*packages: str) -> None:
         raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
 
 
-def open_group(folder: Path, group: str) -> "xr.Dataset":
-    """Open a group of the store as a Dataset whose arrays are read from disk at first use.
+def open_group(folder: Path, group: str) -> "xr.DataTree":
+    """Open a group of the store, whose arrays are read from disk at first use.
+
+    A store of an earlier version is read in the present layout.
 
     Parameters
     ----------
@@ -334,27 +304,48 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
     Raises
     ------
     FleetError
-        If there is no such group, if it has another layout, or if zarr is not installed.
+        If there is no such group, if it lacks variables, or if zarr is not installed.
     """
     check_installed("zarr")
     import xarray as xr
 
     before = f"{folder} holds no group {group} of a fleet ("
     with FleetError.instead_of(OSError, KeyError, ValueError, before=before, after=")."):
-        dataset: xr.Dataset = xr.open_zarr(
-            folder / STORE_NAME, group=group, chunks=None, consolidated=False
+        tree: xr.DataTree = xr.open_datatree(
+            folder / STORE_NAME, engine="zarr", group=group, chunks=None, consolidated=False
         )
-    if FORMER_DIMENSION in dataset.dims:
-        warn_of_former_names(f"{folder / STORE_NAME}", {FORMER_DIMENSION: "step"})
-        dataset = dataset.rename({FORMER_DIMENSION: "step"})
-    missing = SCHEMA["fleet"].keys() - dataset.keys()
+    former_group = tree.to_dataset()
+    if is_former_layout(former_group):
+        warn_of_former_names(f"{folder / STORE_NAME}", former_names_used(former_group))
+        record = _group_record(folder, group)
+        scenario = Scenario.model_validate(record["scenarios"][0])
+        names = [name for name, _seed, _scenario_number in record["members"]]
+        tree = in_present_layout(former_group, scenario, names)
+    paths = {path for path in SCHEMA["fleet"] if "{" not in path}
+    missing = [path for path in sorted(paths) if path not in _paths_of(tree)]
     if missing:
         raise FleetError(
             f"{folder} was flown by another version of this program and lacks "
-            f"{', '.join(sorted(missing))}: fly the fleet again with --replace, "
+            f"{', '.join(missing)}: fly the fleet again with --replace, "
             "or read it with that version."
         )
-    return dataset
+    return tree
+
+
+def _group_record(folder: Path, group: str) -> dict[str, Any]:
+    """Return the record of a group in the configuration of a fleet."""
+    records: list[dict[str, Any]] = fleet_config(folder)["fleet"]["groups"]
+    (record,) = (record for record in records if record["name"] == group)
+    return record
+
+
+def _paths_of(tree: "xr.DataTree") -> set[str]:
+    """Return the paths of all variables in a tree, such as "filtered/mean"."""
+    return {
+        f"{node.relative_to(tree)}/{name}".removeprefix("./")
+        for node in tree.subtree
+        for name in node.data_vars
+    }
 
 
 def create_store(folder: Path, fleet: Fleet) -> None:
@@ -372,21 +363,22 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
     scenario = group.scenarios[0]
     twin_count = len(group.members)
     sizes = dimension_sizes(scenario)
-    variables = _schema()
-    for name in group.parameter_spreads:
-        variables[name] = _Variable((), "SI", "true parameter", "f8")
-    for name, variable in variables.items():
+    layout = stored_layout(scenario, list(group.parameter_spreads))
+    for path, variable in layout.items():
         row_shape = tuple(sizes[axis] for axis in variable.axes)
         zarr_group.create_array(
-            name,
+            path,
             shape=(twin_count, *row_shape),
             chunks=(min(fleet.head.shard, twin_count), *row_shape),
             dtype=variable.dtype,
-            fill_value=_FILL_VALUES.get(name, variable.fill_value),
+            fill_value=variable.fill_value,
             dimension_names=("twin", *variable.axes),
-            attributes={"title": variable.title, "units": variable.unit},
+            attributes=variable.attributes,
             overwrite=True,
         )
+    coordinates = store_coordinates(scenario, [member.name for member in group.members])
+    for group_path, coordinates_of_group in coordinates_of_groups(layout, coordinates).items():
+        _create_coordinates(zarr_group, group_path, coordinates_of_group)
     zarr_group.attrs.update(
         {
             "scenario": scenario.mission.name,
@@ -398,3 +390,35 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
             "gives_notice": scenario.notice is not None,
         }
     )
+
+
+def _create_coordinates(
+    zarr_group: "zarr.Group", path: str, coordinates: Mapping[str, Coordinate]
+) -> None:
+    """Write the coordinates of one of the groups inside a group of the fleet.
+
+    Parameters
+    ----------
+    zarr_group : zarr.Group
+        The group of the fleet.
+    path : str
+        The path of the group inside it; empty for the group itself.
+    coordinates : mapping of str to Coordinate
+        The coordinates by their names.
+    """
+    inner_group = zarr_group.require_group(path) if path else zarr_group
+    for name, coordinate in coordinates.items():
+        values = coordinate.values
+        array = inner_group.create_array(
+            name,
+            shape=values.shape,
+            dtype="str" if values.dtype.kind == "U" else values.dtype,
+            dimension_names=(coordinate.axis,),
+            attributes=coordinate.attributes,
+            overwrite=True,
+        )
+        array[:] = values
+    # By the CF conventions this attribute names the coordinates that are no dimensions.
+    beside_dimensions = [name for name, entry in coordinates.items() if name != entry.axis]
+    if beside_dimensions:
+        inner_group.attrs["coordinates"] = " ".join(beside_dimensions)

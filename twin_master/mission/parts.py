@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol, cast
 
 from numpy.typing import ArrayLike
 
@@ -106,12 +106,14 @@ class TwinParts:
         """
         parts = self
         if isinstance(self.policy, str) and _is_name_of_policy(self.policy):
-            parts = replace(parts, policy=object_by_name("policy", self.policy))
+            policy = cast(GivenPolicy, object_by_name("policy", self.policy))
+            parts = replace(parts, policy=policy)
         if isinstance(self.sensor_model, str):
-            sensor_model = object_by_name("sensor_model", self.sensor_model)
+            sensor_model = cast(GivenSensorModel, object_by_name("sensor_model", self.sensor_model))
             parts = replace(parts, sensor_model=sensor_model)
         if isinstance(self.estimator, str):
-            parts = replace(parts, estimator=object_by_name("estimator", self.estimator))
+            estimator = cast(GivenEstimator, object_by_name("estimator", self.estimator))
+            parts = replace(parts, estimator=estimator)
         return parts
 
     def policy_for(self, model: GraphicalModel) -> Float | BeliefPolicy | None:
@@ -243,7 +245,7 @@ def description(part: object) -> str:
     return f"{article}{named.__module__}.{named.__qualname__}"
 
 
-def object_by_name(role: str, name: str) -> Any:
+def object_by_name(role: str, name: str) -> object:
     """Return the object that a name stands for.
 
     Parameters

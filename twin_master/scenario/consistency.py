@@ -1,14 +1,14 @@
 """All tables of a scenario, with the checks that two or more tables agree with each other."""
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
 from reporting.toml_file import Fault
 from reporting.words import comma_list
-from twin_master.scenario.kinds import AssetSection, BeliefSection
+from twin_master.scenario.kinds import WATCHED_KIND, AssetSection, BeliefSection
 from twin_master.scenario.mission import Calibration, Control, Mission, Reference, StateFactor
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
@@ -33,8 +33,6 @@ from twin_master.scenario.tables import (
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge above which the number was meant in microstrain [1]. Usual
 gauges break at a strain of a few percent."""
-WATCHED_KIND = "watched"
-"""Kind of the asset of a scenario without `[asset]`."""
 
 
 class InspectionReading(NamedTuple):
@@ -61,25 +59,42 @@ class InspectionReading(NamedTuple):
 class ScenarioTables(Section):
     """All tables of a scenario, in SI; each table is checked alone, and against the others."""
 
+    filled_in: ClassVar[tuple[str, ...]] = ("asset", "truth")
+
     format: Literal[2]
+    """Version of the format; files of format 1 are still read."""
     mission: Mission
+    """What is flown, and for how long."""
     state: Annotated[tuple[StateFactor, ...], Field(min_length=1)]
+    """The factors of the hidden state, the outermost first."""
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
-    """The controls of the file, followed by one for each action."""
+    """The controls that the twin chooses from."""
     action: tuple[Action, ...] = ()
+    """Inspections, repairs and the end of the mission, beside the controls."""
     observation: ObservationSection
+    """What is observed, and how well."""
     transition: Transition
+    """How the state changes in a step."""
     rewards: Rewards
+    """What the policy maximises."""
     planner: Planner
+    """How the twin decides."""
     asset: SerializeAsAny[AssetSection]
+    """What flies; left out if a real asset is watched."""
     belief: SerializeAsAny[BeliefSection]
+    """The model that predicts the observations of the twin."""
     calibration: Calibration
+    """The uncertain parameter of the model, and its distribution."""
     truth: TruthSection
+    """What really happens, unseen by the twin; left out if a real asset is watched."""
     learning: Learning | None = None
+    """What the twin learns during the mission; nothing without the table."""
     notice: NoticingOrNot = None
-    """When alarms are raised; `reading.load_scenario` says when a scenario has them by default."""
+    """When an alarm is raised; `notice = false` switches alarms off."""
     watch: WatchSection = WatchSection()
+    """How a real asset is watched."""
     reference: tuple[Reference, ...] = ()
+    """Published values that are printed beside figures of the summary."""
 
     @model_validator(mode="before")
     @classmethod

@@ -13,14 +13,17 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, ClassVar, Self
 
-from pydantic import ModelWrapValidatorHandler, model_validator
+from pydantic import GetJsonSchemaHandler, ModelWrapValidatorHandler, model_validator
+from pydantic_core import CoreSchema
 
 from reporting.toml_file import missing_keys, short_repr
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
-from twin_master.scenario.section import Section
+from twin_master.scenario.section import Section, Table
 
 KIND_FOLDER = Path(__file__).parents[1] / "assets"
 """The folder of the modules that define the kinds."""
+WATCHED_KIND = "watched"
+"""Kind of the asset of a scenario without `[asset]`."""
 KIND_PACKAGE = f"{__package__.rpartition('.')[0]}.{KIND_FOLDER.name}"
 CALIBRATED_DESIGN_NAME = "calibration"
 """The name, in a scenario, of the wing design that a calibration file holds."""
@@ -95,6 +98,7 @@ class KindSection(FileSection):
     """A table whose `kind` decides which subclass it is."""
 
     kind: str
+    """The kind of the table, which decides its other keys."""
     has_unique_model: ClassVar[bool] = False
     """Whether its observations come from a model that no other kind flies or believes."""
 
@@ -122,6 +126,29 @@ class KindSection(FileSection):
         """Return the kind of this class; None for a base class, which has no kind of its own."""
         kind = cls.model_fields["kind"].default
         return kind if isinstance(kind, str) else None
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> Table:
+        """Return the JSON Schema of a kind, or that of all kinds for a base class."""
+        kind = cls.kind_of_class()
+        if kind is None:
+            kinds = [kind for name, kind in cls.kinds().items() if name != WATCHED_KIND]
+            return {
+                "oneOf": [
+                    kind.__get_pydantic_json_schema__(kind.__pydantic_core_schema__, handler)
+                    for kind in kinds
+                ]
+            }
+        schema = super().__get_pydantic_json_schema__(core_schema, handler)
+        table = handler.resolve_ref_schema(schema)
+        if "properties" in table:
+            description = table["properties"]["kind"]["description"]
+            table["properties"]["kind"] = {"const": kind, "description": description}
+            other_required = [key for key in table.get("required", []) if key != "kind"]
+            table["required"] = ["kind", *other_required]
+        return schema
 
     @model_validator(mode="wrap")
     @classmethod

@@ -16,12 +16,19 @@ class Mission(Section):
     """What is flown, and for how long."""
 
     name: Name
+    """Name of the mission, of letters, digits, `_`, `.` and `-`."""
     title: str = ""
+    """Title in the report; by default the name."""
     description: str = ""
+    """What the mission shows, for people."""
     steps: Count
+    """Number of steps of the mission."""
     prediction_steps: Count = 10
+    """Number of steps that the twin predicts ahead."""
     first_control: Name
+    """The control of the first step."""
     seed: Seed = 0
+    """Seed of all random numbers of the mission."""
     step_name: Name = "step"
     """The word for a step of the mission in the report."""
 
@@ -31,11 +38,15 @@ class StateFactor(Section):
 
     units: ClassVar[Mapping[str, str]] = {"levels": "percent"}
     name: Name
+    """Name of the factor, such as that of a damage region."""
     title: str = ""
+    """Name of the factor in the report; by default the name."""
     unit: str = "1"
     """Unit of the levels; a dimensionless level is a fraction, printed in percent."""
     levels: Annotated[tuple[Number, ...], Field(min_length=1)]
+    """Levels that the factor can have, in rising order [unit of the factor]."""
     prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
+    """Probability of each level before the first observation [1]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: levels and prior."""
@@ -66,16 +77,22 @@ class Control(Section):
     """One choice of the twin, with the value of each control input of the asset, SI."""
 
     name: Name
+    """Name of the control."""
     title: str = ""
+    """Name of the control in the report; by default the name."""
     values: Annotated[dict[str, Number], Field(min_length=1)]
+    """Value of each control input of the asset, by the name of the input [SI]."""
 
 
 class Reference(Section):
     """A value that is printed beside a figure of the summary, and where it comes from."""
 
     figure: Name
+    """Name of a figure of the summary."""
     value: Number | str
+    """The value to compare with, in the unit of the figure [unit of the figure]."""
     source: str
+    """Where the value comes from."""
 
 
 CALIBRATION_COPY = "asset/calibration.nc"
@@ -86,15 +103,23 @@ class Calibration(FileSection):
     """The uncertain parameter of the model, and where its distribution comes from."""
 
     parameter: Name
+    """Name of the uncertain parameter."""
     source: Literal["static_test", "normal", "fixed", "file"]
+    """Where the distribution of the parameter comes from: a static test of the wing, a normal
+    distribution, one fixed value, or a calibration file."""
     file: str | None = None
     """A calibration (`calibration.nc`). If `mean` and `standard_deviation` are given, the file is
     used for everything else in it."""
     method: Literal["particle_filter", "exact"] = "exact"
+    """How the posterior of the static test is computed."""
     curve: Literal["published", "design"] = "published"
+    """Stiffness curve of the static test: as published, or computed from the design."""
     draws: Count = 100
+    """Number of draws of the parameter."""
     mean: Number | None = None
+    """Mean of the parameter [unit of the parameter]."""
     standard_deviation: NotNegative | None = None
+    """Standard deviation of the parameter [unit of the parameter]."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": CALIBRATION_COPY}
 

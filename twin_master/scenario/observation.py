@@ -50,12 +50,13 @@ class ModesSection(Section):
     accelerometers: Annotated[tuple[Name, ...], Field(min_length=1)]
     """Acceleration outputs of the model; shapes are relative to the first."""
     bands: Annotated[tuple[tuple[Positive, Positive], ...], Field(min_length=1)]
-    """Lowest and highest frequency of each mode [Hz]; the mode is the strongest one in its band."""
+    """Lowest and highest frequency of each mode; the mode is the strongest one in its band [Hz]."""
     numbers: tuple[Count, ...] = ()
     """Number of each mode in the model, in rising order; 1, 2, ... by default."""
     standard_deviation: dict[FeatureKind, Positive]
-    """Standard deviation of each kind of feature [Hz, 1, 1], in addition to that of the
-    identification: what changes between records, and the error of the model."""
+    """Standard deviation of each kind of feature, in addition to that of the identification: what
+    changes between records, and the error of the model [Hz for frequencies and 1 for the
+    others]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: bands, numbers and features."""
@@ -168,7 +169,7 @@ class RecordSection(Section):
     input: Name
     """The control input that is excited or released."""
     amplitude: Positive
-    """Root mean square of the noise, or the value before the release, in the input's unit."""
+    """Root mean square of the noise, or the value before the release [unit of the input]."""
     duration: Positive
     """Length of the record [s]."""
     sampling_rate: Positive
@@ -184,18 +185,23 @@ class ObservationSection(Section):
         "standard_deviation": "microstrain",
         "model_error": "percent",
     }
+    filled_in: ClassVar[tuple[str, ...]] = ("count", "standard_deviation")
+
     role: Name = "strain"
+    """What is observed: an observation of the binding, or `modes`."""
     count: Count
+    """Number of sensors; it follows from the modes if the role is `modes`."""
     titles: tuple[str, ...] = ()
     """The name of each sensor in the report; by default the sensors have numbers."""
     unit: str | tuple[str, ...] = "1"
     """Unit of the observed values, one for all sensors or one for each; a strain without unit is
     printed in microstrain."""
     standard_deviation: PerSensor
-    """Standard deviation of the noise that the twin assumes, one for all sensors or for each."""
+    """Standard deviation of the noise that the twin assumes, one for all sensors or for each [unit
+    of the sensors]."""
     model_error: NotNegative | tuple[NotNegative, ...] = 0.0
     """Standard deviation of the predicted value as a fraction of it, one for all sensors or one for
-    each; added to the noise in quadrature."""
+    each; added to the noise in quadrature [1]."""
     between_levels: bool = True
     """Whether the truth may lie between the levels of the states, which then stand for
     intervals."""

@@ -6,13 +6,18 @@ A key may carry its unit in its name (`levels_percent`); the value is converted 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema
 
 from reporting import toml_file
+from reporting.choices import did_you_mean
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
 
 Table = dict[str, Any]
 """A table of a TOML or JSON file before it is checked: values of any type by key."""
+
+_BOUNDS_OF_SCHEMA = ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "default")
+"""Keys of a JSON Schema whose numbers have the unit of the value."""
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 """By how much a value in a unit is divided to be in SI."""
@@ -40,8 +45,17 @@ PerSensor = Positive | tuple[Positive, ...]
 """One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
 _AT_MOST_LARGEST_COUNT = _limit_validator(LARGEST_COUNT, "for the twin holds arrays of that length")
-Count = Annotated[int, Field(strict=True, ge=1), _AT_MOST_LARGEST_COUNT]
-Step = Annotated[int, Field(strict=True, ge=0), _AT_MOST_LARGEST_COUNT]
+_LARGEST_COUNT_IN_SCHEMA = {"maximum": LARGEST_COUNT}
+Count = Annotated[
+    int,
+    Field(strict=True, ge=1, json_schema_extra=_LARGEST_COUNT_IN_SCHEMA),
+    _AT_MOST_LARGEST_COUNT,
+]
+Step = Annotated[
+    int,
+    Field(strict=True, ge=0, json_schema_extra=_LARGEST_COUNT_IN_SCHEMA),
+    _AT_MOST_LARGEST_COUNT,
+]
 Seed = Annotated[
     int,
     Field(strict=True, ge=0),
@@ -57,6 +71,20 @@ class Section(toml_file.Section):
     model_config = ConfigDict(strict=False)
     units: ClassVar[Mapping[str, str]] = {}
     """The unit that a key may carry in its name, by key."""
+    filled_in: ClassVar[tuple[str, ...]] = ()
+    """Required keys that a file may leave out, because they then follow from others."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> Table:
+        """Return the JSON Schema of the table in a file, where keys may carry their units."""
+        schema = handler(core_schema)
+        table = handler.resolve_ref_schema(schema)
+        if "properties" in table:
+            _add_keys_with_units(table, cls.units)
+            _relax_required_keys(table, {*cls.filled_in})
+        return schema
 
     @model_validator(mode="before")
     @classmethod
@@ -69,7 +97,11 @@ class Section(toml_file.Section):
             field, unit = cls.split_unit(str(key))
             if field not in cls.model_fields:
                 known_keys = ", ".join(cls._documented_key(name) for name in cls.model_fields)
-                raise ValueError(f"unknown key `{key}`; the keys known there are {known_keys}")
+                question = did_you_mean(str(key), cls._keys_in_file())
+                stop = "." if question else ""
+                raise ValueError(
+                    f"unknown key `{key}`; the keys known there are {known_keys}{stop}{question}"
+                )
             if field in converted:
                 raise ValueError(f"`{field}` was given with and without its unit: keep one of them")
             if unit == "percent":
@@ -97,12 +129,75 @@ class Section(toml_file.Section):
         return f"{name}[_{cls.units[name]}]" if name in cls.units else name
 
     @classmethod
+    def _keys_in_file(cls) -> list[str]:
+        """Return the keys that a file may have, with and without their units."""
+        return [*cls.model_fields, *(f"{name}_{unit}" for name, unit in cls.units.items())]
+
+    @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:
         """Return the key without its unit, and the unit; an empty text for a key without one."""
         for field, unit in cls.units.items():
             if key == f"{field}_{unit}":
                 return field, unit
         return key, ""
+
+
+def _add_keys_with_units(table: Table, units: Mapping[str, str]) -> None:
+    """Add a key with a unit in its name beside each key that may carry one, to a table's schema.
+
+    Parameters
+    ----------
+    table : dict
+        The JSON Schema of the table, which is changed.
+    units : mapping of str to str
+        The unit of each key that may carry one.
+    """
+    properties: Table = {}
+    alternatives = []
+    for key, key_schema in table["properties"].items():
+        properties[key] = key_schema
+        if key not in units:
+            continue
+        key_with_unit = f"{key}_{units[key]}"
+        unit_text = units[key].replace("_per_", " per ")
+        scaled_schema = _schema_in_unit(key_schema, UNIT_DIVISOR[units[key]])
+        properties[key_with_unit] = {**scaled_schema, "unit": unit_text, "same_as": key}
+        if key in table.get("required", ()):
+            alternatives.append({"anyOf": [{"required": [key]}, {"required": [key_with_unit]}]})
+    table["properties"] = properties
+    if alternatives:
+        table["allOf"] = alternatives
+        _relax_required_keys(table, {*units})
+
+
+def _relax_required_keys(table: Table, keys: set[str]) -> None:
+    """Remove keys from the required ones of the JSON Schema of a table."""
+    if "required" in table:
+        table["required"] = [key for key in table["required"] if key not in keys]
+
+
+def _schema_in_unit(schema: Any, divisor: float) -> Any:
+    """Return the JSON Schema of a value in SI for the same value in a unit.
+
+    Parameters
+    ----------
+    schema : object
+        The schema, or a part of it.
+    divisor : float
+        By how much a value in the unit is divided to be in SI.
+    """
+    if isinstance(schema, list):
+        return [_schema_in_unit(entry, divisor) for entry in schema]
+    if not isinstance(schema, dict):
+        return schema
+    scaled: Table = {}
+    for key, value in schema.items():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if key in _BOUNDS_OF_SCHEMA and is_number:
+            scaled[key] = value * divisor
+        else:
+            scaled[key] = _schema_in_unit(value, divisor)
+    return scaled
 
 
 def _check_percentage(key: object, value: object) -> None:

@@ -52,15 +52,21 @@ class Rewards(Section):
     }
     health_limit: PerSensor
     """Value at which the health reward is zero, one for all sensors that count for it or one for
-    each."""
+    each [unit of the sensors]."""
     health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
     """The sensors, numbered from 1, that have a limit and so count for the health reward."""
     health_weight: Number = 1.0
+    """Weight of the health reward in planning [1]."""
     control_weight: Number = 1.0
+    """Weight of the control reward in planning [1]."""
     error_scale: PerSensor
-    """Distance between observation and model that costs one, one for all sensors or for each."""
+    """Distance between observation and model that costs one, one for all sensors or for each [unit
+    of the sensors]."""
     normalise_error_by: Name | None = None
+    """A control input by which the error is divided, so that errors under different loads are
+    comparable."""
     control: dict[str, Number]
+    """Reward of each control, by its name [1]."""
 
 
 class Transition(Section):
@@ -70,11 +76,13 @@ class Transition(Section):
     """
 
     kind: Literal["independent_worsening", "independent_tables"]
+    """Whether every factor worsens by one level with a probability, or changes by a table."""
     probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """`independent_worsening`: probability of one level up, by control, or by control and state."""
+    """`independent_worsening`: probability of one level up, by control, or by control and state
+    [1]."""
     tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
     """`independent_tables`: a square table by control and state; a row is the level before the
-    step, a column the level after it."""
+    step, a column the level after it [1]."""
 
     def faults_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
@@ -151,7 +159,10 @@ class Span(Section):
     """Steps of a mission, the last one included."""
 
     first_step: Step
+    """First step, counted from 0."""
     last_step: Step | None = None
+    """Last step, which is included; by default only the first step, or for a fault of sensors all
+    later steps."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: an early end."""
@@ -167,7 +178,9 @@ class Gain(Span):
 
     units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
     state: Name
+    """Name of the state factor."""
     gain: Number
+    """Growth of the true factor in each step [unit of the factor]."""
 
 
 class Noise(Section):
@@ -175,7 +188,7 @@ class Noise(Section):
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
     standard_deviation: NotNegative | tuple[NotNegative, ...]
-    """One for all sensors or one for each."""
+    """Standard deviation, one for all sensors or one for each [unit of the sensors]."""
 
 
 class SensorFault(Span):
@@ -183,8 +196,11 @@ class SensorFault(Span):
 
     units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
     kind: Literal["dropout", "drift"]
+    """Whether the sensors deliver nothing, or drift."""
     sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
+    """The sensors, numbered from 1, or "all"."""
     rate: Number | None = None
+    """Growth of the drift in each step [unit of the sensors]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: span and rate."""
@@ -210,12 +226,16 @@ class TruthSection(Section):
     """
 
     kind: Literal["scripted", "random_growth", "asset"]
+    """Whether the damage follows a script, grows at random, or happens inside the asset."""
     gains: tuple[Gain, ...] = ()
+    """`scripted`: how the true factors of the state grow."""
     probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """`random_growth`: the true probabilities to worsen, as in `transition`; by default those that
-    the twin assumes."""
+    the twin assumes [1]."""
     noise: Noise = Noise(standard_deviation=0.0)
+    """Noise of the real sensors."""
     sensor_faults: tuple[SensorFault, ...] = ()
+    """Faults of sensors."""
     state: dict[str, Name] = Field(default_factory=dict)
     """`asset`: for each state factor, the monitor of the binding that holds its true value."""
     observation: Name | None = None
@@ -274,19 +294,21 @@ class Action(Section):
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
     name: Name
+    """Name of the action."""
     title: str = ""
+    """Name of the action in the report; by default the name."""
     control: Name
     """The control whose loads act on the asset in that step."""
     cost: NotNegative
-    """By how much the reward of the step is lower than under the control alone."""
+    """By how much the reward of the step is lower than under the control alone [1]."""
     inspects: tuple[Name, ...] = ()
     """The state factors that are read in that step, and only then."""
     standard_deviation: PerSensor | None = None
-    """Standard deviation of these readings, one for all or one for each."""
+    """Standard deviation of these readings, one for all or one for each [unit of the factor]."""
     repairs: tuple[Name, ...] = ()
     """The state factors that are at their lowest level in the next step."""
     success: Probability = 1.0
-    """Probability with which a repair succeeds, for each state factor."""
+    """Probability with which a repair succeeds, for each state factor [1]."""
     ends: Flag = False
     """Whether the mission ends with that step."""
 
@@ -325,6 +347,7 @@ class Planner(Section):
     """How the twin decides: value iteration, eq. (36), or planning on the belief."""
 
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
+    """Discount factor of the rewards of later steps [1]."""
     decide_on: Literal["filtered", "predicted"] = "filtered"
     """The belief of which the next control is the most probable one: D_t, or D_{t+1} as
     predicted."""
@@ -335,7 +358,8 @@ class Planner(Section):
     the mean over the states, as if they were known from the next step on; `belief`: the control
     that is planned on the belief."""
     limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
-    """`belief`: the fraction of the steps, discounted, in which a health limit may be exceeded."""
+    """`belief`: the fraction of the steps, discounted, in which a health limit may be exceeded
+    [1]."""
 
     inspections_per_step: Count | None = None
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
@@ -415,15 +439,15 @@ class Learning(Section):
     noise: Flag = True
     """Whether the noise scale of each sensor is learnt, about the assumed standard deviation."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
-    """Certainty of the assumed noise, as a number of observations, which is more than two."""
+    """Certainty of the assumed noise, as a number of observations, which is more than two [1]."""
     gauge_gain: NotNegative | tuple[NotNegative, ...] = 0.0
-    """Prior standard deviation of the relative gain error of each sensor; 0 is not learnt."""
+    """Prior standard deviation of the relative gain error of each sensor; 0 is not learnt [1]."""
     gauge_offset: NotNegative | tuple[NotNegative, ...] = 0.0
-    """Prior standard deviation of the offset of each sensor, in the unit of the sensors; 0 is not
-    learnt."""
+    """Prior standard deviation of the offset of each sensor; 0 is not learnt [unit of the
+    sensors]."""
     transition_factors: tuple[Positive, ...] = ()
     """Factors on the probabilities to leave a state, equally probable at first; by default they are
-    not learnt."""
+    not learnt [1]."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: transition factors."""
@@ -478,23 +502,24 @@ class Noticing(Section):
     units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "all_gain": "percent"}
     threshold: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1.0)] = 100.0
     """Evidence that raises an alarm; the probability of a false alarm of each of the two kinds is
-    at most its inverse."""
+    at most its inverse [1]."""
     gauge_gain: Annotated[float, Field(strict=True, gt=0.0, le=_LARGEST_GAIN)] = 0.2
-    """Gain error of a single sensor that is to be found; less than half of it raises no alarm."""
+    """Gain error of a single sensor that is to be found; less than half of it raises no alarm
+    [1]."""
     all_gain: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.1
     """Prior standard deviation of the gain error of each sensor under the hypothesis that no state
-    explains all sensors."""
+    explains all sensors [1]."""
     memory_steps: Positive = 20.0
-    """Steps after which what was learnt of these gains has faded to 1 / e."""
+    """Steps after which what was learnt of these gains has faded to 1 / e [steps]."""
     onset_steps: Positive = 50.0
-    """Steps within which half of the faults begin that did not exist from the start."""
+    """Steps within which half of the faults begin that did not exist from the start [steps]."""
     absurd_deviations: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=3.0)] = 8.0
     """A reading is left out if it is so many assumed standard deviations beyond the readings of all
-    states."""
+    states [1]."""
     prior: Annotated[float, Field(strict=True, gt=0.0, lt=0.5)] = 0.01
-    """Prior probability of each of the two kinds of fault, for their posterior."""
+    """Prior probability of each of the two kinds of fault, for their posterior [1]."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
-    """Certainty of the assumed noise, as a number of observations, which is more than two."""
+    """Certainty of the assumed noise, as a number of observations, which is more than two [1]."""
 
 
 def _none_for_false(value: object) -> object:
@@ -502,7 +527,10 @@ def _none_for_false(value: object) -> object:
     return None if value is False else value
 
 
-NoticingOrNot = Annotated[Noticing | None, BeforeValidator(_none_for_false)]
+NoticingOrNot = Annotated[
+    Noticing | None,
+    BeforeValidator(_none_for_false, json_schema_input_type=Noticing | Literal[False]),
+]
 """The table, or `notice = false`."""
 
 

@@ -1,10 +1,12 @@
-"""The joint posterior: enumeration and an independent sampler as oracles, limits, calibration, bad input."""
+"""The joint posterior against enumeration, limits and bad input; readings of ring-downs."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
 
 from calibration.dynamics.records import RingDownRecord, read_records
@@ -19,186 +21,394 @@ from calibration.static.posterior import PUBLISHED_LINE, stiffness_line
 from tests.calibration.decays import free_decay
 
 LIMITS = np.array([[0.85, 1.15], [0.05, 0.3], [0.0, 0.3]])
+"""Where the model is valid: factor of the modulus, servo mass and pitot mass [kg]."""
 CENTRE = np.array([1.0, 0.169, 0.1345])
-AT_CENTRE = np.log([5.632, 28.544])
-SLOPE = np.array([[0.41, 0.325], [-0.94, -0.69], [-0.98, -0.64]])  # of ln f1, ln f2, as of the shipped wing
+LOG_FREQUENCIES_AT_CENTRE = np.log([5.632, 28.544])
+SLOPES = np.array([[0.41, 0.325], [-0.94, -0.69], [-0.98, -0.64]])
+"""Of ln f1, ln f2 by the three quantities, as of the shipped wing."""
 VALIDITY = dict(zip(STATE[:3], ((low, high) for low, high in LIMITS.tolist()), strict=True))
-STATIC = published_measurements()
-MODAL = PUBLISHED_MODES
-TOTAL = weighed()
+LOAD_TEST = published_measurements()
 
 
-def modes(**deviation):
-    """The published modes, some of their deviations changed."""
-    deviations = [deviation.get(item.name, item.deviation) for item in MODAL]
-    return modal_readings([item.value for item in MODAL], deviations)
+# ---------------------------------------------------------------- a wing in closed form
 
 
-def asked(wing, modal=MODAL, static=STATIC, total_mass=TOTAL, **given):
-    return joint_posterior(wing, static, (total_mass, *modal), **given)
+def line_frequencies(quantities):
+    """Return frequencies (N, 2) [Hz] of a wing whose logarithms are linear."""
+    return np.exp(LOG_FREQUENCIES_AT_CENTRE + (quantities - CENTRE) @ SLOPES)
 
 
-def line_frequency(quantities):
-    """Frequencies (N, 2) [Hz] of a wing whose logarithms are linear."""
-    return np.exp(AT_CENTRE + (quantities - CENTRE) @ SLOPE)
-
-
-def line_table():
-    """The same wing as tables; the polynomial is exact."""
-    half = 0.5 * np.diff(LIMITS, axis=1)[:, 0]
+def make_line_table():
+    """Return the same wing as tables, whose polynomial is exact."""
+    low, high = LIMITS.T
+    half_width = 0.5 * (high - low)
     middle = LIMITS.mean(axis=1)
     coefficient = np.zeros((2, 2, 2, 2))
-    coefficient[0, 0, 0] = AT_CENTRE + (middle - CENTRE) @ SLOPE
-    coefficient[1, 0, 0], coefficient[0, 1, 0], coefficient[0, 0, 1] = half[:, None] * SLOPE
+    coefficient[0, 0, 0] = LOG_FREQUENCIES_AT_CENTRE + (middle - CENTRE) @ SLOPES
+    coefficient[1, 0, 0], coefficient[0, 1, 0], coefficient[0, 0, 1] = half_width[:, None] * SLOPES
     curve = stiffness_line(575.2, 101.8, lower=0.85, upper=1.15)
     return WingTable(LIMITS, coefficient, curve)
 
 
-TABLES = line_table()
+LINE_TABLE = make_line_table()
 
 
-def test_enumeration_finds_mean_and_deviation():
-    """The same seed draws the same bytes; damping priors far from zero make alpha and beta Gaussians."""
-    prior = wing_priors(VALIDITY, damping_alpha=(2.0, 0.3), damping_beta=(8e-4, 1e-4))
-    found = asked(TABLES, priors=prior, count=20_000)
-    axes = np.linspace(0.95, 1.07, 31), np.linspace(0.09, 0.24, 61), np.linspace(0.466, 0.478, 25)
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)  # e, servo, weighed total
-    quantities = grid - np.array([0.0, 0.0, 2.0]) * grid[:, 1:2]
-    inside = (quantities[:, 2] > 0.0) & (quantities[:, 2] < 0.3)
-    quantities, grid = quantities[inside], grid[inside]
-    norm = stats.norm
-    log_density = norm.logpdf(grid[:, 2], 0.472, 1e-3)
-    for place, item in enumerate(prior[:3]):
-        log_density += norm.logpdf(quantities[:, place], item.mean, item.deviation)
-        log_density -= math.log(np.diff(norm.cdf(LIMITS[place], item.mean, item.deviation))[0])
-    k = PUBLISHED_LINE.stiffness(quantities[:, 0])
-    spread = np.hypot(STATIC.load_standard_deviation, k * STATIC.displacement_standard_deviation)
-    for load, displacement in zip(STATIC.load, STATIC.displacement, strict=True):
-        log_density += norm.logpdf(load - k * displacement, 0.0, spread)
-    frequency = line_frequency(quantities)
-    omega = 2.0 * math.pi * frequency
-    for mode, tau in enumerate(MODEL_ERROR):
-        spread = np.hypot(MODAL[mode].deviation, tau * frequency[:, mode])
-        log_density += norm.logpdf(MODAL[mode].value, frequency[:, mode], spread)
+def published_modes(**deviations):
+    """Return the published modes, some of their deviations changed."""
+    changed = [deviations.get(mode.name, mode.deviation) for mode in PUBLISHED_MODES]
+    return modal_readings([mode.value for mode in PUBLISHED_MODES], changed)
+
+
+def draw_posterior(modes=PUBLISHED_MODES, load_test=LOAD_TEST, total_mass=None, **options):
+    """Return samples of the posterior of the wing in closed form, with published readings."""
+    weight = weighed() if total_mass is None else total_mass
+    return joint_posterior(LINE_TABLE, load_test, (weight, *modes), **options)
+
+
+# ---------------------------------------------------------------- enumeration
+
+ALPHA_PRIOR = (2.0, 0.3)
+BETA_PRIOR = (8e-4, 1e-4)
+"""Means and deviations; far from zero, so that the posteriors of alpha and beta are Gaussians."""
+PRIORS = wing_priors(VALIDITY, damping_alpha=ALPHA_PRIOR, damping_beta=BETA_PRIOR)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Points of an enumeration within the limits.
+
+    Attributes
+    ----------
+    quantities : (N, 3) array
+        Factor of the modulus, servo mass and pitot mass.
+    total_mass : (N,) array
+        Mass of two servos and the pitot tube [kg].
+    """
+
+    quantities: NDArray[np.float64]
+    total_mass: NDArray[np.float64]
+
+
+def enumerate_grid():
+    factor, servo, total = np.meshgrid(
+        np.linspace(0.95, 1.07, 31),
+        np.linspace(0.09, 0.24, 61),
+        np.linspace(0.466, 0.478, 25),
+        indexing="ij",
+    )
+    pitot = total - 2.0 * servo
+    is_inside = (pitot > 0.0) & (pitot < 0.3)
+    quantities = np.column_stack([factor[is_inside], servo[is_inside], pitot[is_inside]])
+    return Grid(quantities, total[is_inside])
+
+
+def log_prior(quantities):
+    """Return the log density of Gaussians that are cut off at the limits."""
+    log_density = np.zeros(len(quantities))
+    for values, prior, limits in zip(quantities.T, PRIORS[:3], LIMITS, strict=True):
+        low, high = stats.norm.cdf(limits, prior.mean, prior.deviation)
+        log_density += stats.norm.logpdf(values, prior.mean, prior.deviation)
+        log_density -= math.log(high - low)
+    return log_density
+
+
+def log_likelihood_of_loads(factor):
+    """Return the log density of the load test, with errors of load and displacement."""
+    stiffness = PUBLISHED_LINE.stiffness(factor)
+    deviation = np.hypot(
+        LOAD_TEST.load_standard_deviation,
+        stiffness * LOAD_TEST.displacement_standard_deviation,
+    )
+    log_density = np.zeros(len(factor))
+    for load, displacement in zip(LOAD_TEST.load, LOAD_TEST.displacement, strict=True):
+        log_density += stats.norm.logpdf(load - stiffness * displacement, 0.0, deviation)
+    return log_density
+
+
+def log_likelihood_of_frequencies(frequencies):
+    """Return the log density of both frequencies, with errors of readings and of the model."""
+    log_density = np.zeros(len(frequencies))
+    for frequency, mode, model_error in zip(
+        frequencies.T, PUBLISHED_MODES[:2], MODEL_ERROR, strict=True
+    ):
+        deviation = np.hypot(mode.deviation, model_error * frequency)
+        log_density += stats.norm.logpdf(mode.value, frequency, deviation)
+    return log_density
+
+
+@dataclass(frozen=True)
+class DampingPosterior:
+    """The Gaussian posterior of alpha and beta at each point of a grid.
+
+    Attributes
+    ----------
+    log_evidence : (N,) array
+    mean, variance : (N, 2) array
+    """
+
+    log_evidence: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+def damping_posterior(frequencies):
+    """Return the posterior by linear regression: the ratios are linear in alpha and beta."""
+    prior_mean, prior_deviation = np.transpose([ALPHA_PRIOR, BETA_PRIOR])
+    omega = 2.0 * math.pi * frequencies
     design = np.stack([0.5 / omega, 0.5 * omega], axis=2)
-    ratios, deviations = np.array([(item.value, item.deviation) for item in MODAL[2:]]).T
-    swept = np.diag([0.3**2, 1e-4**2]) @ np.swapaxes(design, 1, 2)
-    covariance = design @ swept + np.diag(np.square(deviations))
-    residual = ratios - design @ np.array([2.0, 8e-4])
+    ratios = np.array([mode.value for mode in PUBLISHED_MODES[2:]])
+    deviations = np.array([mode.deviation for mode in PUBLISHED_MODES[2:]])
+
+    # prior covariance of (alpha, beta) with the ratios, and covariance of the ratios
+    cross = np.diag(prior_deviation**2) @ np.swapaxes(design, 1, 2)
+    covariance = design @ cross + np.diag(deviations**2)
+    residual = ratios - design @ prior_mean
     solved = np.linalg.solve(covariance, residual[..., None])[..., 0]
-    log_density -= 0.5 * np.sum(residual * solved, axis=1)
-    log_density -= 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1]
+    reduction = np.einsum(
+        "nij,nji->ni", cross, np.linalg.solve(covariance, np.swapaxes(cross, 1, 2))
+    )
+
+    _, log_determinant = np.linalg.slogdet(2.0 * math.pi * covariance)
+    return DampingPosterior(
+        log_evidence=-0.5 * np.sum(residual * solved, axis=1) - 0.5 * log_determinant,
+        mean=prior_mean + (cross @ solved[..., None])[..., 0],
+        variance=prior_deviation**2 - reduction,
+    )
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Mean and deviation of modulus factor, servo mass, pitot mass, alpha and beta."""
+
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def enumerated():
+    """Moments of the posterior by a sum over a grid of factor, servo mass and weighed total."""
+    grid = enumerate_grid()
+    factor, _, _ = grid.quantities.T
+    frequencies = line_frequencies(grid.quantities)
+    damping = damping_posterior(frequencies)
+    log_density = (
+        stats.norm.logpdf(grid.total_mass, 0.472, 1e-3)
+        + log_prior(grid.quantities)
+        + log_likelihood_of_loads(factor)
+        + log_likelihood_of_frequencies(frequencies)
+        + damping.log_evidence
+    )
     weight = np.exp(log_density - log_density.max())
     weight /= weight.sum()
-    damping = np.array([2.0, 8e-4]) + (swept @ solved[..., None])[..., 0]
-    reduced = np.einsum("nij,nji->ni", swept, np.linalg.solve(covariance, np.swapaxes(swept, 1, 2)))
-    points = np.hstack([quantities, damping])
+    points = np.hstack([grid.quantities, damping.mean])
     mean = weight @ points
     variance = weight @ (points - mean) ** 2
-    variance[3:] += np.array([0.3**2, 1e-4**2]) - weight @ reduced
-    deviation = np.sqrt(variance)
-    np.testing.assert_array_less(np.abs(found.mean(axis=0) - mean), 0.02 * deviation)
-    np.testing.assert_allclose(found.std(axis=0), deviation, rtol=0.02)
-    one, two, other = (asked(TABLES, seed=seed, count=200) for seed in (3, 3, 4))
-    assert one.tobytes() == two.tobytes() != other.tobytes()
+    variance[3:] += weight @ damping.variance
+    return Moments(mean=mean, deviation=np.sqrt(variance))
 
 
-SHARP = modes(frequency_1=0.001, frequency_2=0.03)
-SOFT = replace(STATIC, displacement=STATIC.displacement * 0.7)
-OVERDAMPED = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3))
+def test_samples_have_the_moments_of_an_enumeration(enumerated):
+    samples = draw_posterior(priors=PRIORS, count=20_000)
+
+    error = np.abs(samples.mean(axis=0) - enumerated.mean)
+    np.testing.assert_array_less(error, 0.02 * enumerated.deviation)
+    np.testing.assert_allclose(samples.std(axis=0), enumerated.deviation, rtol=0.02)
+
+
+def test_the_same_seed_draws_the_same_bytes():
+    samples = draw_posterior(seed=3, count=200).tobytes()
+
+    assert samples == draw_posterior(seed=3, count=200).tobytes()
+    assert samples != draw_posterior(seed=4, count=200).tobytes()
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def test_a_total_mass_that_the_wing_cannot_have_is_refused():
+    with pytest.raises(ExperimentDataError, match="cannot weigh 2 kg"):
+        draw_posterior(total_mass=weighed(2.0))
+
+
+def test_a_wing_far_stiffer_than_the_model_is_refused():
+    stiff = replace(LOAD_TEST, displacement=LOAD_TEST.displacement * 0.7)
+
+    with pytest.raises(OutsideValidityError, match="outside"):
+        draw_posterior(load_test=stiff)
+
+
+def test_damping_ratios_without_rayleigh_coefficients_are_refused():
+    overdamped = modal_readings((5.6492, 29.9699, 0.01, 0.3), (0.06, 0.3, 1e-4, 1e-3))
+
+    with pytest.raises(ExperimentDataError, match="negative Rayleigh coefficient"):
+        draw_posterior(overdamped)
+
+
+def test_a_posterior_at_the_end_of_the_model_is_refused():
+    sharp = published_modes(frequency_1=0.001, frequency_2=0.03)
+
+    with pytest.raises(OutsideValidityError, match=r"pressed against 1\.15, where the model ends"):
+        draw_posterior(sharp, model_error=(0.0, 0.0))
+
+
+def test_a_reading_without_uncertainty_is_refused():
+    with pytest.raises(ExperimentDataError, match=r"damping_ratio_1 .* without any unc"):
+        published_modes(damping_ratio_1=0.0)
 
 
 @pytest.mark.parametrize(
-    ("ask", "kind", "sentence"),
+    ("quantities", "sentence"),
     [
-        (lambda: asked(TABLES, total_mass=weighed(2.0)), ExperimentDataError, "cannot weigh 2 kg"),
-        (lambda: asked(TABLES, static=SOFT), OutsideValidityError, "outside"),
-        (lambda: asked(TABLES, OVERDAMPED), ExperimentDataError, "negative Rayleigh coefficient"),
-        (lambda: asked(TABLES, SHARP, model_error=(0.0, 0.0)), OutsideValidityError,
-         r"pressed against 1\.15, where the model ends"),
-        (lambda: modes(damping_ratio_1=0.0), ExperimentDataError, "damping_ratio_1 .* without any unc"),
-        (lambda: TABLES.frequency([[1.0, 0.4, 0.1]]), OutsideValidityError,
-         r"mass of each servo is 0\.4 kg, .* 0\.05 to 0\.3 kg"),
-        (lambda: TABLES.frequency([[1.5, 0.17, 0.1]]), OutsideValidityError,
-         r"modulus of the skin, e is 1\.5"),
+        ([1.0, 0.4, 0.1], r"mass of each servo is 0\.4 kg, .* 0\.05 to 0\.3 kg"),
+        ([1.5, 0.17, 0.1], r"modulus of the skin, e is 1\.5"),
     ],
-)  # fmt: skip
-def test_readings_and_states_that_cannot_be(ask, kind, sentence):
-    with pytest.raises(kind, match=sentence):
-        ask()
+)
+def test_frequencies_outside_the_table_are_refused(quantities, sentence):
+    with pytest.raises(OutsideValidityError, match=sentence):
+        LINE_TABLE.frequency([quantities])
 
 
 # ---------------------------------------------------------------- what the ring-down is made to say
 
-
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
-F1, F2, ZETA1, ZETA2 = 5.65, 29.0, 0.028, 0.05
+F1 = 5.65
+F2 = 29.0
+ZETA1 = 0.028
+ZETA2 = 0.05
+DECAY_RATE = 2.0 * math.pi * F1 * ZETA1
+"""Of the first mode [1/s]."""
+NOISE = 1e-4
+AMPLITUDE = 0.012
 
 
-def by_name(trials):
-    """What `measured_modes` reads, by name."""
-    return {item.name: item for item in measured_modes(trials)}
+def readings_by_name(trials):
+    """Return what `measured_modes` reads, by name."""
+    return {reading.name: reading for reading in measured_modes(trials)}
 
 
-def trials(softening, seed, noise=1e-4, scatter=0.0):
-    """Records whose first frequency falls by `softening` [Hz] with every factor e of the amplitude."""
+def record_trials(seed, softening=0.0, scatter=0.0):
+    """Return five records of two modes.
+
+    Parameters
+    ----------
+    seed : int
+    softening : float
+        By how much the first frequency falls with every factor e of the amplitude [Hz].
+    scatter : float
+        Standard deviation of the first frequency from record to record [Hz].
+    """
     generator = np.random.default_rng(seed)
     records = []
     for trial in range(5):
-        decay = 2.0 * math.pi * F1 * ZETA1
         # f(t) = F1 + softening (ln A(0) - ln A(t)) - middle, integrated over time
-        frequency = F1 - 0.5 * softening * decay * TIME[-1] + scatter * generator.standard_normal()
-        phase = 2.0 * math.pi * (frequency * TIME + 0.5 * softening * decay * TIME**2)
-        signal = 0.012 * np.exp(-decay * TIME) * np.cos(phase) + free_decay(TIME, F2, ZETA2, 0.008)
-        signal += generator.normal(0.0, noise, TIME.size)
+        half_change = 0.5 * softening * DECAY_RATE
+        frequency = F1 - half_change * TIME[-1] + scatter * generator.standard_normal()
+        phase = 2.0 * math.pi * (frequency * TIME + half_change * TIME**2)
+        first = AMPLITUDE * np.exp(-DECAY_RATE * TIME) * np.cos(phase)
+        signal = first + free_decay(TIME, F2, ZETA2, 0.008)
+        signal += generator.normal(0.0, NOISE, TIME.size)
         records.append(RingDownRecord(TIME, signal, source=f"drawn {trial + 1}"))
     return tuple(records)
 
 
-def test_a_wing_that_softens_is_given_its_spread():
-    slope = 0.07
-    found = by_name(fit_trials(trials(slope, 1), free=True, start=-1.0))
-    # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise; spread of the log amplitude.
-    decay = 2.0 * math.pi * F1 * ZETA1
-    last = min(5.6, math.log(0.012 / (4.0 * 1e-4)) / decay)
-    middles = np.arange(0.8, last + 0.4, 0.4)
-    assert found["frequency_1"].deviation == pytest.approx(slope * decay * middles.std(), rel=0.25)
+def test_the_frequency_of_a_wing_that_softens_has_the_deviation_of_its_course():
+    softening = 0.07
+    trials = fit_trials(record_trials(1, softening), free=True, start=-1.0)
+
+    deviation = readings_by_name(trials)["frequency_1"].deviation
+
+    # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise
+    end_of_mode = math.log(AMPLITUDE / (4.0 * NOISE)) / DECAY_RATE
+    middles = np.arange(0.8, min(5.6, end_of_mode) + 0.4, 0.4)
+    log_amplitude_deviation = DECAY_RATE * middles.std()
+    assert deviation == pytest.approx(softening * log_amplitude_deviation, rel=0.25)
 
 
 def test_frequencies_of_spectral_peaks_carry_their_bias():
     """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
-    found = by_name(fit_trials(trials(0.0, 2), start=-1.0))
-    fitted = by_name(fit_trials(trials(0.0, 2), free=True, start=-1.0))
-    bias = abs(found["frequency_2"].value - F2)
-    assert bias > 5.0 * fitted["frequency_2"].deviation
-    assert found["frequency_2"].deviation > 0.5 * bias
-    assert found["frequency_2"].deviation < 2.0 * bias
+    records = record_trials(2)
+    by_peak = readings_by_name(fit_trials(records, start=-1.0))["frequency_2"]
+    by_fit = readings_by_name(fit_trials(records, free=True, start=-1.0))["frequency_2"]
+
+    bias = abs(by_peak.value - F2)
+    assert bias > 5.0 * by_fit.deviation
+    assert 0.5 * bias < by_peak.deviation < 2.0 * bias
 
 
-@pytest.mark.parametrize(
-    ("count", "scatter", "widening"), [(1, 0.05, None), (2, 0.05, 4.0), (5, 0.05, 2.0), (5, 0.0, None)]
-)
-def test_trials_that_scatter_beyond_their_fits_widen_the_error_of_the_mean(count, scatter, widening):
-    fitted = fit_trials(trials(0.0, 1, scatter=scatter)[:count], free=True, start=-1.0)
-    for read in measured_modes(fitted):
-        name, mode = read.name[:-2], int(read.name[-1]) - 1
-        values = [getattr(fit.modes[mode], name) for fit in fitted]
-        squares = [fit.modes[mode].standard_error[name] ** 2 for fit in fitted]
-        assert read.value == pytest.approx(np.mean(values))
-        if scatter == 0.0 or read.name == "frequency_1":  # a linear wing has statistical errors alone
-            variance = widening * np.var(values, ddof=1) if widening else np.mean(squares)
-            assert read.deviation == pytest.approx(math.sqrt(variance / count), rel=1e-9), read.name
+def values_of(trials, reading):
+    """Return the values and standard errors of a reading in each trial."""
+    name = reading.name[:-2]
+    mode = int(reading.name[-1]) - 1
+    modes = [trial.modes[mode] for trial in trials]
+    values = np.array([getattr(mode, name) for mode in modes])
+    errors = np.array([mode.standard_error[name] for mode in modes])
+    return values, errors
 
 
-def test_the_published_records(reference):
-    trials = fit_trials(read_records(reference))
-    for read, published in zip(measured_modes(trials), PUBLISHED_MODES, strict=True):
-        assert read.deviation == pytest.approx(published.deviation, rel=0.02), read.name
-        if read.name.startswith("frequency"):
-            assert read.value == pytest.approx(published.value, rel=3e-3)
-    # The wing is not linear: as the amplitude falls, frequency rises and damping falls.
-    points = amplitude_dependence(trials[0])
-    assert points[0].frequency < 5.58
-    assert 5.70 < points[-1].frequency < 5.80
-    assert points[0].amplitude > 10.0 * points[-1].amplitude
-    assert points[0].damping_ratio > 1.2 * points[-1].damping_ratio
+@cache
+def fit_scattered(count, scatter):
+    """Return the fits of some trials with scattered frequencies, which take seconds."""
+    records = record_trials(1, scatter=scatter)[:count]
+    return fit_trials(records, free=True, start=-1.0)
+
+
+@pytest.mark.parametrize(("count", "scatter"), [(1, 0.05), (2, 0.05), (5, 0.05), (5, 0.0)])
+def test_a_reading_is_the_mean_of_the_trials(count, scatter):
+    trials = fit_scattered(count, scatter)
+
+    for reading in measured_modes(trials):
+        values, _ = values_of(trials, reading)
+        assert reading.value == pytest.approx(np.mean(values))
+
+
+@pytest.mark.parametrize(("count", "widening"), [(2, 4.0), (5, 2.0)])
+def test_trials_that_scatter_beyond_their_fits_widen_the_error_of_the_mean(count, widening):
+    trials = fit_scattered(count, scatter=0.05)
+
+    reading = readings_by_name(trials)["frequency_1"]
+
+    values, _ = values_of(trials, reading)
+    variance = widening * np.var(values, ddof=1)
+    assert reading.deviation == pytest.approx(math.sqrt(variance / count), rel=1e-9)
+
+
+def test_a_single_trial_has_the_error_of_its_fit():
+    trials = fit_scattered(1, scatter=0.05)
+
+    reading = readings_by_name(trials)["frequency_1"]
+
+    _, (error,) = values_of(trials, reading)
+    assert reading.deviation == pytest.approx(error, rel=1e-9)
+
+
+def test_trials_of_a_linear_wing_have_statistical_errors_alone():
+    trials = fit_scattered(5, scatter=0.0)
+
+    for reading in measured_modes(trials):
+        _, errors = values_of(trials, reading)
+        expected = math.sqrt(np.mean(errors**2) / 5)
+        assert reading.deviation == pytest.approx(expected, rel=1e-9), reading.name
+
+
+# ---------------------------------------------------------------- the published records
+
+
+@pytest.fixture(scope="module")
+def published_trials(reference):
+    return fit_trials(read_records(reference))
+
+
+def test_the_published_records_have_the_published_modes(published_trials):
+    for reading, published in zip(measured_modes(published_trials), PUBLISHED_MODES, strict=True):
+        assert reading.deviation == pytest.approx(published.deviation, rel=0.02), reading.name
+        if reading.name.startswith("frequency"):
+            assert reading.value == pytest.approx(published.value, rel=3e-3)
+
+
+def test_the_published_wing_softens_with_the_amplitude(published_trials):
+    """The wing is not linear: as the amplitude falls, frequency rises and damping falls."""
+    first, *_, last = amplitude_dependence(published_trials[0])
+
+    assert first.amplitude > 10.0 * last.amplitude
+    assert first.frequency < 5.58 < 5.70 < last.frequency < 5.80
+    assert first.damping_ratio > 1.2 * last.damping_ratio

@@ -10,6 +10,7 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.judgement.in_part import not_named_sentence
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.remarks import look_alike_remark, verdict_with_untested_effects
 from discrepancy.judgement.rules import VerdictCase
@@ -236,6 +237,23 @@ def test_the_rules_stand_in_the_page_in_their_order():
 
 
 # ---------------------------------------------------------------- names in part
+
+
+@pytest.mark.parametrize(
+    ("reason", "sentence"),
+    [
+        (
+            "What is left follows the loads.",
+            "It is not named, because what is left follows the loads.",
+        ),
+        (
+            "its probability is 0.4: a name needs 0.95",
+            "It is not named, because its probability is 0.4: a name needs 0.95.",
+        ),
+    ],
+)
+def test_the_reason_why_a_hypothesis_is_not_named_is_one_sentence(reason, sentence):
+    assert not_named_sentence(reason) == sentence
 
 
 @pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.long)])

@@ -246,11 +246,13 @@ def test_a_release_can_be_held_by_a_force(rig: FmuModel, make) -> None:
 # ---------------------------------------------------------------- refusals
 
 
-def test_the_documented_file_is_one() -> None:
+def test_the_documented_files_are_read() -> None:
     page = (Path(__file__).parents[3] / "docs" / "how_to" / "fmu_models.md").read_text(encoding="utf-8")
-    described = FmuModelDescription.model_validate(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
-    assert described.effects == {"point_mass": "unmodelled_point_mass"}
-    assert described.scales.length == 0.4
+    texts = [part.split("```")[0] for part in page.split("```toml\n")[1:]]
+    example, complete = (FmuModelDescription.model_validate(tomllib.loads(text)) for text in texts)
+    assert [output.name for output in example.output] == ["tip", "strain[{1..4}]"]
+    assert complete.effects == {"point_mass": "unmodelled_point_mass"}
+    assert complete.scales.length == 0.4
 
 
 def test_an_fmu_that_never_rests_is_refused(make) -> None:

@@ -26,7 +26,8 @@ from discrepancy.missing_force.ported_trial import ported_trial
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
-from discrepancy.report.text import force_sentence, size_sentence
+from discrepancy.report.sizes import size_sentence
+from discrepancy.report.verdict_sentences import force_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel

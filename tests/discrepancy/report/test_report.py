@@ -18,6 +18,7 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
+from discrepancy.judgement.closed_share import percent_with_interval
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,
@@ -30,21 +31,16 @@ from discrepancy.pictures import plot_missing_force
 from discrepancy.report.decidability_text import (
     campaign_needs,
     confused_effects,
-    detectability_texts,
     group_lines,
 )
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import missing_effects_text, parameter_rows, render_report
+from discrepancy.report.page import missing_effects_text, render_report
+from discrepancy.report.printed import check_lines
 from discrepancy.report.residual_figures import gauge_places, planform_figure
-from discrepancy.report.text import (
-    WORDS,
-    formula,
-    headline,
-    number,
-    percent_with_interval,
-    remainders_sentence,
-    si_sizes,
-)
+from discrepancy.report.sizes import si_sizes
+from discrepancy.report.tables import detectable_sizes_table, parameter_rows
+from discrepancy.report.text import formula, number
+from discrepancy.report.verdict_sentences import headline, remainders_sentence
 from discrepancy.system.structures import WingModel
 from discrepancy.verdict import NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
@@ -196,19 +192,12 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
 
 
 def test_what_can_be_decided(drag, able):
-    words = {"confused_effects": confused_effects, "detectability_texts": detectability_texts, "able": able}
-    _, cells = WORDS.table("decide", [item for item in able.detectability if not item.reason], **words)
-    rows = {row[0].replace(" ", "_"): row for row in cells}
+    rows = {row[0].replace(" ", "_"): row for row in detectable_sizes_table(able).table.rows}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
-    told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
-    said = list(
-        WORDS.rendered_blocks(
-            WORDS.content["printed"]["check"], group_lines=group_lines, campaign_needs=campaign_needs, **told
-        )
-    )
-    assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
-    confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
+    lines = list(check_lines(drag.campaign, model=drag.model, catalogue=FEW, faults=(), separability=able))
+    assert "Not testable: washout. The campaign has no flight trial to fit." in lines
+    confused = [line for line in lines if isinstance(line, str) and line.startswith("Confused: ")]
     assert len(confused) == sum(bool(confused_effects(able, name)) for name in able.identifiers)
     for line in confused:
         assert all(other in line for other in confused_effects(able, line.split()[1]))

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from evidence.identification.__main__ import main
-from evidence.identification.comparison import _row, outputs
+from evidence.identification.comparison import NO_LIMITS, _row, outputs
 from evidence.identification.design_file import HEADER, design_toml, rounded
 from evidence.identification.errors import IdentificationError
 from evidence.identification.identifiability import analyse, profile
 from evidence.identification.least_squares import DesignFit, identify
 from evidence.identification.local_model import LocalModel, build_local_model
-from evidence.identification.parameters import deviations, scaled, values_of, wing_parameters, with_values
+from evidence.identification.parameters import deviations, scaled, values_of, with_values
 from evidence.identification.targets import (
     LEVELS,
     MASS_TOTAL,
@@ -32,6 +32,7 @@ from evidence.identification.targets import (
     fitted_states,
     read_targets,
 )
+from evidence.identification.wing_parameters import wing_parameters
 from fe.structure.affine import natural_frequencies, static_response
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design, parse_design
 from fe.wing.operators import assemble, flapwise_bending_modes, point_masses, wing_values
@@ -236,9 +237,9 @@ def test_a_written_design_is_read_back_and_the_shipped_file_is_such_a_one():
 def test_the_first_gauge_is_gauge_1():
     difference = np.zeros((3, 24))
     difference[2, 0] = 1.0
-    assert _row("strain", "%", difference, (None, None), True).where == "gauge 1"
+    assert _row("strain", "%", difference, NO_LIMITS, True).where == "gauge 1"
     difference[1, 23] = -2.0
-    assert _row("strain", "%", difference, (None, None), True).where == "gauge 24"
+    assert _row("strain", "%", difference, NO_LIMITS, True).where == "gauge 24"
 
 
 # ---------------------------------------------------------------- local models

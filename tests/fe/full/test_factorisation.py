@@ -38,7 +38,9 @@ def test_solutions_are_those_of_a_general_solver(leaf, seed, size, share, copies
     random = np.random.default_rng(seed)
     half = sparse.random_array((size, size), density=share, rng=random)
     block = random.standard_normal((copies, copies))
-    whole = sparse.kron(half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies))
+    whole = sparse.kron(
+        half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies)
+    )
     matrix = sparse.csr_array(whole + sparse.diags_array(np.asarray(abs(whole).sum(axis=1)) + 1e-3))
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
@@ -59,7 +61,9 @@ def test_the_wing_is_solved_as_by_a_general_solver(coarse_operators):
     for threads in (1, 2, 2):
         with threadpool_limits(threads):
             factors = Factorisation(stiffness)
-            found.append((factors.riesz(load).tobytes(), factors.riesz(np.eye(len(load), 3)).tobytes()))
+            found.append(
+                (factors.riesz(load).tobytes(), factors.riesz(np.eye(len(load), 3)).tobytes())
+            )
     assert found[0] == found[1] == found[2]
     assert factors.backward_error(factors.riesz(load), load) < 2e-15
     # The condition number is about 1e10.

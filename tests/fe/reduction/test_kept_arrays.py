@@ -26,7 +26,13 @@ from threadpoolctl import threadpool_limits
 from fe.compilation import compiled
 from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
-from fe.reduction.model_cache import MODELLING_PACKAGES, cache_file, patch_arrays, reduced_model, wing_fields
+from fe.reduction.model_cache import (
+    MODELLING_PACKAGES,
+    cache_file,
+    patch_arrays,
+    reduced_model,
+    wing_fields,
+)
 from fe.runtime import arrays as array_records
 from fe.runtime.arrays import StoredArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
@@ -60,7 +66,9 @@ def test_every_truncation_flipped_byte_and_lock_is_noticed():
     for place in range(len(WHOLE)):
         damaged = bytearray(WHOLE)
         damaged[place] ^= 0xFF
-        with suppress(ReducedModelFileError):  # or it is a date of the archive, which means nothing here
+        with suppress(
+            ReducedModelFileError
+        ):  # or it is a date of the archive, which means nothing here
             found = arrays_from_bytes(bytes(damaged), "x.npz", ["a"])
             np.testing.assert_array_equal(found["a"], np.arange(5))
     locked = bytearray(WHOLE)
@@ -112,12 +120,15 @@ def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
+    "value",
+    [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)],
 )
 def test_arrays_of_a_wrong_kind_are_refused(kept, value, monkeypatch):
     arrays = arrays_from_bytes(kept.to_bytes(), "it")
     for item in fields(kept):
-        if item.type is str or (arrays[item.name].shape == value.shape == () and value.dtype.kind == "f"):
+        if item.type is str or (
+            arrays[item.name].shape == value.shape == () and value.dtype.kind == "f"
+        ):
             continue
         given = {**arrays, item.name: value}
         monkeypatch.setattr(array_records, "arrays_from_bytes", lambda *_, own=given: own)
@@ -221,14 +232,18 @@ def test_without_a_place_to_keep_it_the_model_is_still_given(
 def test_every_file_that_shapes_the_model_counts_for_the_key():
     code = "import sys, fe.reduction.patch_basis; print(*(n for n in sys.modules if n.startswith('fe.')))"
     words = [sys.executable, "-c", code]
-    result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
+    result = subprocess.run(
+        words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3]
+    )
     modules = {name.split(".")[1] for name in result.stdout.split()}
     assert modules - {"designs", "sentences"} == set(MODELLING_PACKAGES)
 
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_real_build_is_reproducible_in_any_number_of_threads(coarse_design, coarse_fields, own_cache):
+def test_a_real_build_is_reproducible_in_any_number_of_threads(
+    coarse_design, coarse_fields, own_cache
+):
     with threadpool_limits(2):
         wing = wing_fields(coarse_design)
     assert wing.to_bytes() == coarse_fields.to_bytes()
@@ -264,7 +279,9 @@ def test_a_wait_is_said_and_ends_with_the_other(tmp_path, caplog, killed):
     assert began.wait(60.0)
     Timer(0.3, other.kill if killed else finish.set).start()
     assert ours(path) == path.read_text() == ("ours" if killed else "theirs")
-    assert caplog.messages == [f"Waiting for another process (number {other.pid}) that makes {path}."]
+    assert caplog.messages == [
+        f"Waiting for another process (number {other.pid}) that makes {path}."
+    ]
     other.join(60.0)
 
 
@@ -301,9 +318,7 @@ def test_without_a_folder_for_the_cache_it_still_compiles(monkeypatch):
     assert [options.get("cache", False) for options in asked] == [True, False]
 
 
-INNER = (
-    "from fe.compilation import compiled\nSTEP = {step}\n@compiled\ndef inner(x):\n    return x + {added}\n"
-)
+INNER = "from fe.compilation import compiled\nSTEP = {step}\n@compiled\ndef inner(x):\n    return x + {added}\n"
 OUTER = (
     "from fe.compilation import compiled\nfrom inner import STEP, inner\n"
     "@compiled\ndef outer(x):\n    return STEP * inner(x)\n"
@@ -311,7 +326,9 @@ OUTER = (
 
 
 @pytest.mark.parametrize("change", [{"added": 5.0}, {"step": 7.0}])
-def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(tmp_path, monkeypatch, change):
+def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(
+    tmp_path, monkeypatch, change
+):
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
 
     def outer(**numbers: float) -> tuple[float, int]:

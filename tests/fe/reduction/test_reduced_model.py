@@ -76,7 +76,10 @@ def test_the_bound_holds_and_keeps_the_tolerance(pair):
     def holds(shares: list[float]) -> None:
         vector = low + (high - low) * np.array(shares)
         # of all loads at once: where they nearly cancel, a sum of solutions has lost its digits
-        full, found = static_response(pair.full, named(model, vector)), model.static_response(vector)
+        full, found = (
+            static_response(pair.full, named(model, vector)),
+            model.static_response(vector),
+        )
         loads = model.load_coefficients(vector)
         alone = [model.static_response(vector, load=unit) for unit in np.eye(len(loads))]
         for what, wanted in (("strain", full.strain), ("displacement", full.output)):
@@ -84,7 +87,8 @@ def test_the_bound_holds_and_keeps_the_tolerance(pair):
             assert np.abs(getattr(found, what) - wanted).max() <= bound
             # combined loads may nearly cancel, so the scale is that of each load alone
             scale = sum(
-                np.abs(getattr(one, what)).max() * abs(part) for one, part in zip(alone, loads, strict=True)
+                np.abs(getattr(one, what)).max() * abs(part)
+                for one, part in zip(alone, loads, strict=True)
             )
             assert bound <= pair.tolerance * scale + 1e-300
 
@@ -97,7 +101,9 @@ def test_frequencies_are_those_of_the_full_model(pair):
     for vector in states(model, 3):
         wanted, _ = natural_frequencies(pair.full, model.mode_count, named(model, vector))
         modes = model.modes(vector)
-        np.testing.assert_allclose(modes.shape.T @ modes.mass @ modes.shape, np.eye(len(wanted)), atol=1e-11)
+        np.testing.assert_allclose(
+            modes.shape.T @ modes.mass @ modes.shape, np.eye(len(wanted)), atol=1e-11
+        )
         assert np.all(modes.output[-1] >= 0)
         relative = modes.frequency / wanted - 1.0
         assert np.all(relative > -3e-6)  # a projection can only be stiffer, but for rounding
@@ -108,8 +114,13 @@ def test_low_modes_keep_their_digits(pair):
     """Another orthonormal basis of the same space gives the same frequencies, to rounding."""
     model, size = pair.model, len(pair.model.modal_load.T)
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(size, size)))[0]
-    sides = {name: getattr(model, name) @ turn for name in ("modal_load", "modal_output", "followed_shapes")}
-    both = {name: turn.T @ getattr(model, name) @ turn for name in ("modal_stiffness", "modal_mass")}
+    sides = {
+        name: getattr(model, name) @ turn
+        for name in ("modal_load", "modal_output", "followed_shapes")
+    }
+    both = {
+        name: turn.T @ getattr(model, name) @ turn for name in ("modal_stiffness", "modal_mass")
+    }
     turned = replace(model, **sides, **both)
     for name in both:
         np.testing.assert_array_equal(getattr(model, name), getattr(model, name).transpose(0, 2, 1))
@@ -141,11 +152,15 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model):
     e, loss, servo, pitot = 0.9, (0.8, 0.8), 0.30, 0.0
     values = wing_values(coarse_operators, e, loss, **point_masses(servo, pitot))
     full = natural_frequencies(coarse_operators, 6, values)
-    reduced = model.modes(stiffness_loss=loss, young_modulus_factor=e, servo_mass=servo, pitot_mass=pitot)
+    reduced = model.modes(
+        stiffness_loss=loss, young_modulus_factor=e, servo_mass=servo, pitot_mass=pitot
+    )
     np.testing.assert_allclose(reduced.frequency, full.frequency[: model.mode_count], rtol=1e-4)
     assert reduced.followed == tuple(flapwise_bending_modes(coarse_operators, full))
     assert min(reduced.followed_mac) > 0.8  # far more than any other mode could have
-    assert model.tip_stiffness(e, loss) == pytest.approx(tip_stiffness(coarse_operators, e, loss), rel=1e-5)
+    assert model.tip_stiffness(e, loss) == pytest.approx(
+        tip_stiffness(coarse_operators, e, loss), rel=1e-5
+    )
     for index in reduced.followed:
         shape, output = full.shape[:, index], reduced.output[:, index]
         tip = abs(coarse_operators.tip_row @ shape)  # in the reduced model it moves up
@@ -235,10 +250,17 @@ def test_what_cannot_be_reduced_is_refused(changes, cells, sentence, write_beam,
 
 # ---------------------------------------------------------------- fields of the wing
 
-STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_factor": 3.0, "tip_force": 5.0}
+STATE = {
+    "young_modulus_factor": 0.95,
+    "stiffness_loss": (0.3, 0.6),
+    "load_factor": 3.0,
+    "tip_force": 5.0,
+}
 
 
-def test_displacement_strain_and_damage_are_those_of_the_full_one(coarse_fields, coarse_operators, tmp_path):
+def test_displacement_strain_and_damage_are_those_of_the_full_one(
+    coarse_fields, coarse_operators, tmp_path
+):
     """Files of the same state are the same bytes, and are read as the wing's mesh."""
     first, again = (tmp_path / folder / "wing.vtu" for folder in "ab")
     for path in (first, again):
@@ -276,7 +298,9 @@ def test_modes_are_those_of_the_full_model(coarse_fields, coarse_operators, tmp_
     for number, name in enumerate(list(written)[:3]):
         label, frequency = name.rsplit("_", 1)
         assert label == f"mode_{number + 1}"
-        assert float(frequency.removesuffix("Hz")) == pytest.approx(full.frequency[number], rel=1e-4)
+        assert float(frequency.removesuffix("Hz")) == pytest.approx(
+            full.frequency[number], rel=1e-4
+        )
         wanted = np.abs(coarse_operators.full_displacement(full.shape[:, number]))
         np.testing.assert_allclose(np.abs(written[name]), wanted, atol=1e-2 * wanted.max())
 
@@ -285,7 +309,9 @@ def test_bad_states_and_places_leave_no_file(coarse_fields, tmp_path):
     place = tmp_path / "folder.vtu"
     place.mkdir()
     with refused(OutsideModelError, "load_factor must"):
-        write_wing_vtu(tmp_path / "wing.vtu", coarse_fields, coarse_fields.vector(load_factor=np.nan))
+        write_wing_vtu(
+            tmp_path / "wing.vtu", coarse_fields, coarse_fields.vector(load_factor=np.nan)
+        )
     with refused(FileNotWrittenError, re.escape(str(place))):
         write_wing_vtu(place, coarse_fields, coarse_fields.vector(**STATE))
     assert list(tmp_path.iterdir()) == [place]

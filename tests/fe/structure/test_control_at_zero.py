@@ -102,9 +102,13 @@ def test_every_other_variant_of_a_hexahedron_is_refused_by_its_name(tmp_path, ki
         load_and_assemble(bar(tmp_path, kind=kind))
 
 
-@pytest.mark.parametrize("kind", ["C3D20RI", "C3D10M", "C3D10I", "C3D15V", "C3D6R", "B31R", "CPS8R", "S8R"])
+@pytest.mark.parametrize(
+    "kind", ["C3D20RI", "C3D10M", "C3D10I", "C3D15V", "C3D6R", "B31R", "CPS8R", "S8R"]
+)
 def test_variants_of_other_elements_are_refused_by_their_names(tmp_path, kind):
-    with pytest.raises(MeshError, match=f"line 10: elements of type '?{kind}'? cannot be read.*C3D20R"):
+    with pytest.raises(
+        MeshError, match=f"line 10: elements of type '?{kind}'? cannot be read.*C3D20R"
+    ):
         load_and_assemble(bar(tmp_path, kind=kind))
 
 
@@ -121,11 +125,17 @@ def slender(folder: Path, kind: str) -> Path:
     numbers = range(1, len(points) + 1)
     rows = ["*NODE", *(f"{n}, {', '.join(map(repr, points[n - 1].tolist()))}" for n in numbers)]
     rows.append(f"*ELEMENT, TYPE={kind}, ELSET=ALL")
-    rows += [f"{n}, {', '.join(map(str, cell))}" for n, cell in enumerate((cells + 1).tolist(), start=1)]
+    rows += [
+        f"{n}, {', '.join(map(str, cell))}" for n, cell in enumerate((cells + 1).tolist(), start=1)
+    ]
     for name, place in (("FOOT", 0.0), ("TOP", 1.0)):
         rows += [f"*NSET, NSET={name}", *(f"{n}," for n in numbers if points[n - 1, 0] == place)]
     (folder / "bar.inp").write_text("\n".join(rows) + "\n")
-    text = STRUCTURE.replace("NOMINAL", "1.0").replace("HELD", "FOOT").replace("[1, 1, 2]", "[1, 0.3, 0.2]")
+    text = (
+        STRUCTURE.replace("NOMINAL", "1.0")
+        .replace("HELD", "FOOT")
+        .replace("[1, 1, 2]", "[1, 0.3, 0.2]")
+    )
     (folder / "bar.toml").write_text(text.replace("poisson_ratio = 0.0", "poisson_ratio = 0.3"))
     return folder / "bar.toml"
 

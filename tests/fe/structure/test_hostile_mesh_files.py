@@ -19,7 +19,9 @@ INPUTS = Inputs(__file__)
 
 def check(read: Callable[[], Any], *expected: type[Exception]) -> bool:
     """Whether something was read; what is refused is one sentence."""
-    signal.alarm(60)  # seconds; who hangs is ended with the process, and all is read in hundredths of one
+    signal.alarm(
+        60
+    )  # seconds; who hangs is ended with the process, and all is read in hundredths of one
     try:
         read()
     except expected as error:
@@ -48,7 +50,11 @@ HOSTILE = {f"many {mark}": mark * LONG for mark in 'a1,"['} | {
 def test_a_long_text_is_read_or_refused(what, tmp_path):
     """None of these takes a time that grows with the square of its length."""
     errors = TableErrors(DesignFileError, InvalidDesignError)
-    for parse, last in ((parse_toml, DesignFileError), (parse_json, DesignFileError), (parse_table, errors)):
+    for parse, last in (
+        (parse_toml, DesignFileError),
+        (parse_json, DesignFileError),
+        (parse_table, errors),
+    ):
         check(partial(parse, HOSTILE[what], "f", last), DesignFileError)
     for path in (tmp_path / "m.inp", tmp_path / "m.bdf"):
         for before in ("", "*NODE\n", "*ELEMENT, TYPE=C3D8\n", "GRID,"):
@@ -61,7 +67,12 @@ MUCH = {
     "sets that grow": ["*NSET, NSET=A, GENERATE\n1, 9, 2"]
     + [f"*NSET, NSET=B{n}\n" + f"B{n - 1}, " * 50 for n in range(30)],
     "blocks": [f"*NODE, NSET=S\n{n}, 0, 0, 0" for n in range(20_000)],
-    "large faces": ["*ELSET, ELSET=E, GENERATE", *["1, 1"] * 50_000, "*SURFACE, NAME=T", *["E, S1"] * 10_000],
+    "large faces": [
+        "*ELSET, ELSET=E, GENERATE",
+        *["1, 1"] * 50_000,
+        "*SURFACE, NAME=T",
+        *["E, S1"] * 10_000,
+    ],
     "faces": ["*SURFACE, NAME=T"] + ["E, S1"] * 20_000,
     "words": [f"*UNKNOWN{n}" for n in range(20_000)],
 }

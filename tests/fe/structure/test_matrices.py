@@ -27,10 +27,14 @@ def tables(free: list[int], forces: list[tuple[int, Point]], gauge: tuple[int, i
     """A load for each force, a gauge of 100 mm along x, and the displacements of all free nodes."""
     text = f'[[gauge]]\nname = "g"\nnodes = {list(gauge)}\ndirection = [2, 0, 0]\nlength = 100\n'
     for number, (node, force) in enumerate(forces):
-        text += f'[[load]]\nname = "l{number}"\ncontrol = "push"\nnode = {node}\nforce = {[*force]}\n'
+        text += (
+            f'[[load]]\nname = "l{number}"\ncontrol = "push"\nnode = {node}\nforce = {[*force]}\n'
+        )
     for node in free:
         for name, direction in zip("xyz", np.eye(3).tolist(), strict=True):
-            text += f'[[displacement]]\nname = "{name}{node}"\nnode = {node}\ndirection = {direction}\n'
+            text += (
+                f'[[displacement]]\nname = "{name}{node}"\nnode = {node}\ndirection = {direction}\n'
+            )
     return text
 
 
@@ -54,7 +58,9 @@ def test_shells_are_calculixs_own(tmp_path):
             largest = np.abs(wanted).max()
             assert np.abs(found - wanted).max() < 1e-6 * largest
             strain = (theirs[ends[1]] - theirs[ends[0]])[0] / 100.0
-            assert structure.gauge_output @ ours == pytest.approx(strain, abs=1e-6 * largest / 100.0)
+            assert structure.gauge_output @ ours == pytest.approx(
+                strain, abs=1e-6 * largest / 100.0
+            )
         squares, _ = lowest_eigenpairs(stiffness, structure.mass(), 6)
         wanted = decks.frequencies(other, tmp_path / "calculix")
         np.testing.assert_allclose(np.sqrt(squares) / (2.0 * np.pi), wanted, rtol=1e-6)
@@ -99,14 +105,18 @@ def test_a_chain_answers_as_by_hand(chain):
     # 2, 1.5 (with the pump) and 0.5 kg at 10 m/s^2
     weight = -1e-3 * (40 / 200 + 20 / 100 + 5 / 50)
     assert found["weight"].output == pytest.approx([weight], rel=1e-12)
-    assert structure.load("weight", masses={"pump": 1.0}) == pytest.approx([20.0, 20.0, 5.0], rel=1e-12)
+    assert structure.load("weight", masses={"pump": 1.0}) == pytest.approx(
+        [20.0, 20.0, 5.0], rel=1e-12
+    )
     assert found["push"].largest == pytest.approx(-found["push"].output[0], rel=1e-12)
     changed = structure.stiffness({"e": 3.0}, {"z1": 0.6}).toarray()
     wanted = 1e3 * (STIFFNESS + (1.5 * 0.4 - 1.0) * MIDDLE)  # N/m
     np.testing.assert_allclose(changed, wanted, rtol=1e-12, atol=1e-7)
     pumped = MASS + np.diag([0.0, 0.5e-3, 0.0])
     wanted = np.sqrt(np.linalg.eigvals(np.linalg.solve(pumped, STIFFNESS))) / (2.0 * np.pi)
-    np.testing.assert_allclose(natural_frequencies(structure, 2)[0], np.sort(wanted)[:2], rtol=1e-10)
+    np.testing.assert_allclose(
+        natural_frequencies(structure, 2)[0], np.sort(wanted)[:2], rtol=1e-10
+    )
 
 
 FORMATS = {  # in `inputs/chain` one of each two entries that mirror each other stands, on either side
@@ -150,13 +160,17 @@ def test_other_ways_to_say_the_same(chain, tmp_path):
         "node = 7\nmass": 'matrix = "pump.mtx"\nmass',
     })  # fmt: skip
     values = {"e": 1.9, "z1": 0.3}
-    ours, theirs = (structure.system_at(values).stiffness.toarray() for structure in (found, wanted))
+    ours, theirs = (
+        structure.system_at(values).stiffness.toarray() for structure in (found, wanted)
+    )
     np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(found.load("push"), wanted.load("push"), rtol=1e-12, atol=1e-15)
     for name in ("gauge_output", "displacement_output"):
         ours, theirs = (getattr(structure, name).toarray() for structure in (found, wanted))
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(found.mass().toarray(), wanted.mass().toarray(), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        found.mass().toarray(), wanted.mass().toarray(), rtol=1e-12, atol=1e-15
+    )
 
 
 def test_a_support_holds_what_the_matrices_leave_free(chain):
@@ -169,7 +183,11 @@ def test_a_support_holds_what_the_matrices_leave_free(chain):
     found = static_responses(chain(held))["push"]
     assert found.output == pytest.approx([-1e-3 * (1 / 100 + 1 / 50)], rel=1e-12)
     # a row of nothing, as a solid's turns in Nastran, is left out
-    held |= {name: np.pad(matrix, (0, 1)) for name, matrix in (FILES | held).items() if name.endswith("mtx")}
+    held |= {
+        name: np.pad(matrix, (0, 1))
+        for name, matrix in (FILES | held).items()
+        if name.endswith("mtx")
+    }
     wide = chain(held | {"rows.dof": "4 1\n7,1\n 9.1\n9.4\n"})
     assert static_responses(wide)["push"].output == pytest.approx(found.output, rel=1e-12)
 

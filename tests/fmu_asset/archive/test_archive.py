@@ -32,7 +32,9 @@ def in_utf_16(contents: dict[str, bytes]) -> dict[str, bytes]:
 @pytest.mark.parametrize("row", REFUSED, ids=lambda row: row["sentence"])
 def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
     path = edited(fmu, tmp_path / "changed.fmu", *row.get("change", ()))
-    contents = {n: c for n, c in members(path).items() if not n.startswith(row.get("without", "\0"))}
+    contents = {
+        n: c for n, c in members(path).items() if not n.startswith(row.get("without", "\0"))
+    }
     contents |= {row[key]: b"x" for key in row.keys() & {"add"}}
     with pytest.raises(getattr(errors, row["error"]), match=row["sentence"]):
         read_fmu(archive_of(path, in_utf_16(contents) if "utf_16" in row else contents))
@@ -41,7 +43,9 @@ def test_what_is_wrong_with_a_file_is_one_sentence(fmu, tmp_path, row) -> None:
 def test_a_display_unit_that_is_one_over_the_value_is_none(ours, tmp_path) -> None:
     inverse = ('<DisplayUnit name="microstrain"', '<DisplayUnit inverse="true" name="microstrain"')
     changed = edited(ours("fmi3"), tmp_path / "changed.fmu", inverse)
-    shown = [{u.name: u.displays for u in read_fmu(path).units}["1"] for path in (ours("fmi3"), changed)]
+    shown = [
+        {u.name: u.displays for u in read_fmu(path).units}["1"] for path in (ours("fmi3"), changed)
+    ]
     assert [("microstrain", 1e6, 0.0) in displays for displays in shown] == [True, False]
 
 
@@ -70,20 +74,26 @@ def test_what_is_no_fmu_or_dangerous_is_one_sentence(fmu, tmp_path) -> None:
         read_fmu(fmu, "model-exchange")
 
 
-def test_what_is_seen_when_it_is_loaded_is_one_sentence(foreign_fmu, fmu, tmp_path, scratch) -> None:
+def test_what_is_seen_when_it_is_loaded_is_one_sentence(
+    foreign_fmu, fmu, tmp_path, scratch
+) -> None:
     strange = edited(fmu, tmp_path / "strange.fmu", ('start="1.0"', 'start="abc"'))
     with pytest.raises(errors.FmuFileError, match=r"start value that is no number .*'abc'"):
         FmiAsset(strange, WING_BINDING).reset()
     contents = members(foreign_fmu("hostile2"))
     library = bytearray(contents["binaries/linux64/hostile2.so"])
     struct.pack_into("<H", library, 18, 183)  # ELF e_machine: AArch64
-    arm = archive_of(tmp_path / "arm.fmu", contents | {"binaries/linux64/hostile2.so": bytes(library)})
+    arm = archive_of(
+        tmp_path / "arm.fmu", contents | {"binaries/linux64/hostile2.so": bytes(library)}
+    )
     words = r"binary cannot be loaded on this machine .*another processor"
     with pytest.raises(errors.FmuCallError, match=words):
         FmiAsset(arm, HOSTILE).reset()
     needing = ("<CoSimulation ", '<CoSimulation needsExecutionTool="true" ')
     tool = edited(foreign_fmu("hostile2", "NO_INSTANCE"), tmp_path / "tool.fmu", needing)
-    with pytest.raises(errors.FmuCallError, match=r"could not be instantiated .*needs its authoring tool"):
+    with pytest.raises(
+        errors.FmuCallError, match=r"could not be instantiated .*needs its authoring tool"
+    ):
         FmiAsset(tool, HOSTILE).reset()
     assert not list(scratch.iterdir())
 
@@ -101,7 +111,9 @@ def test_odd_files_that_are_sound(fmu, tmp_path) -> None:
     assert (extract_fmu(description) / DESCRIPTION).is_file()
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr(DESCRIPTION, b"another")
-    with pytest.raises(errors.FmuFileError, match=r"'modelDescription\.xml' twice with different content"):
+    with pytest.raises(
+        errors.FmuFileError, match=r"'modelDescription\.xml' twice with different content"
+    ):
         read_fmu(path)
     with pytest.raises(errors.FmuFileError, match="has changed since it was checked"):
         extract_fmu(description)
@@ -114,21 +126,29 @@ def renamed(fmu: Path, target: Path, rename: Callable[[str], str]) -> Path:
 
 def test_names_that_begin_with_a_dot_are_told(foreign_fmu, tmp_path) -> None:
     dotted = renamed(foreign_fmu("room2"), tmp_path / "dotted.fmu", lambda name: f"./{name}")
-    with pytest.raises(errors.FmuFileError, match=r"but with '\./modelDescription\.xml': FMI has the names"):
+    with pytest.raises(
+        errors.FmuFileError, match=r"but with '\./modelDescription\.xml': FMI has the names"
+    ):
         read_fmu(dotted)
 
 
 def test_a_binary_whose_name_begins_with_a_dot_is_told(foreign_fmu, tmp_path) -> None:
     half = renamed(
-        foreign_fmu("room2"), tmp_path / "half.fmu", lambda name: name.replace("binaries", "./binaries")
+        foreign_fmu("room2"),
+        tmp_path / "half.fmu",
+        lambda name: name.replace("binaries", "./binaries"),
     )
-    with pytest.raises(errors.FmuUnsupportedError, match=r"one named '\./binaries/linux64/room2\.so'"):
+    with pytest.raises(
+        errors.FmuUnsupportedError, match=r"one named '\./binaries/linux64/room2\.so'"
+    ):
         read_fmu(half)
 
 
 def test_a_folder_that_was_packed_instead_of_its_content_is_told(foreign_fmu, tmp_path) -> None:
     nested = renamed(foreign_fmu("room2"), tmp_path / "nested.fmu", lambda name: f"room/{name}")
-    with pytest.raises(errors.FmuFileError, match=r"it has 'room/modelDescription\.xml'\. Pack the content"):
+    with pytest.raises(
+        errors.FmuFileError, match=r"it has 'room/modelDescription\.xml'\. Pack the content"
+    ):
         read_fmu(nested)
 
 
@@ -166,12 +186,16 @@ def test_a_description_with_one_odd_attribute(foreign_fmu, tmp_path_factory, dat
     contents = members(foreign_fmu(model))
     text = contents[DESCRIPTION].decode()
     place = data.draw(st.sampled_from(list(re.finditer(r'\s[A-Za-z]+="([^"]*)"', text))))
-    odd = st.sampled_from(["", "-1", "1e999", "nan", "x", "0", "99999999999999999999", "true", "1 2", "&lt;"])
+    odd = st.sampled_from(
+        ["", "-1", "1e999", "nan", "x", "0", "99999999999999999999", "true", "1 2", "&lt;"]
+    )
     if data.draw(st.booleans()):
         text = text[: place.start()] + text[place.end() :]
     else:
         text = text[: place.start(1)] + data.draw(odd) + text[place.end(1) :]
-    path = archive_of(tmp_path_factory.mktemp("odd") / "odd.fmu", contents | {DESCRIPTION: text.encode()})
+    path = archive_of(
+        tmp_path_factory.mktemp("odd") / "odd.fmu", contents | {DESCRIPTION: text.encode()}
+    )
     try:
         draft_binding(read_fmu(path))
     except errors.FmuError as error:
@@ -193,7 +217,8 @@ def texts(check: FmuCheck, name: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "model", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in MODELS]
+    "model",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in MODELS],
 )
 def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu, model) -> None:
     check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
@@ -250,7 +275,10 @@ def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:
 def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu) -> None:
     """Three inputs, for which the FMU has two start values."""
     sized = bound(
-        1.0, {"y": ("y", "1")}, control={"u": ("u", "1")}, header={"structural_parameters": {"n": 3}}
+        1.0,
+        {"y": ("y", "1")},
+        control={"u": ("u", "1")},
+        header={"structural_parameters": {"n": 3}},
     )
     check = check_fmu(foreign_fmu("resize3"), sized, cycles=2)
     assert "3 finite outputs" in texts(check, "first flight")

@@ -67,7 +67,10 @@ class Kind:
     def at(self, index: int) -> dict[str, dict[str, Any]]:
         """Return the inputs of one step, as `step` takes them."""
         return {
-            role: {name: values[index] if np.ndim(values) else values for name, values in histories.items()}
+            role: {
+                name: values[index] if np.ndim(values) else values
+                for name, values in histories.items()
+            }
             for role, histories in self.course.items()
         }
 
@@ -85,7 +88,9 @@ _FILES = *BINDINGS_FOLDER.glob("*.toml"), *binding_files().values()
 BINDINGS = {path.stem: load_binding(path) for path in _FILES}
 """By the name of the file."""
 BINDINGS["beam"] = structure_binding(parse_structure(tomllib.loads(BEAM)))
-HOSTILE, WING_BINDING, SPRING_BINDING = (BINDINGS[name] for name in ("hostile2", "uav_wing", "spring_mass"))
+HOSTILE, WING_BINDING, SPRING_BINDING = (
+    BINDINGS[name] for name in ("hostile2", "uav_wing", "spring_mass")
+)
 
 # ---------------------------------------------------------------------- structures
 
@@ -105,11 +110,15 @@ def statics(kind: Kind, ours: OurFmus) -> Shown:
 def motion(kind: Kind, ours: OurFmus) -> Shown:
     """The modal integrator: a release, loads that jump, health that changes on the way."""
     model, given = ours.model(kind.file), kind.parameters
-    damping = [given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))]
+    damping = [
+        given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))
+    ]
     begin = model.vector(dict(ChainMap(*kind.start.values())))
     now = ModalIntegrator(model.structure_at(begin), *damping)
     tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(begin)
-    state = now.state_after_release(tip, at_start, TIP_FORCE) if tip else now.state_at_rest(at_start)
+    state = (
+        now.state_after_release(tip, at_start, TIP_FORCE) if tip else now.state_at_rest(at_start)
+    )
     health, shown = dict.fromkeys(model.regions, 0.0) | kind.start.get("health", {}), []
     for row in kind.rows:
         vector = model.vector(row)
@@ -208,7 +217,9 @@ def bounces(restitution: float, gravity: float, until: float) -> tuple[float, fl
 def ball(kind: Kind, _: OurFmus) -> Shown:
     moments = kind.binding.interval * np.arange(1, STEPS + 1)
     found = [bounces(kind.parameters.get("restitution", 0.7), 9.81, moment) for moment in moments]
-    return [[1e3 * height, speed] for height, speed, _ in found], {"bounces": [item[2] for item in found]}
+    return [[1e3 * height, speed] for height, speed, _ in found], {
+        "bounces": [item[2] for item in found]
+    }
 
 
 def decay(kind: Kind, _: OurFmus) -> Shown:
@@ -229,7 +240,10 @@ def swing(kind: Kind, _: OurFmus) -> Shown:
 
 def follower(kind: Kind, _: OurFmus) -> Shown:
     """x' = u - x, x(0) = 0, u in straight lines; `seen` is u at the last call."""
-    step, line = kind.binding.interval, np.array([kind.start["control"]["u"], *kind.course["control"]["u"]])
+    step, line = (
+        kind.binding.interval,
+        np.array([kind.start["control"]["u"], *kind.course["control"]["u"]]),
+    )
     lost = 1.0 - math.exp(-step)
     shown = accumulate(
         pairwise(line), initial=0.0,
@@ -238,7 +252,9 @@ def follower(kind: Kind, _: OurFmus) -> Shown:
     values = np.array([*shown][1:])[:, np.newaxis]
     if kind.file == "follow1" or kind.binding.binding.interface == "model-exchange":
         return values, {}
-    return values, {"seen": line[:-1] + (1.0 - 1.0 / kind.binding.binding.decimation) * np.diff(line)}
+    return values, {
+        "seen": line[:-1] + (1.0 - 1.0 / kind.binding.binding.decimation) * np.diff(line)
+    }
 
 
 def integral(kind: Kind, _: OurFmus) -> Shown:
@@ -248,7 +264,9 @@ def integral(kind: Kind, _: OurFmus) -> Shown:
 def damage(kind: Kind, ours: OurFmus) -> Shown:
     """The behaviour that is packed, in this process."""
     values = parameters_of(ours(kind.file))
-    values |= {kind.binding.parameter[name].variable: value for name, value in kind.parameters.items()}
+    values |= {
+        kind.binding.parameter[name].variable: value for name, value in kind.parameters.items()
+    }
     behaviour = DamageGrowthBehaviour()
     behaviour.start(values, 0.0, [1.0])
     loads = enumerate(kind.course["control"]["load_factor"])
@@ -288,7 +306,9 @@ def kind_of(row: dict[str, Any]) -> Kind:
     """Return the kind of a row of the table."""
     record = BINDINGS[row.get("binding", row["file"])].model_dump(exclude_none=True, mode="json")
     further = {
-        key: row[key] for key in ("rtol", "largest", "atol", "state", "start", "parameters") if key in row
+        key: row[key]
+        for key in ("rtol", "largest", "atol", "state", "start", "parameters")
+        if key in row
     }
     return Kind(
         row["file"],

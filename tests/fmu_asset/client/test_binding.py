@@ -27,178 +27,305 @@ from tests.fmu_asset.making import MODELS, changed, tables
 from tests.refusals import refused
 
 HERE = Path(__file__).parent
-GOOD = (HERE / "good.toml").read_text("utf-8")
+GOOD_FILE = (HERE / "good.toml").read_text("utf-8")
 REFUSED = tables(__file__)["refused"]
 UNITS = tables(__file__, "unit_texts")
 
 
-def drafted(fmu: Any, **options: Any) -> Binding:
+def parse_draft(fmu: Any, **options: Any) -> Binding:
+    """Return the binding that is drafted for an FMU."""
     return parse_binding(tomllib.loads(draft_binding(fmu, **options)))
+
+
+def make_variable(
+    name: str, causality: str, description: str = "", unit: str | None = None
+) -> VariableInfo:
+    return VariableInfo(name, 0, causality=causality, description=description, unit=unit, start="0")
+
+
+def make_description(*variables: VariableInfo) -> FmuDescription:
+    return FmuDescription(Path("x.fmu"), model_name="x", variables=variables)
 
 
 # ---------------------------------------------------------------------- files
 
 
 @pytest.mark.parametrize("case", REFUSED, ids=lambda case: case["sentence"])
-def test_bad_files_are_one_sentence(tmp_path, case) -> None:
-    assert case["old"] in GOOD
+def test_a_bad_file_is_one_sentence(tmp_path, case):
+    assert case["old"] in GOOD_FILE
     path = tmp_path / "binding.toml"
-    path.write_text(GOOD.replace(case["old"], case["new"]), encoding="utf-8")
+    path.write_text(GOOD_FILE.replace(case["old"], case["new"]), encoding="utf-8")
+
     with refused(BindingError, case["sentence"]) as caught:
         load_binding(path)
+
     assert "binding.toml" in str(caught.value)
 
 
-def test_limits_come_from_the_caller_then_from_the_binding() -> None:
-    limited = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
-    assert worker_limits(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
-    assert worker_limits(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
-    for wrong in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
-            worker_limits(limited, None, None, wrong)
+LIMITED = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
 
 
-# ---------------------------------------------------------------------- units
+def test_limits_come_from_the_binding():
+    limits = worker_limits(LIMITED, None, None, None)
 
-SI = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-
-
-def si(**exponents: int) -> tuple[int, ...]:
-    return tuple(exponents.get(symbol, 0) for symbol in SI)
+    assert limits == WorkerLimits(step_time=3.0, memory=500.0)
 
 
-KELVIN = si(K=1)
-DEFINED = (
-    UnitInfo("1", si(), 1.0, 0.0, (("microstrain", 1e6, 0.0),)),
-    UnitInfo("K", KELVIN, 1.0, 0.0, (("degC", 1.0, -273.15),)),
-    UnitInfo("degF", KELVIN, 5 / 9, 459.67 * 5 / 9, ()),
-)
+def test_limits_of_the_caller_come_first():
+    limits = worker_limits(LIMITED, 1.0, 2.0, None)
+
+    assert limits == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
+
+
+@pytest.mark.parametrize("memory", [0.0, -1.0, float("nan"), float("inf")])
+def test_an_impossible_limit_is_refused(memory):
+    with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
+        worker_limits(LIMITED, None, None, memory)
+
+
+# ---------------------------------------------------------------------- meanings of units
+
+BASE_SYMBOLS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+def exponents_of(**exponents: int) -> tuple[int, ...]:
+    """Return the exponents of all base units, given those that are not zero."""
+    return tuple(exponents.get(symbol, 0) for symbol in BASE_SYMBOLS)
+
+
+KELVIN = exponents_of(K=1)
+NEWTON = exponents_of(kg=1, m=1, s=-2)
 
 
 @pytest.mark.parametrize("unit", UNITS["unit"], ids=lambda unit: unit["text"])
-def test_unit_texts_mean_what_is_defined(unit) -> None:
+def test_unit_texts_mean_what_is_defined(unit):
+    meaning = meaning_of(unit["text"])
+
     factor = pytest.approx(unit["factor"] / unit.get("divisor", 1.0), rel=1e-12)
-    assert meaning_of(unit["text"]) == Meaning(si(**unit["of"]), factor, unit.get("offset", 0.0))
+    assert meaning == Meaning(exponents_of(**unit["of"]), factor, unit.get("offset", 0.0))
 
 
-def test_units_that_pint_is_not_asked_for_mean_what_it_says():
-    for unit in units._COMMON_UNITS:
-        exponents, factor, offset = exact_meaning(unit)
-        assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset)), unit
+@pytest.mark.parametrize("unit", units._COMMON_UNITS)
+def test_units_that_pint_is_not_asked_for_mean_what_it_says(unit):
+    exponents, factor, offset = exact_meaning(unit)
+
+    assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset))
 
 
-def test_other_texts_mean_nothing() -> None:
-    for text in (*UNITS["nothing"], "(" * 3000 + "m" + ")" * 3000):
-        assert meaning_of(text) is None, text
+@pytest.mark.parametrize("text", [*UNITS["nothing"], "(" * 3000 + "m" + ")" * 3000], ids=repr)
+def test_other_texts_mean_nothing(text):
+    assert meaning_of(text) is None
 
 
-def test_dimensions_are_compared_and_contradictions_told() -> None:
-    pairs = ("kN", "lbf"), ("N", "m"), ("blorp", "m")
-    assert [same_dimension(*pair) for pair in pairs] == [True, False, None]
-    sound = UnitInfo("kN", si(kg=1, m=1, s=-2), 1e3, 0.0, ())
-    unusual, open_one = UnitInfo("blorp", si(m=3), 0.035, 0.0, ()), UnitInfo("K", None, 1, 0, ())
+@pytest.mark.parametrize(
+    ("first", "second", "is_same"),
+    [("kN", "lbf", True), ("N", "m", False), ("blorp", "m", None)],
+)
+def test_dimensions_are_compared_if_both_are_known(first, second, is_same):
+    assert same_dimension(first, second) is is_same
+
+
+SOUND_UNITS = {
+    "usual": UnitInfo("kN", NEWTON, 1e3, 0.0, ()),
+    "unknown": UnitInfo("blorp", exponents_of(m=3), 0.035, 0.0, ()),
+    "without exponents": UnitInfo("K", None, 1, 0, ()),
     # Radians come and go in FMUs, and nobody means anything by it.
-    turning = UnitInfo("rad/s", si(s=-1), 1.0, 0.0, ())
-    assert contradictions([sound, unusual, open_one, turning]) == []
-    lying = UnitInfo("kN", si(kg=1, m=1, s=-2), 1.0, 0.0, ())
-    told = contradictions([lying, UnitInfo("m", si(kg=1), 1.0, 0.0, ())])
-    assert ["usual are 1000" in text for text in told] == [True, False]
-    assert ["another dimension" in text for text in told] == [False, True]
+    "without its radians": UnitInfo("rad/s", exponents_of(s=-1), 1.0, 0.0, ()),
+}
 
 
-@pytest.mark.parametrize(("unit", "of_fmu", "value", "in_fmu"), UNITS["converted"])
-def test_units_convert_both_ways(unit, of_fmu, value, in_fmu) -> None:
-    scale = conversion(unit, variable("v", "input", unit=of_fmu or None), DEFINED, where="here")
-    assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
-    assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
+@pytest.mark.parametrize("name", SOUND_UNITS)
+def test_a_sound_unit_contradicts_nothing(name):
+    assert contradictions([SOUND_UNITS[name]]) == []
+
+
+def test_a_unit_with_an_unusual_factor_contradicts_its_name():
+    (sentence,) = contradictions([UnitInfo("kN", NEWTON, 1.0, 0.0, ())])
+
+    assert "usual are 1000" in sentence
+    assert "another dimension" not in sentence
+
+
+def test_a_unit_of_another_dimension_contradicts_its_name():
+    (sentence,) = contradictions([UnitInfo("m", exponents_of(kg=1), 1.0, 0.0, ())])
+
+    assert "another dimension" in sentence
+    assert "usual are 1000" not in sentence
+
+
+# ---------------------------------------------------------------------- conversions
+
+DEFINED_UNITS = (
+    UnitInfo("1", exponents_of(), 1.0, 0.0, (("microstrain", 1e6, 0.0),)),
+    UnitInfo("K", KELVIN, 1.0, 0.0, (("degC", 1.0, -273.15),)),
+    UnitInfo("degF", KELVIN, 5 / 9, 459.67 * 5 / 9, ()),
+)
+"""Units that an FMU defines."""
+
+
+def convert(unit: str, fmu_unit: str | None) -> Conversion:
+    """Return the conversion of a unit of a binding into one of an FMU."""
+    variable = make_variable("v", "input", unit=fmu_unit)
+    return conversion(unit, variable, DEFINED_UNITS, where="here")
+
+
+@pytest.mark.parametrize(("unit", "fmu_unit", "value", "fmu_value"), UNITS["converted"])
+def test_units_convert_both_ways(unit, fmu_unit, value, fmu_value):
+    scale = convert(unit, fmu_unit or None)
+
+    assert scale.to_fmu(value) == pytest.approx(fmu_value, rel=1e-12)
+    assert scale.from_fmu(fmu_value) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(("unit", "fmu_unit", "value", "fmu_value"), UNITS["converted"])
+def test_conversions_follow_one_another(unit, fmu_unit, value, fmu_value):
+    scale = convert(unit, fmu_unit or None)
     other = Conversion(2.0, 0.5)
-    assert scale.then(other).to_fmu(value) == pytest.approx(2.0 * in_fmu + 0.5, rel=1e-12)
-    assert other.then(scale).to_fmu(value) == pytest.approx(scale.to_fmu(2.0 * value + 0.5), rel=1e-12)
+
+    scaled_first = scale.then(other).to_fmu(value)
+    scaled_last = other.then(scale).to_fmu(value)
+
+    assert scaled_first == pytest.approx(2.0 * fmu_value + 0.5, rel=1e-12)
+    assert scaled_last == pytest.approx(scale.to_fmu(2.0 * value + 0.5), rel=1e-12)
 
 
-@pytest.mark.parametrize(("unit", "of_fmu"), UNITS["unfit"])
-def test_units_that_do_not_fit(unit, of_fmu) -> None:
-    with pytest.raises(BindingError, match=rf"here is in '{unit}', but the FMU has 'v' in '{of_fmu}'"):
-        conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
+@pytest.mark.parametrize(("unit", "fmu_unit"), UNITS["unfit"])
+def test_units_that_do_not_fit_are_refused(unit, fmu_unit):
+    sentence = rf"here is in '{unit}', but the FMU has 'v' in '{fmu_unit}'"
+
+    with pytest.raises(BindingError, match=sentence):
+        convert(unit, fmu_unit)
 
 
 # ---------------------------------------------------------------------- drafts
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_draft_flies(foreign_fmu, model, tmp_path) -> None:
-    path, file = foreign_fmu(model), tmp_path / "binding.toml"
+def test_a_draft_flies(foreign_fmu, model, tmp_path):
+    path = foreign_fmu(model)
+    file = tmp_path / "binding.toml"
     file.write_text(draft_binding(read_fmu(path)), encoding="utf-8")
+
     with FmiAsset(path, file) as asset:
         assert asset.step().values.size >= 1
 
 
-def test_the_wing_is_drafted_almost_as_it_is_bound(fmu) -> None:
-    wing = drafted(read_fmu(fmu))
-    assert (wing.control, [*wing.health.values()]) == (WING_BINDING.control, [*WING_BINDING.health.values()])
-    assert wing.observation["strain"] == WING_BINDING.observation["strain"]
-    assert wing.port["tip"].force.variables == ("tip_force",)
-    assert wing.port["tip"].quantities["displacement"].variables == ("tip_displacement",)
-    assert "frequency[6]" in wing.record.variables
-    assert wing.parameter["damping_alpha"].unit == "1/s"
-    for size in (0.0, -1.0, float("nan"), float("inf")):
-        for made in (draft_binding, default_experiment):
-            with pytest.raises(BindingError, match="must be a positive number of seconds"):
-                made(read_fmu(fmu), step_size=size)
+@pytest.fixture(scope="module")
+def wing_draft(fmu) -> Binding:
+    return parse_draft(read_fmu(fmu))
 
 
-def test_roles_units_and_step_size_come_from_the_description(foreign_fmu) -> None:
-    room, lag, fixed = (read_fmu(foreign_fmu(model)) for model in ("room2", "lag1", "fixed2"))
-    found, text = drafted(room), draft_binding(room)
-    assert found.step_size == 60.0
-    assert found.load["ambient_t"].unit == "K"
-    assert found.control["heater_u_1_p"].unit == "W"
+def test_inputs_and_strains_of_the_wing_are_drafted_as_they_are_bound(wing_draft):
+    assert wing_draft.control == WING_BINDING.control
+    assert [*wing_draft.health.values()] == [*WING_BINDING.health.values()]
+    assert wing_draft.observation["strain"] == WING_BINDING.observation["strain"]
+
+
+def test_a_port_of_the_wing_is_drafted(wing_draft):
+    tip = wing_draft.port["tip"]
+
+    assert tip.force.variables == ("tip_force",)
+    assert tip.quantities["displacement"].variables == ("tip_displacement",)
+
+
+def test_records_and_parameters_of_the_wing_are_drafted(wing_draft):
+    assert "frequency[6]" in wing_draft.record.variables
+    assert wing_draft.parameter["damping_alpha"].unit == "1/s"
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("make", [draft_binding, default_experiment])
+def test_an_impossible_step_size_is_refused(fmu, make, size):
+    with pytest.raises(BindingError, match="must be a positive number of seconds"):
+        make(read_fmu(fmu), step_size=size)
+
+
+@pytest.fixture(scope="module")
+def room(foreign_fmu) -> FmuDescription:
+    return read_fmu(foreign_fmu("room2"))
+
+
+def test_roles_units_and_step_size_come_from_the_description(room):
+    draft = parse_draft(room)
+
+    assert draft.step_size == 60.0
+    assert draft.load["ambient_t"].unit == "K"
+    assert draft.control["heater_u_1_p"].unit == "W"
+
+
+def test_a_draft_says_what_cannot_be_bound_and_what_a_range_is(room):
+    text = draft_binding(room)
+
     assert "# Not bindable (texts, clocks, binaries): title" in text
     assert "# 0 to 5000; start 0.0" in text
+
+
+def test_a_step_size_that_the_fmu_does_not_say_is_to_be_chosen(foreign_fmu):
+    lag = read_fmu(foreign_fmu("lag1"))
+
     assert "the FMU does not say one, choose it" in draft_binding(lag)
+    assert parse_draft(lag, step_size=0.3).step_size == 0.3
+
+
+def test_a_draft_says_that_a_step_size_is_fixed(foreign_fmu):
+    fixed = read_fmu(foreign_fmu("fixed2"))
+
     assert "takes this step size only" in draft_binding(fixed)
-    assert drafted(lag, step_size=0.3).step_size == 0.3
 
 
-def description(*variables: VariableInfo) -> FmuDescription:
-    return FmuDescription(Path("x.fmu"), model_name="x", variables=variables)
-
-
-def variable(name: str, causality: str, about: str = "", unit: str | None = None) -> VariableInfo:
-    return VariableInfo(name, 0, causality=causality, description=about, unit=unit, start="0")
+UNICODE = st.characters(codec="utf-8")
 
 
 @settings(max_examples=40)
 @given(
-    st.lists(st.text(st.characters(codec="utf-8"), min_size=1), min_size=1, max_size=6, unique=True),
-    st.text(st.characters(codec="utf-8")),
+    st.lists(st.text(UNICODE, min_size=1), min_size=1, max_size=6, unique=True),
+    st.text(UNICODE),
     st.sampled_from(["input", "output", "parameter", "local"]),
 )
-def test_any_name_survives_the_draft(names, about, causality) -> None:
+def test_any_name_survives_the_draft(names, text, causality):
     """Quotes, brackets, line ends and the like in names, descriptions and units."""
-    there = [variable("y", "output"), *(variable(name, causality, about) for name in names if name != "y")]
-    found = drafted(description(*there))
-    names_of = set(Exchange(description(*there), found).binding.observation_variables)
-    bound = names_of | {*found.record.variables}
-    for role in ("control", "health", "load", "parameter"):
-        bound |= {item.variable for item in getattr(found, role).values()}
-    if causality != "local":
-        assert bound == {item.name for item in there}
+    variables = [make_variable("y", "output")]
+    variables += [make_variable(name, causality, text) for name in names if name != "y"]
+    description = make_description(*variables)
+
+    draft = parse_draft(description)
+
+    bound = {*Exchange(description, draft).binding.observation_variables}
+    bound |= {*draft.record.variables}
+    for role in (draft.control, draft.health, draft.load, draft.parameter):
+        bound |= {end.variable for end in role.values()}
+    assert causality == "local" or bound == {variable.name for variable in variables}
 
 
 @given(st.integers(0, 20), st.integers(1, 20), st.sampled_from(["s[{}]", "s{}", "a.b_{}.c", "{}"]))
-def test_numbered_outputs_are_one_observation(first, count, form) -> None:
+def test_numbered_outputs_are_one_observation(first, count, form):
     names = [form.format(number) for number in range(first, first + count)]
-    found = drafted(description(*(variable(name, "output", unit="m") for name in names)))
-    assert found.observation_variables == tuple(names)
-    assert len(found.observation) == 1
+    outputs = [make_variable(name, "output", unit="m") for name in names]
+
+    draft = parse_draft(make_description(*outputs))
+
+    assert draft.observation_variables == tuple(names)
+    assert len(draft.observation) == 1
 
 
-def test_other_units_and_shapes_are_another_observation_and_none_is_none() -> None:
-    metres, kelvins = variable("s1", "output", unit="m"), variable("s2", "output", unit="K")
-    array = dataclasses.replace(variable("s1", "output"), shape=(3,))
-    padded = variable("s01", "output"), variable("s2", "output")
-    for first, second in ((metres, kelvins), (array, variable("s2", "output")), padded):
-        assert len(drafted(description(first, second)).observation) == 2
+ARRAY = dataclasses.replace(make_variable("s1", "output"), shape=(3,))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (make_variable("s1", "output", unit="m"), make_variable("s2", "output", unit="K")),
+        (ARRAY, make_variable("s2", "output")),
+        (make_variable("s01", "output"), make_variable("s2", "output")),
+    ],
+    ids=["units", "shapes", "numbers of digits"],
+)
+def test_outputs_that_differ_are_two_observations(first, second):
+    assert len(parse_draft(make_description(first, second)).observation) == 2
+
+
+def test_an_fmu_without_outputs_cannot_be_drafted():
+    without_output = make_description(make_variable("u", "input"))
+
     with pytest.raises(BindingError, match="no number that could be observed"):
-        draft_binding(description(variable("u", "input")))
+        draft_binding(without_output)

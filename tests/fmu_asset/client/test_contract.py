@@ -31,7 +31,9 @@ def open_asset(ours: OurFmus, foreign_fmu: Any, scratch: Path) -> Iterator[Open]
             return CoupledAsset(of_ours(ours), kind.binding, **given)
         if kind.file.startswith("oscillator"):
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
-            return CoupledAsset(coupled("oscillator", foreign_fmu), kind.binding, **algorithm, **given)
+            return CoupledAsset(
+                coupled("oscillator", foreign_fmu), kind.binding, **algorithm, **given
+            )
         file = ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file)
         return FmiAsset(file, kind.binding, **given)
 
@@ -69,7 +71,9 @@ IN_A_WORKER = (
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset, ours, name) -> None:
+def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(
+    open_asset, ours, name
+) -> None:
     kind, ways = KINDS[name], (False, True) if name in IN_A_WORKER else (False,)
     with open_asset(kind, isolated=False) as one:
         one.reset(**kind.start)
@@ -87,7 +91,9 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
             assert saved.model_copy(update={"body": b""}) == now.model_copy(update={"body": b""})
             assert kind.state == "serialised" or saved.body == now.body
             assert bits(whole.step()) == following
-    moments = [kind.binding.binding.start_time + k * kind.binding.interval for k in range(1, STEPS + 1)]
+    moments = [
+        kind.binding.binding.start_time + k * kind.binding.interval for k in range(1, STEPS + 1)
+    ]
     assert history.time.tolist() == moments  # never accumulated
     if kind.oracle is None:
         return
@@ -127,9 +133,14 @@ def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, name
         for again in (asset.reset, asset.reset, asset.renew):
             again(**kind.start)
             assert flown(asset, kind, half) == begin
-        assert asset.reset_trial.works is not False or kind.file == "decay1"  # FMI 1 has none for it
+        assert (
+            asset.reset_trial.works is not False or kind.file == "decay1"
+        )  # FMI 1 has none for it
         asset.close()
-        for refused, words in ((asset.step, "closed; reset"), (asset.save_state, "no state to save")):
+        for refused, words in (
+            (asset.step, "closed; reset"),
+            (asset.save_state, "no state to save"),
+        ):
             with pytest.raises(FmuStateError, match=words):
                 refused()
         asset.reset()
@@ -162,7 +173,9 @@ def test_a_state_of_something_else_is_refused(open_asset, name) -> None:
         with pytest.raises(FmuStateError, match="another FMU"):
             asset.restore_state(foreign_state)
         for wrong in (b"", b"x" * 40, b"x" + saved[1:], saved[:30]):
-            with pytest.raises(FmuStateError, match=r"not a state of .*, or it is damaged|is damaged"):
+            with pytest.raises(
+                FmuStateError, match=r"not a state of .*, or it is damaged|is damaged"
+            ):
                 asset.restore_state(wrong)
         after = bits(asset.step(**kind.at(1)))  # it is where it was
         with pytest.raises(FmuStateError):

@@ -40,7 +40,9 @@ def test_an_end_within_the_last_step_is_told_as_the_end_of_that_step(foreign_fmu
     assert experiment.binding.binding.stop_time == pytest.approx(1.2)
 
 
-def test_steps_that_only_rounding_leads_beyond_the_end_leave_it_as_it_was_asked_for(foreign_fmu) -> None:
+def test_steps_that_only_rounding_leads_beyond_the_end_leave_it_as_it_was_asked_for(
+    foreign_fmu,
+) -> None:
     experiment = default_experiment(read_fmu(foreign_fmu("siren2")), stop_time=0.3, step_size=0.1)
     assert experiment.binding.binding.stop_time == 0.3
 
@@ -111,7 +113,9 @@ def test_a_value_that_an_enumeration_does_not_define_is_refused(foreign_fmu, val
 
 
 def test_a_word_that_is_no_item_names_the_items(foreign_fmu) -> None:
-    with pytest.raises(errors.FmuInputError, match="loudness must be one of quiet = 1, loud = 3, but is 'x'"):
+    with pytest.raises(
+        errors.FmuInputError, match="loudness must be one of quiet = 1, loud = 3, but is 'x'"
+    ):
         flown(foreign_fmu("siren2"), values={"loudness": "x"})
 
 
@@ -130,7 +134,9 @@ def test_a_text_stays_after_a_reset_and_in_a_state(foreign_fmu) -> None:
         "observation": {"y": {"variables": "y", "unit": "1"}},
         "parameter": {"label": {"variable": "label", "unit": "1", "value": "horn"}},
     }
-    with FmiAsset(foreign_fmu("siren2"), parse_binding(content), parameters={"label": "siren"}) as asset:
+    with FmiAsset(
+        foreign_fmu("siren2"), parse_binding(content), parameters={"label": "siren"}
+    ) as asset:
         asset.step()
         saved = asset.save_state()
         asset.reset({})

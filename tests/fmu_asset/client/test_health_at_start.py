@@ -15,7 +15,10 @@ from tests.fmu_asset.making import bound, changed, system
 def binding() -> Binding:
     """A siren whose broken share is its health."""
     return bound(
-        1.0, {"all": (["y", "steps", "began"], "1")}, control={"u": ("u", "1")}, health={"z": ("broken", "1")}
+        1.0,
+        {"all": (["y", "steps", "began"], "1")},
+        control={"u": ("u", "1")},
+        health={"z": ("broken", "1")},
     )
 
 

@@ -65,11 +65,14 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
                 one.step({"push": 0.3}, load={"misbehaviour": 0})
             with pytest.raises(getattr(errors, kind), match=sentence):
                 asset.simulate(
-                    {"push": push}, load={"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)}
+                    {"push": push},
+                    load={"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)},
                 )
             for value in push[:bad]:
                 other.step({"push": value})
-            assert asset.step_index == bad + 1 + (behaviour == NOT_A_NUMBER)  # after which the step was made
+            assert asset.step_index == bad + 1 + (
+                behaviour == NOT_A_NUMBER
+            )  # after which the step was made
             if behaviour == DISCARD:  # it is where it was before
                 assert asset.save_state() == other.save_state()
                 assert asset.step().values.tobytes() == other.step().values.tobytes()
@@ -98,10 +101,14 @@ def test_histories_that_are_refused(foreign_fmu, spring_mass) -> None:
         assert asset.step_index == 0
         assert asset.simulate(steps=1).extra["steps"].tolist() == [1.0]
         for again in (asset.reset, asset.renew):
-            with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'loads' came"):
+            with pytest.raises(
+                TypeError, match="Inputs are control, health, load, port, and 'loads' came"
+            ):
                 again(loads={})
     with FmiAsset(foreign_fmu("array3"), BINDINGS["array3_whole"], isolated=False) as asset:
-        with pytest.raises(errors.FmuInputError, match=r"load\.u must be 3 values, .* the shape \(12, 2\)"):
+        with pytest.raises(
+            errors.FmuInputError, match=r"load\.u must be 3 values, .* the shape \(12, 2\)"
+        ):
             asset.simulate(load={"u": np.ones((12, 2))})
         held = asset.simulate(load={"u": [1.0, -2.0, 3.0]}, steps=2)  # one array for all steps
         np.testing.assert_allclose(held.values, [[6e-3, 12e-3], [12e-3, 24e-3]], rtol=1e-12)
@@ -141,7 +148,9 @@ CLOCKS = [("INSTANCE_CLOCK", True), ("INSTANCE_CLOCK", False), ("process_clock",
 
 @pytest.mark.parametrize(("clock", "isolated"), CLOCKS, ids=["instance", "in process", "process"])
 @pytest.mark.parametrize(("in_one_go", "lengths"), FLIGHTS, ids=str)
-def test_a_hidden_clock_shows_at_no_start(foreign_fmu, clock, isolated, in_one_go, lengths, caplog) -> None:
+def test_a_hidden_clock_shows_at_no_start(
+    foreign_fmu, clock, isolated, in_one_go, lengths, caplog
+) -> None:
     """The clock adds 1 from its sixth step on: where the first reset is looked at, nothing is to be seen."""
     case = f"CASE={sum(lengths)}{len(lengths)}{isolated}{in_one_go}"  # what is wrong is said once for a file
     fmu = foreign_fmu("hostile2", f"CLOCK={clock}", "STAYS_LOADED", case)
@@ -180,7 +189,9 @@ def test_a_check_names_a_reset_that_does_nothing(foreign_fmu) -> None:
     assert check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET")).passed
 
 
-def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(foreign_fmu, isolated) -> None:
+def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
+    foreign_fmu, isolated
+) -> None:
     for header, expected in (({}, 1e-4), ({"tolerance": 1e-7}, 1e-7)):
         chosen = bound(0.1, {"tolerance": ("tolerance", "1")}, header=header)
         with FmiAsset(foreign_fmu("spring2"), chosen, isolated=isolated) as asset:
@@ -190,7 +201,9 @@ def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(fore
 # ---------------------------------------------------------------------- many instances of one FMU
 
 
-def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, scratch, isolated) -> None:
+def test_copies_share_the_extracted_fmu_until_the_last_is_closed(
+    foreign_fmu, scratch, isolated
+) -> None:
     with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=isolated) as asset:
         asset.step({"u": 2.0})
         forks = [asset.fork() for _ in range(3)]
@@ -209,7 +222,10 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, sc
 
 
 def test_siblings_have_parameters_of_their_own(foreign_fmu) -> None:
-    with FmiAsset(foreign_fmu("lag1"), BINDINGS["lag1"]) as first, first.sibling({"gain": 3.0}) as other:
+    with (
+        FmiAsset(foreign_fmu("lag1"), BINDINGS["lag1"]) as first,
+        first.sibling({"gain": 3.0}) as other,
+    ):
         seen = [asset.step({"speed": 1.0}).values for asset in (first, other)]
     np.testing.assert_allclose(seen, (1.0 - np.exp(-0.3)) * np.array([[2.0], [3.0]]), rtol=1e-12)
 
@@ -224,7 +240,9 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, iso
     with FmiAsset(foreign_fmu("lag1"), LAG, isolated=isolated, parameters={"gain": 3.0}) as asset:
         held = asset.step({"speed": 2.0}).values
         saved = asset.save_state()
-        with pytest.raises(errors.FmuInputError, match=r"parameter\.gain = 101\.0 lies outside .* 0 to 100"):
+        with pytest.raises(
+            errors.FmuInputError, match=r"parameter\.gain = 101\.0 lies outside .* 0 to 100"
+        ):
             asset.reset({"gain": 101.0})
         with pytest.raises(errors.FmuCallError, match=r"(?s)fmiDoStep returned Error.*saturates"):
             asset.step({"speed": 1500.0})
@@ -234,7 +252,9 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, iso
         asset.step({"u": 3.0})
         saved = asset.save_state()
         following = asset.step({"u": -1.0}).values
-        with pytest.raises(errors.FmuCallError, match=r"It was step 5\d of the 100 between two observations"):
+        with pytest.raises(
+            errors.FmuCallError, match=r"It was step 5\d of the 100 between two observations"
+        ):
             asset.step({"u": 2e6})
         asset.restore_state(saved)
         np.testing.assert_array_equal(asset.step({"u": -1.0}).values, following)
@@ -242,15 +262,22 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, iso
 
 def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu, isolated) -> None:
     with FmiAsset(foreign_fmu("array3"), ARRAY, isolated=isolated) as asset:
-        for offset, words in ((99, "asked to end the simulation in the step"), (98, "returned early")):
+        for offset, words in (
+            (99, "asked to end the simulation in the step"),
+            (98, "returned early"),
+        ):
             asset.reset()
             with pytest.raises(errors.FmuCallError, match=words):
                 asset.step(load={"offset": offset})
 
 
-def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(foreign_fmu, tmp_path) -> None:
+def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(
+    foreign_fmu, tmp_path
+) -> None:
     contents = {
-        name.replace("ball2", "ball-2"): text.replace(b'modelIdentifier="ball2"', b'modelIdentifier="ball-2"')
+        name.replace("ball2", "ball-2"): text.replace(
+            b'modelIdentifier="ball2"', b'modelIdentifier="ball-2"'
+        )
         for name, text in members(foreign_fmu("ball2", "NOMINAL=0.0")).items()
     }
     with FmiAsset(archive_of(tmp_path / "ball-2.fmu", contents), BALL, isolated=False) as asset:
@@ -271,7 +298,9 @@ ENDS = {  # what is observed, the step, where it ends, and what is seen there
 
 
 @pytest.mark.parametrize("model", ENDS)
-def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, isolated, model) -> None:
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(
+    foreign_fmu, isolated, model
+) -> None:
     """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
     name, unit, size, end, value = ENDS[model]
     sent = {"control": {"u": ("u", "m/s")}} if model == "hostile2" else {}
@@ -280,7 +309,9 @@ def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, 
         history = asset.simulate(steps=50)
         assert f"ended at t = {end:g} s" in history.ended
         whole = int(end / size)
-        np.testing.assert_allclose(history.time, [*(size * np.arange(1, whole + 1)), end], rtol=1e-6)
+        np.testing.assert_allclose(
+            history.time, [*(size * np.arange(1, whole + 1)), end], rtol=1e-6
+        )
         assert history.values[-1, 0] == pytest.approx(value, abs=1e-5)
         with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
             asset.step()
@@ -289,7 +320,9 @@ def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, 
         np.testing.assert_allclose(asset.simulate(steps=50).time, history.time[1:], rtol=1e-12)
         asset.reset()
         assert [asset.step().values[0] for _ in range(whole)] == history.values[:whole, 0].tolist()
-        with pytest.raises(errors.FmuEndedError, match="asked to end the simulation in the step") as caught:
+        with pytest.raises(
+            errors.FmuEndedError, match="asked to end the simulation in the step"
+        ) as caught:
             asset.step()
         assert caught.value.time == pytest.approx(end, rel=1e-6)
         assert asset.observe().values[0] == history.values[-1, 0]
@@ -305,18 +338,24 @@ def test_ports_are_sent_and_read(foreign_fmu) -> None:
         assert shown.extra["p.displacement"] == pytest.approx(1e3 * expected)
         assert asset.recorded_units == {"p.displacement": "mm", "p.velocity": "m/s"}
     # Elements of an array go in, a whole array comes out.
-    fmu = foreign_fmu.changed("array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"'))
+    fmu = foreign_fmu.changed(
+        "array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"')
+    )
     with FmiAsset(fmu, tip) as asset:
         shown = asset.step(port={"p.force": [0.002, -0.001]})
         found = [shown.extra["p.displacement[1]"], shown.extra["p.displacement[2]"]]
         np.testing.assert_allclose(found, [-1e-3, 2e-3], rtol=1e-12)
-        with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
+        with pytest.raises(
+            errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"
+        ):
             asset.step(port={"p.force": 1.0})
 
 
 def test_a_model_without_states_is_solved_as_well(foreign_fmu) -> None:
     both = foreign_fmu.changed(
-        "fixed2", "both", ("<CoSimulation", '<ModelExchange modelIdentifier="fixed2"/><CoSimulation')
+        "fixed2",
+        "both",
+        ("<CoSimulation", '<ModelExchange modelIdentifier="fixed2"/><CoSimulation'),
     )
     header = {"interface": "model-exchange"}
     solved = bound(0.01, {"y": ("y", "1")}, control={"u": ("u", "1")}, header=header)
@@ -327,7 +366,9 @@ def test_a_model_without_states_is_solved_as_well(foreign_fmu) -> None:
 def test_events_that_pile_up_are_one_sentence(foreign_fmu) -> None:
     with FmiAsset(foreign_fmu("ball2"), bound(1.0, {"h": ("h", "mm")})) as asset:
         asset.step(), asset.step()
-        with pytest.raises(errors.FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"):
+        with pytest.raises(
+            errors.FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"
+        ):
             asset.step()
         with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
             asset.step()

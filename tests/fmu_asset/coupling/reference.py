@@ -1,6 +1,7 @@
 """Systems of FMUs by name, and the recursion of linear ones, in matrices: what coupling must do."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
 SYSTEMS = tables(__file__, "systems")
-
-
-PARTS = {"damage": "damage_growth", "wing": "python", "gauges": "strain_gauges", "spring": "spring_mass"}
-"""Components of systems of ours."""
+PARTS = {
+    "damage": "damage_growth",
+    "wing": "python",
+    "gauges": "strain_gauges",
+    "spring": "spring_mass",
+}
+"""Our FMUs by the names of components."""
 
 
 def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
@@ -25,7 +29,8 @@ def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
     settings = {}
     for key, value in values.items():
         for place, x in np.ndenumerate(np.array(value, dtype=float)):
-            settings[key + "".join(str(index + 1) for index in place)] = ComponentSetting(float(x))
+            indices = "".join(str(index + 1) for index in place)
+            settings[key + indices] = ComponentSetting(float(x))
     return Component(name, fmu, settings, substeps)
 
 
@@ -33,68 +38,144 @@ OUTPUTS = '<Outputs><Unknown index="3"{}/><Unknown index="4"{}/>'
 
 
 def coupled(name: str, foreign_fmu: Any, substeps: int = 1) -> SystemStructure:
-    """Return a system of `linear2.c`, which is told on which of its inputs, 1 and 2, each output depends."""
+    """Return a system of `linear2.c`.
+
+    The description of a component may say on which of its inputs, 1 and 2, each output depends.
+    """
     components = []
-    for part, told in SYSTEMS[name]["parts"].items():
-        inputs, fmu = told.get("inputs"), foreign_fmu("linear2")
+    for component, keys in SYSTEMS[name]["parts"].items():
+        inputs = keys.get("inputs")
+        fmu = foreign_fmu("linear2")
         if inputs:
-            outputs = OUTPUTS.format(*(f' dependencies="{numbers}"' for numbers in inputs))
-            fmu = foreign_fmu.changed(
-                "linear2", "_".join(("linear", *inputs)), (OUTPUTS.format("", ""), outputs)
-            )
-        values = {key: value for key, value in told.items() if key != "inputs"}
-        components.append(linear(part, fmu, substeps, **values))
+            dependencies = [f' dependencies="{numbers}"' for numbers in inputs]
+            change = (OUTPUTS.format("", ""), OUTPUTS.format(*dependencies))
+            fmu = foreign_fmu.changed("linear2", "_".join(("linear", *inputs)), change)
+        values = {key: value for key, value in keys.items() if key != "inputs"}
+        components.append(linear(component, fmu, substeps, **values))
     return system(components, SYSTEMS[name]["links"])
 
 
-def of_ours(ours: OurFmus, told: Mapping[str, Any] = SYSTEMS["three"], name: str = "test") -> SystemStructure:
+def of_ours(
+    ours: OurFmus, content: Mapping[str, Any] = SYSTEMS["three"], name: str = "test"
+) -> SystemStructure:
     """Return a system of our FMUs: what is set in them, and how they are joined."""
-    components = [
-        Component(part, ours(PARTS[part]), {key: ComponentSetting(*value) for key, value in given.items()})
-        for part, given in told["given"].items()
-    ]
-    return system(components, told["links"], name)
+    components = []
+    for component, values in content["given"].items():
+        settings = {key: ComponentSetting(*value) for key, value in values.items()}
+        components.append(Component(component, ours(PARTS[component]), settings))
+    return system(components, content["links"], name)
+
+
+# ---------------------------------------------------------------------- the recursion
+
+
+@dataclass(frozen=True)
+class LinearComponent:
+    """x' = A x + B u, y = C x + D u, with two states, inputs and outputs.
+
+    Attributes
+    ----------
+    step : (2, 4) array
+        The state after a step, by the state before it and the inputs, which are held.
+    output, feedthrough : (2, 2) array
+        C and D.
+    initial : (2,) array
+        The state at the start.
+    """
+
+    step: Floats
+    output: Floats
+    feedthrough: Floats
+    initial: Floats
+
+    def outputs(self, state: Floats, inputs: Floats) -> Floats:
+        return np.asarray(self.output @ state + self.feedthrough @ inputs)
+
+
+def linear_component(keys: Mapping[str, Any], step_size: float) -> LinearComponent:
+    """Return a component from its table; what is not there is zero."""
+    zero = np.zeros((2, 2))
+    a = np.array(keys.get("a", zero))
+    b = np.array(keys.get("b", zero))
+    generator = np.block([[a, b], [np.zeros((2, 4))]])
+    return LinearComponent(
+        step=expm(step_size * generator)[:2],
+        output=np.array(keys.get("c", zero)),
+        feedthrough=np.array(keys.get("d", zero)),
+        initial=np.array(keys.get("initial", np.zeros(2))),
+    )
 
 
 def recursion(
-    name: str, order: Sequence[str], step: float, pushes: Sequence[float], *,
-    jacobi: bool = False, delayed: Sequence[str] = (), sweeps: int = 1,
-) -> dict[str, Floats]:  # fmt: skip
-    """Return the outputs of each part at the start and after each step.
+    name: str,
+    order: Sequence[str],
+    step: float,
+    pushes: Sequence[float],
+    *,
+    jacobi: bool = False,
+    delayed: Sequence[str] = (),
+    sweeps: int = 1,
+) -> dict[str, Floats]:
+    """Return the outputs of each component at the start and after each step.
 
-    A sweep takes the parts in their order, with what the others show by now; by Jacobi, before the sweep.
+    Parameters
+    ----------
+    name : str
+        The system.
+    order : sequence of str
+        The components in the order in which they are stepped.
+    step : float
+        The length of a step.
+    pushes : sequence of float
+        The input of the system in each step.
+    jacobi : bool
+        Whether a component sees the outputs before the sweep; else the newest ones.
+    delayed : sequence of str
+        Inputs that see the outputs before the step.
+    sweeps : int
+        How often all components make the step.
     """
-    parts, links = SYSTEMS[name]["parts"], SYSTEMS[name]["links"]
-    zero = {**dict.fromkeys("abcd", np.zeros((2, 2))), "initial": np.zeros(2)}
-    its = {part: {key: np.array(told.get(key, zero[key])) for key in zero} for part, told in parts.items()}
-    moves = {
-        part: expm(step * np.block([[m["a"], m["b"]], [np.zeros((2, 4))]]))[:2] for part, m in its.items()
+    tables_of_components = SYSTEMS[name]["parts"]
+    components = {
+        component: linear_component(keys, step) for component, keys in tables_of_components.items()
     }
-    states = {part: m["initial"] for part, m in its.items()}
+    states = {component: each.initial for component, each in components.items()}
 
-    def taken(part: str, push: float, now: Mapping[str, Floats], before: Mapping[str, Floats]) -> Floats:
-        """Return the inputs of a part; what nobody shows yet is zero."""
-        u = np.zeros(2)
-        for source, target in links:
-            known, of = before if target in delayed else now, source.partition(".")[0]
-            value = push if of == "push" else known[of][int(source[-1]) - 1] if of in known else 0.0
-            u[int(target[-1]) - 1] += value * (target[:-3] == part)
-        return u
+    def inputs_of(
+        component: str,
+        push: float,
+        outputs: Mapping[str, Floats],
+        previous_outputs: Mapping[str, Floats],
+    ) -> Floats:
+        """Return the inputs of a component; what nobody shows yet is zero."""
+        inputs = np.zeros(2)
+        for source, target in SYSTEMS[name]["links"]:
+            if target[:-3] != component:
+                continue
+            source_component, _, _ = source.partition(".")
+            known = previous_outputs if target in delayed else outputs
+            number = int(target[-1]) - 1
+            if source_component == "push":
+                inputs[number] += push
+            elif source_component in known:
+                inputs[number] += known[source_component][int(source[-1]) - 1]
+        return inputs
 
-    def shown(part: str, u: Floats) -> Floats:
-        return np.array(its[part]["c"] @ states[part] + its[part]["d"] @ u)
-
-    now: dict[str, Floats] = {}
-    for part in order:
-        now[part] = shown(part, taken(part, 0.0, now, now))
-    history = [dict(now)]
+    outputs: dict[str, Floats] = {}
+    for component in order:
+        inputs = inputs_of(component, 0.0, outputs, outputs)
+        outputs[component] = components[component].outputs(states[component], inputs)
+    history = [dict(outputs)]
     for push in pushes:
-        before, begin = dict(now), dict(states)
+        previous_outputs = dict(outputs)
+        previous_states = dict(states)
         for _ in range(sweeps):
-            last = dict(now)
-            for part in order:
-                u = taken(part, push, last if jacobi else now, before)
-                states[part] = moves[part] @ [*begin[part], *u]
-                now[part] = shown(part, u)
-        history.append(dict(now))
-    return {part: np.array([row[part] for row in history]) for part in order}
+            before_sweep = dict(outputs)
+            for component in order:
+                seen_outputs = before_sweep if jacobi else outputs
+                inputs = inputs_of(component, push, seen_outputs, previous_outputs)
+                state = np.concatenate((previous_states[component], inputs))
+                states[component] = components[component].step @ state
+                outputs[component] = components[component].outputs(states[component], inputs)
+        history.append(dict(outputs))
+    return {component: np.array([row[component] for row in history]) for component in order}

@@ -1,20 +1,15 @@
-"""Systems of FMUs: order, loops and wiring by enumeration; solved and flown as their recursion says."""
+"""Systems of FMUs: solved and flown as their recursion says, refusals, and wiring."""
 
-from dataclasses import replace
-from itertools import pairwise, permutations
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.linalg import expm
-from scipy.sparse.csgraph import connected_components, shortest_path
 
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.schedule import algebraic_loops, schedule, strong_components
 from fmu_asset.coupling.structure import (
     Component,
     ComponentSetting,
@@ -22,102 +17,195 @@ from fmu_asset.coupling.structure import (
     Connector,
     Endpoint,
     SystemStructure,
+    expand_connection,
 )
-from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
 from tests.fmu_asset.client.kinds import BINDINGS
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.making import bound, changed, system, tables, watch
 from tests.fmu_asset.ours import OurFmus
-from tests.refusals import refused as in_one_sentence
+from tests.refusals import refused
 
 JACOBI = {"algorithm": "jacobi"}
+PUSHES = [0.7, -1.0, 0.0, 2.0, 0.5]
+
+# ---------------------------------------------------------------------- the recursion
 
 
 @pytest.mark.parametrize(("name", "order", "delayed", "options"), SYSTEMS["flights"])
-def test_a_system_does_what_its_recursion_says(foreign_fmu, name, order, delayed, options) -> None:
-    """In the order that follows from dependencies; settled, each has the others' values of the step's end.
+def test_a_system_does_what_its_recursion_says(foreign_fmu, name, order, delayed, options):
+    """In the order that follows from dependencies.
 
-    With inputs held, an exact component comes to the same place in one step and in four.
+    If a loop has settled, each component has the values of the others at the end of the step. With
+    inputs held, an exact component comes to the same place in one step and in four.
     """
-    given, parts, pushes = dict(options), order.split(), [0.7, -1.0, 0.0, 2.0, 0.5]
-    structure = coupled(name, foreign_fmu, given.pop("substeps", 1)).delayed(delayed)
-    inputs = ["push"] if any(connector.kind == "input" for connector in structure.connectors) else []
-    ends = [f"{part}.y{number}" for part in parts for number in (1, 2)]
-    binding = watch(*ends, inputs=inputs, step_size=0.1)
-    with CoupledAsset(structure, binding, isolated=False, **given) as asset:
-        assert [*asset.schedule.order] == parts
-        begin = asset.observe().values
-        steps = [asset.step(dict.fromkeys(inputs, push)).values for push in pushes]
-    wanted = recursion(
-        name, parts, 0.1, pushes,
-        jacobi="algorithm" in options, delayed=delayed, sweeps=options.get("iterations", 1),
-    )  # fmt: skip
-    np.testing.assert_allclose(
-        [begin, *steps], np.hstack([wanted[part] for part in parts]), rtol=1e-9, atol=1e-12
+    asset_options = dict(options)
+    substeps = asset_options.pop("substeps", 1)
+    components = order.split()
+    structure = coupled(name, foreign_fmu, substeps).delayed(delayed)
+    has_input = any(connector.kind == "input" for connector in structure.connectors)
+    inputs = ["push"] if has_input else []
+    outputs = [f"{component}.y{number}" for component in components for number in (1, 2)]
+    binding = watch(*outputs, inputs=inputs, step_size=0.1)
+
+    with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
+        order_of_asset = list(asset.schedule.order)
+        rows = [asset.observe().values]
+        for push in PUSHES:
+            rows.append(asset.step(dict.fromkeys(inputs, push)).values)
+
+    expected = recursion(
+        name,
+        components,
+        0.1,
+        PUSHES,
+        jacobi="algorithm" in options,
+        delayed=delayed,
+        sweeps=options.get("iterations", 1),
     )
+    expected_rows = np.hstack([expected[component] for component in components])
+    assert order_of_asset == components
+    np.testing.assert_allclose(rows, expected_rows, rtol=1e-9, atol=1e-12)
 
 
-def test_an_algebraic_loop_is_reported(foreign_fmu) -> None:
-    loop = coupled("loop", foreign_fmu)
+# ---------------------------------------------------------------------- algebraic loops
+
+
+def test_an_algebraic_loop_is_refused_with_its_ends_and_what_to_do(foreign_fmu):
+    remedy = "delay one of its connections, allow iterations, or take the algorithm jacobi"
+
     with pytest.raises(errors.CouplingError) as caught:
-        CoupledAsset(loop, watch("left.y1"))
+        CoupledAsset(coupled("loop", foreign_fmu), watch("left.y1"))
+
     assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in str(caught.value)
-    words = "delay one of its connections, allow iterations, or take the algorithm jacobi"
-    assert words in str(caught.value)
-    words = r"ends at left\.u2.*connections end at right\.u1, left\.u1"
-    with pytest.raises(errors.CouplingError, match=words):
-        loop.delayed(["left.u2"])
-    with CoupledAsset(coupled("circle", foreign_fmu), watch("left.y2"), isolated=False) as asset:
+    assert remedy in str(caught.value)
+
+
+def test_a_delay_of_an_end_without_a_connection_is_refused(foreign_fmu):
+    sentence = r"ends at left\.u2.*connections end at right\.u1, left\.u1"
+
+    with pytest.raises(errors.CouplingError, match=sentence):
+        coupled("loop", foreign_fmu).delayed(["left.u2"])
+
+
+def test_a_circle_without_an_algebraic_loop_holds_one_connection(foreign_fmu):
+    structure = coupled("circle", foreign_fmu)
+
+    with CoupledAsset(structure, watch("left.y2"), isolated=False) as asset:
+        held = [str(connection.source) for connection in asset.schedule.held]
+
         assert asset.schedule.loops == ()
-        assert [str(link.source) for link in asset.schedule.held] == ["right.y1"]
+        assert held == ["right.y1"]
 
 
-def test_iterations_that_do_not_settle_or_cannot_be_made(foreign_fmu, spring_mass) -> None:
-    words = r"left, right did not settle in 8 iterations.*still changes by"
-    stiff = coupled("stiff", foreign_fmu)
-    asset = CoupledAsset(stiff, watch("left.y1"), iterations=8, isolated=False)
-    with asset, pytest.raises(errors.IterationError, match=words):
+def test_iterations_that_do_not_settle_are_refused(foreign_fmu):
+    sentence = r"left, right did not settle in 8 iterations.*still changes by"
+    structure = coupled("stiff", foreign_fmu)
+
+    with (
+        CoupledAsset(structure, watch("left.y1"), iterations=8, isolated=False) as asset,
+        pytest.raises(errors.IterationError, match=sentence),
+    ):
         asset.step()
-    parts = [Component("spring", spring_mass), linear("law", foreign_fmu("linear2"), d=np.eye(2))]
-    joined = system(parts, [("spring.position", "law.u1"), ("law.y1", "spring.force")])
-    with pytest.raises(errors.CouplingError, match="component 'spring' cannot save and restore its state"):
-        CoupledAsset(joined, watch("law.y1"), iterations=3)
 
 
-def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(foreign_fmu) -> None:
-    structure, push = coupled("oscillator", foreign_fmu), {"push": ("push", "1", -1.0, 2.0)}
-    ranged = bound(1.0, {"y": ("first.y1", "1")}, control=push)
-    with CoupledAsset(structure, ranged, isolated=False) as asset:
+def test_iterations_need_components_that_can_save_their_state(foreign_fmu, spring_mass):
+    components = [
+        Component("spring", spring_mass),
+        linear("law", foreign_fmu("linear2"), d=np.eye(2)),
+    ]
+    connections = [("spring.position", "law.u1"), ("law.y1", "spring.force")]
+    structure = system(components, connections)
+
+    sentence = "component 'spring' cannot save and restore its state"
+    with pytest.raises(errors.CouplingError, match=sentence):
+        CoupledAsset(structure, watch("law.y1"), iterations=3)
+
+
+# ---------------------------------------------------------------------- bindings of systems
+
+
+RANGED = bound(1.0, {"y": ("first.y1", "1")}, control={"push": ("push", "1", -1.0, 2.0)})
+"""A binding with the range -1 to 2 of the push."""
+
+
+def test_a_binding_of_several_fmus_keeps_its_ranges(foreign_fmu):
+    with CoupledAsset(coupled("oscillator", foreign_fmu), RANGED, isolated=False) as asset:
         before = asset.step({"push": 2.0}).values
-        with pytest.raises(errors.FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
+
+        with pytest.raises(
+            errors.FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"
+        ):
             asset.step({"push": 2.5})
+
         assert asset.step_index == 1
         np.testing.assert_array_equal(asset.observe().values, before)
+
+
+def test_a_binding_of_several_fmus_has_no_decimation(foreign_fmu):
+    decimated = changed(RANGED, header={"decimation": 2})
+
     with pytest.raises(errors.BindingError, match="bound of several FMUs has a decimation"):
-        CoupledAsset(structure, changed(ranged, header={"decimation": 2}), isolated=False)
+        CoupledAsset(coupled("oscillator", foreign_fmu), decimated, isolated=False)
 
 
-def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
-    structure, seen = of_ours(ours), []
-    direct = [read_fmu(ours(PARTS[name])).feedthrough for name in ("damage", "gauges")]
-    assert (direct[0]["z1"], direct[1]["reading[2]"]) == (set(), {"strain[2]"})
+# ---------------------------------------------------------------------- damage, wing and gauges
+
+
+def couple_three(ours: OurFmus, seed: float = 5.0) -> CoupledAsset:
+    """Return the wing with damage before it and gauges behind it."""
+    return CoupledAsset(of_ours(ours), BINDINGS["three"], isolated=False, parameters={"seed": seed})
+
+
+def test_outputs_say_on_which_inputs_they_depend(ours):
+    damage = read_fmu(ours(PARTS["damage"])).feedthrough
+    gauges = read_fmu(ours(PARTS["gauges"])).feedthrough
+
+    assert damage["z1"] == set()
+    assert gauges["reading[2]"] == {"strain[2]"}
+
+
+def test_components_are_in_the_order_of_their_connections(ours):
+    with couple_three(ours) as asset:
+        assert asset.schedule.order == ("damage", "wing", "gauges")
+
+
+def test_parameters_are_those_of_the_components(ours):
+    readings = []
     for seed in (5.0, 6.0):
-        options = {"isolated": False, "parameters": {"seed": seed}}
-        with CoupledAsset(structure, BINDINGS["three"], **options) as asset:
-            assert asset.schedule.order == ("damage", "wing", "gauges")
-            seen.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
-            state = asset.save_state()
-            with pytest.raises(errors.FmuInputError, match=r"component (damage|wing): load.load_factor = 99"):
-                asset.step({"load_factor": 99.0})
-            with pytest.raises(errors.FmuStateError, match="no longer stand at the same time"):
-                asset.step({"load_factor": 2.0})
-            asset.reset()
+        with couple_three(ours, seed) as asset:
+            readings.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
+
+    assert not np.array_equal(*readings)
+
+
+def test_a_step_that_one_component_refuses_ends_the_flight(ours):
+    sentence = r"component (damage|wing): load.load_factor = 99"
+
+    with couple_three(ours) as asset:
+        with pytest.raises(errors.FmuInputError, match=sentence):
+            asset.step({"load_factor": 99.0})
+        with pytest.raises(errors.FmuStateError, match="no longer stand at the same time"):
             asset.step({"load_factor": 2.0})
-    assert not np.array_equal(*seen)
-    delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in structure.connections)
-    other = CoupledAsset(replace(structure, connections=delayed), BINDINGS["three"], isolated=False)
-    with other, pytest.raises(errors.FmuStateError, match="another FMU than the system test"):
+        asset.reset()
+        asset.step({"load_factor": 2.0})
+
+
+def test_a_state_of_a_system_with_other_connections_is_refused(ours):
+    structure = of_ours(ours)
+    connections = tuple(
+        replace(connection, delayed=bool(connection.source.component))
+        for connection in structure.connections
+    )
+    delayed = replace(structure, connections=connections)
+    with couple_three(ours) as asset:
+        asset.simulate({"load_factor": 2.0}, steps=3)
+        state = asset.save_state()
+
+    with (
+        CoupledAsset(delayed, BINDINGS["three"], isolated=False) as other,
+        pytest.raises(errors.FmuStateError, match="another FMU than the system test"),
+    ):
         other.restore_state(state)
 
 
@@ -128,36 +216,75 @@ END = 2.0
 EXACT = expm(np.array([[-1.0, -2.0], [1.5, -1.0]]) * END) @ [1.0, 0.0]
 
 
-def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps: int = 1) -> SystemStructure:
+def circle(
+    fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps: int = 1
+) -> SystemStructure:
     """Return two followers x' = u - x that feed each other."""
-    joined = (
+    interface = "model-exchange" if exchange else "co-simulation"
+    start = {"start": ComponentSetting(1.0)}
+    first = Component("first", fmu, start, interface="co-simulation")
+    second = Component("second", fmu, {}, substeps, interface)
+    connections = (
         Connection(Endpoint("first", "x"), Endpoint("second", "u"), factor=1.5),
         Connection(Endpoint("second", "x"), Endpoint("first", "u"), factor=-2.0, delayed=delayed),
     )
-    second = Component("second", fmu, {}, substeps, "model-exchange" if exchange else "co-simulation")
-    first = Component("first", fmu, {"start": ComponentSetting(1.0)}, interface="co-simulation")
-    return SystemStructure("circle", (first, second), (), joined)
+    return SystemStructure("circle", (first, second), (), connections)
 
 
-COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
-           ({"exchange": True, "substeps": 3}, JACOBI), ({}, {"iterations": 50})]  # fmt: skip
+@dataclass(frozen=True)
+class CircleErrors:
+    """Errors of a circle in 20 and in 40 steps, with held inputs and with linear ones."""
+
+    held_20: float
+    held_40: float
+    linear_20: float
+    linear_40: float
 
 
-@pytest.mark.parametrize(("system_options", "asset_options"), COUPLED)
-def test_the_error_of_a_system_falls_with_the_square_of_the_step(
-    foreign_fmu, system_options, asset_options
-) -> None:
-    structure, apart = circle(foreign_fmu("follow2"), **system_options), {}
-    for kind in ("zero-order", "linear"):
-        for steps in (20, 40):
-            header = {"step_size": END / steps, "interpolation": kind, "tolerance": 1e-10}
-            binding = watch("first.x", "second.x", **header)
-            with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
-                seen = asset.simulate(steps=steps).values[-1]
-            apart[kind, steps] = np.abs(seen - EXACT).max()
-    assert 1.7 < apart["zero-order", 20] / apart["zero-order", 40] < 2.4
-    assert 3.3 < apart["linear", 20] / apart["linear", 40] < 4.8
-    assert apart["linear", 40] < 0.3 * apart["zero-order", 40]
+CIRCLES = {
+    "plain": ({}, {}),
+    "model exchange": ({"exchange": True}, {}),
+    "substeps": ({"substeps": 3}, {}),
+    "delayed": ({"delayed": True}, {}),
+    "Jacobi": ({}, JACOBI),
+    "Jacobi with substeps of model exchange": ({"exchange": True, "substeps": 3}, JACOBI),
+    "iterations": ({}, {"iterations": 50}),
+}
+"""Options of the circle and of its asset."""
+
+
+@pytest.fixture(scope="module", params=CIRCLES)
+def circle_errors(request, foreign_fmu):
+    circle_options, asset_options = CIRCLES[request.param]
+    structure = circle(foreign_fmu("follow2"), **circle_options)
+
+    def error_of(interpolation: str, steps: int) -> float:
+        binding = watch(
+            "first.x",
+            "second.x",
+            step_size=END / steps,
+            interpolation=interpolation,
+            tolerance=1e-10,
+        )
+        with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
+            last = asset.simulate(steps=steps).values[-1]
+        return float(np.abs(last - EXACT).max())
+
+    return CircleErrors(
+        held_20=error_of("zero-order", 20),
+        held_40=error_of("zero-order", 40),
+        linear_20=error_of("linear", 20),
+        linear_40=error_of("linear", 40),
+    )
+
+
+def test_the_error_of_held_inputs_falls_with_the_step(circle_errors):
+    assert 1.7 < circle_errors.held_20 / circle_errors.held_40 < 2.4
+
+
+def test_the_error_of_linear_inputs_falls_with_the_square_of_the_step(circle_errors):
+    assert 3.3 < circle_errors.linear_20 / circle_errors.linear_40 < 4.8
+    assert circle_errors.linear_40 < 0.3 * circle_errors.held_40
 
 
 # ---------------------------------------------------------------------- wiring
@@ -165,146 +292,170 @@ def test_the_error_of_a_system_falls_with_the_square_of_the_step(
 
 @pytest.fixture(scope="module")
 def base(ours: OurFmus) -> SystemStructure:
-    ends = Connector("push", "input"), Connector("seen", "output"), Connector("percent", "output", "%")
-    return SystemStructure("base", tuple(Component(name, ours(file)) for name, file in PARTS.items()), ends)
+    """Components that are not joined, and connectors."""
+    components = tuple(Component(name, ours(file)) for name, file in PARTS.items())
+    connectors = (
+        Connector("push", "input"),
+        Connector("seen", "output"),
+        Connector("percent", "output", "%"),
+    )
+    return SystemStructure("base", components, connectors)
 
 
-def link(source: str, target: str, **options: Any) -> Connection:
-    return replace(expand(source, target, tuple(PARTS))[0], **options)
+def connect(source: str, target: str, **options: Any) -> Connection:
+    """Return a connection of the components of `base`."""
+    connection, *_ = expand_connection(source, target, tuple(PARTS))
+    return replace(connection, **options)
 
 
 REFUSED = tables(__file__)
+WIRING_ERRORS = (errors.CouplingError, errors.FmuFileError)
 
 
-def test_what_does_not_fit_is_one_sentence(base, foreign_fmu, tmp_path) -> None:
-    first = base.components[0]
-    refused = [({"connections": [link(*ends) for ends in joined]}, w) for joined, w in REFUSED["unjoined"]]
-    for name, key, value, words in REFUSED["unset"]:
-        part = base.component(name) if name in PARTS else Component(name, foreign_fmu(name))
-        settled = replace(part, settings={key: ComponentSetting(*value)})
-        refused += [({"components": [settled]}, words)]
-    refused += [
-        ({"components": []}, "has no component"),
-        ({"components": [*base.components, first]}, "two components named 'damage'"),
-        ({"components": [replace(first, substeps=0)]}, "at least one step"),
-        ({"components": [Component("a", tmp_path / "none.fmu")]}, r"no FMU .*none\.fmu"),
-    ]
-    for changes, words in refused:
-        with in_one_sentence((errors.CouplingError, errors.FmuFileError), words):
-            Wiring(replace(base, **{name: tuple(items) for name, items in changes.items()}))
-    for source, target, sentence in REFUSED["unexpanded"]:
-        with pytest.raises(errors.CouplingError, match=sentence):
-            expand(source, target, ["a", "b"])
+@pytest.mark.parametrize(("ends", "sentence"), REFUSED["unjoined"])
+def test_connections_that_do_not_fit_are_refused(base, ends, sentence):
+    connections = tuple(connect(*pair) for pair in ends)
+
+    with refused(WIRING_ERRORS, sentence):
+        Wiring(replace(base, connections=connections))
 
 
-def test_units_and_types_are_converted(base, foreign_fmu) -> None:
-    """The value of a connection is converted first, and transformed in the unit of the target."""
-    seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
-    for options, conversion in (
+@pytest.mark.parametrize(("name", "key", "value", "sentence"), REFUSED["unset"])
+def test_settings_that_do_not_fit_are_refused(base, foreign_fmu, name, key, value, sentence):
+    component = base.component(name) if name in PARTS else Component(name, foreign_fmu(name))
+    changed_component = replace(component, settings={key: ComponentSetting(*value)})
+
+    with refused(WIRING_ERRORS, sentence):
+        Wiring(replace(base, components=(changed_component,)))
+
+
+def test_a_system_without_components_is_refused(base):
+    with refused(WIRING_ERRORS, "has no component"):
+        Wiring(replace(base, components=()))
+
+
+def test_two_components_of_one_name_are_refused(base):
+    with refused(WIRING_ERRORS, "two components named 'damage'"):
+        Wiring(replace(base, components=(*base.components, base.component("damage"))))
+
+
+def test_a_component_without_steps_is_refused(base):
+    without_steps = replace(base.component("damage"), substeps=0)
+
+    with refused(WIRING_ERRORS, "at least one step"):
+        Wiring(replace(base, components=(without_steps,)))
+
+
+def test_a_component_without_its_fmu_is_refused(base, tmp_path):
+    missing = Component("a", tmp_path / "none.fmu")
+
+    with refused(WIRING_ERRORS, r"no FMU .*none\.fmu"):
+        Wiring(replace(base, components=(missing,)))
+
+
+@pytest.mark.parametrize(("source", "target", "sentence"), REFUSED["unexpanded"])
+def test_ends_that_do_not_match_are_refused(source, target, sentence):
+    with pytest.raises(errors.CouplingError, match=sentence):
+        expand_connection(source, target, ["a", "b"])
+
+
+# ---------------------------------------------------------------------- units and types
+
+
+@pytest.mark.parametrize(
+    ("options", "factor_and_offset"),
+    [
         ({}, (100.0, 0.0)),
         ({"factor": 0.5, "offset": 0.1}, (50.0, 0.1)),
         ({"convert_units": False}, (1.0, 0.0)),
-    ):
-        joined = (link("damage.z1", "percent", **options), link("damage.z1", "wing.health.z1"), seen)
-        wiring = Wiring(replace(base, connections=joined))
-        assert wiring.ends["percent"][0].conversion == conversion
-        assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
-        assert (wiring.ends["seen"][0].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
-    given = {
+    ],
+)
+def test_a_value_is_converted_and_then_transformed_in_the_unit_of_the_target(
+    base, options, factor_and_offset
+):
+    connections = (connect("damage.z1", "percent", **options),)
+
+    wiring = Wiring(replace(base, connections=connections))
+
+    (end,) = wiring.ends["percent"]
+    assert end.conversion == factor_and_offset
+
+
+def test_equal_units_are_not_converted(base):
+    connections = (connect("damage.z1", "wing.health.z1"),)
+
+    wiring = Wiring(replace(base, connections=connections))
+
+    (feed,) = wiring.feeds.values()
+    assert feed.conversion == (1.0, 0.0)
+
+
+def test_a_connector_without_a_unit_has_that_of_its_source(base):
+    connections = (connect("wing.tip_displacement", "seen", factor=2.0, offset=0.5),)
+
+    wiring = Wiring(replace(base, connections=connections))
+
+    (end,) = wiring.ends["seen"]
+    assert end.conversion == (2.0, 0.5)
+    assert wiring.units["seen"] == "m"
+
+
+def test_settings_are_converted_into_numbers_in_the_units_of_the_fmu(base):
+    settings = {
         "mass.servo": ComponentSetting(150.0, "g"),
         "response": ComponentSetting("transient"),
         "health.z1": ComponentSetting(0.2),
     }
-    wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
-    assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+    wing = replace(base.component("wing"), settings=settings)
+
+    wiring = Wiring(replace(base, components=(wing,)))
+
+    expected = {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+    assert wiring.settings["wing"] == expected
+
+
+def test_a_boolean_setting_is_a_number(foreign_fmu):
     switched = Component("a", foreign_fmu("array3"), {"active": ComponentSetting(False)})
-    assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
-    # An enumeration and an integer feed each other.
-    joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
-    assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
+
+    wiring = Wiring(SystemStructure("one", (switched,)))
+
+    assert wiring.settings == {"a": {"active": 0.0}}
 
 
-def test_bindings_that_do_not_fit(base) -> None:
-    ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
-    wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
-    observed = {"y": ("damage.z1", "1")}
-    for role, end, words in REFUSED["unbound"]:
-        given = {"observation": observed} | {role: {"x": end}}
-        with pytest.raises(ValueError, match=words):
-            CoupledAsset(wiring, bound(1.0, **given))
-    right = bound(1.0, observed, control={"x": ("push", "1")})
+def test_an_enumeration_feeds_an_integer(base):
+    connections = (connect("damage.status", "spring.misbehaviour"),)
+
+    wiring = Wiring(replace(base, connections=connections))
+
+    (feed,) = wiring.feeds.values()
+    assert feed.conversion == (1.0, 0.0)
+
+
+# ---------------------------------------------------------------------- bindings that do not fit
+
+OBSERVED = {"y": ("damage.z1", "1")}
+
+
+@pytest.fixture(scope="module")
+def joined(base) -> Wiring:
+    connections = (
+        connect("push", "wing.load_factor"),
+        connect("damage.z1", "wing.health.z1"),
+        connect("damage.z1", "percent"),
+    )
+    return Wiring(replace(base, connections=connections))
+
+
+@pytest.mark.parametrize(("role", "end", "sentence"), REFUSED["unbound"])
+def test_a_binding_that_does_not_fit_is_refused(joined, role, end, sentence):
+    roles = {"observation": OBSERVED} | {role: {"x": end}}
+
+    with pytest.raises(ValueError, match=sentence):
+        CoupledAsset(joined, bound(1.0, **roles))
+
+
+def test_an_unknown_algorithm_is_refused(joined):
+    binding = bound(1.0, OBSERVED, control={"x": ("push", "1")})
+
     with pytest.raises(ValueError, match="algorithm must be one of gauss_seidel, jacobi"):
-        CoupledAsset(wiring, right, algorithm="newton")  # type: ignore[arg-type]
-
-
-NAMES = "abcd"
-
-
-links_strategy = st.lists(
-    st.tuples(st.sampled_from(NAMES), st.sampled_from("xy"), st.sampled_from(NAMES), st.sampled_from("uv")),
-    max_size=6,
-    unique=True,
-)
-through = st.fixed_dictionaries(
-    {name: st.fixed_dictionaries({out: st.sets(st.sampled_from("uv")) for out in "xy"}) for name in NAMES}
-)
-
-
-@settings(max_examples=300)
-@given(links_strategy, through)
-def test_the_order_by_enumeration(pairs, feedthrough) -> None:
-    """Where some order puts every component after all that it depends on directly, ours is such an order."""
-    links = [Connection(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
-    plan = schedule(NAMES, links, feedthrough)
-    assert sorted(plan.order) == sorted(NAMES)
-    assert plan.order == tuple(name for group in plan.groups for name in group)
-    directly = {(a, b) for a, _, b, u in pairs if any(u in inputs for inputs in feedthrough[b].values())}
-    follows = {(a, b) for a, _, b, _ in pairs}
-    orders = [*permutations(NAMES)]
-
-    def keeping(wanted: set[tuple[str, str]]) -> list[tuple[str, ...]]:
-        return [order for order in orders if all(order.index(a) < order.index(b) for a, b in wanted)]
-
-    assert plan.order in (keeping(directly) or orders)
-    if keeping(follows):
-        assert not plan.held
-        assert not plan.circles
-    place = {name: index for index, name in enumerate(plan.order)}
-    assert {*plan.held} == {k for k in links if place[k.source.component] >= place[k.target.component]}
-
-
-@settings(max_examples=300)
-@given(links_strategy, through)
-def test_algebraic_loops_by_enumeration(pairs, feedthrough) -> None:
-    """A shortest one for each class of variables that depend on each other."""
-    links = [Connection(Endpoint(a, x), Endpoint(b, u)) for a, x, b, u in pairs]
-    graph: dict[Endpoint, set[Endpoint]] = {Endpoint(name, end): set() for name in NAMES for end in "xyuv"}
-    for link in links:
-        graph[link.source].add(link.target)
-    for name, outputs in feedthrough.items():
-        for output, inputs in outputs.items():
-            for variable in inputs:
-                graph[Endpoint(name, variable)].add(Endpoint(name, output))
-    joined = np.array([[int(other in successors) for other in graph] for successors in graph.values()])
-    _, labels = connected_components(joined, connection="strong")
-    ways = shortest_path(joined, unweighted=True)
-    nodes = list(graph)
-    shortest: dict[int, float] = {}
-    for node, successors in graph.items():
-        for other in successors:
-            a, b = nodes.index(node), nodes.index(other)
-            if np.isfinite(ways[b, a]):
-                shortest[labels[a]] = min(1.0 + ways[b, a], shortest.get(labels[a], np.inf))
-    loops = algebraic_loops(links, feedthrough)
-    for loop in loops:
-        assert loop[0] == loop[-1]
-        assert all(b in graph[a] for a, b in pairwise(loop))
-    assert {labels[nodes.index(loop[0])]: len(loop) - 1 for loop in loops} == shortest
-    assert len(loops) == len(shortest)
-
-
-def test_a_long_chain_is_put_in_order_and_the_rest_stays_as_it_stood() -> None:
-    count = 30_000
-    chain = {node: [node - 1] if node else [] for node in range(count)}
-    found = strong_components(chain | {-1: [], -2: [-1]})
-    assert found == [(node,) for node in (*reversed(range(count)), -2, -1)]
+        CoupledAsset(joined, binding, algorithm="newton")  # type: ignore[arg-type]

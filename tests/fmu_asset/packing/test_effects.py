@@ -32,7 +32,10 @@ from tests.refusals import refused as no_line_end
 
 HERE, REFUSED = Path(__file__).parent, tables(__file__)
 SENSORS, WING = (
-    {effect["id"]: effect["primitives"] for effect in json.loads((HERE / name).read_text("utf-8"))["effects"]}
+    {
+        effect["id"]: effect["primitives"]
+        for effect in json.loads((HERE / name).read_text("utf-8"))["effects"]
+    }
     for name in ("sensors.json", "wing.json")
 )
 SENSING, PATCHED = KINDS["effects of sensors"].binding, KINDS["hysteresis"].binding
@@ -47,7 +50,9 @@ OUTPUTS = [name for name, _ in CHANNELS]
 def content(effects: Mapping[str, Sequence[Any]] = SENSORS) -> bytes:
     """Return a patch file: that of the sensors with other effects."""
     record = json.loads((HERE / "sensors.json").read_text("utf-8"))
-    rows = [{"id": name, "place": "anywhere", "primitives": items} for name, items in effects.items()]
+    rows = [
+        {"id": name, "place": "anywhere", "primitives": items} for name, items in effects.items()
+    ]
     return json.dumps(record | {"effects": rows}).encode()
 
 
@@ -68,19 +73,25 @@ def naming_side() -> WingModel:
     return WingModel(wing_arrays())
 
 
-def flown(fmu: Path, rows: Sequence[Sequence[float]], start: float = 0.0, **parameters: float) -> np.ndarray:
+def flown(
+    fmu: Path, rows: Sequence[Sequence[float]], start: float = 0.0, **parameters: float
+) -> np.ndarray:
     """Return all outputs at the start and after steps of 50 ms of load factor and tip force."""
     binding = BINDINGS["watched"].with_header(step_size=0.05, start_time=start)
     with FmiAsset(fmu, binding, isolated=False, parameters=parameters) as asset:
         asset.reset(control={"load_factor": rows[0][0]})
-        seen = [asset.observe()] + [asset.step({"load_factor": n}, load={"tip_force": f}) for n, f in rows]
+        seen = [asset.observe()] + [
+            asset.step({"load_factor": n}, load={"tip_force": f}) for n, f in rows
+        ]
         return np.array([item.values for item in seen])
 
 
 # ---------------------------------------------------------------------- files
 
 
-def test_the_table_only_grows_at_its_end_and_the_guid_tells_what_is_on(fmu, sensing, model, tmp_path) -> None:
+def test_the_table_only_grows_at_its_end_and_the_guid_tells_what_is_on(
+    fmu, sensing, model, tmp_path
+) -> None:
     active = build_fmu(model, tmp_path / "on.fmu", patch=parse_patch(content()), activate=True).path
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed).path
@@ -111,7 +122,11 @@ def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patched, mo
     assert off.tobytes() == plain.tobytes()
     assert moving or flown(patched, rows)[first:].tobytes() == plain.tobytes()
     whole = ModelPatch(
-        tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
+        tuple(
+            item
+            for effect in parse_patch(content()).for_gauges(24).effects
+            for item in effect.patch
+        )
     )
     time, kind = 0.05 * np.arange(first, len(rows) + 1), "ringdown" if moving else "flight"
     more = {"release": 0.03} if moving else {}
@@ -135,7 +150,10 @@ def test_gauges_that_saturate_show_the_formula_and_displacements_stay(fmu, sensi
 def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
     with FmiAsset(sensing, SENSING, isolated=False) as asset:
         plain = flown(fmu, [(2.0, 0.0)])[1]
-        seen = [asset.step({"load_factor": 2.0}, load={"drift": k}).values[16] for k in (0.0, 1.0, 0.0, 1.0)]
+        seen = [
+            asset.step({"load_factor": 2.0}, load={"drift": k}).values[16]
+            for k in (0.0, 1.0, 0.0, 1.0)
+        ]
         assert seen[0] == seen[2] == plain[16]
         for index, time in ((1, 0.1), (3, 0.2)):
             assert seen[index] - plain[16] == pytest.approx(4e-5 * math.sqrt(time / 10.0), rel=1e-9)
@@ -149,12 +167,16 @@ def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
     np.testing.assert_allclose(warm - cold, [4.8e-5] * 24 + [0.0] * 2, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("which", "parameters", "first", "wrong", "right", "sentence"), REFUSED["values"])
+@pytest.mark.parametrize(
+    ("which", "parameters", "first", "wrong", "right", "sentence"), REFUSED["values"]
+)
 def test_values_that_cannot_be_are_refused_and_change_nothing(
     ours, which, parameters, first, wrong, right, sentence
 ) -> None:
     binding = {"sensing": SENSING, "patched": PATCHED}[which]
-    with FmiAsset(ours(which), binding, isolated=False, parameters=parameters | {"response": 2.0}) as asset:
+    with FmiAsset(
+        ours(which), binding, isolated=False, parameters=parameters | {"response": 2.0}
+    ) as asset:
         asset.step({"load_factor": 1.0}, load=first)
         before = asset.save_state()
         with pytest.raises(FmuCallError, match=sentence):
@@ -172,7 +194,8 @@ FORCES = np.array([2.0, 9.0, 15.0, 6.0, -3.0, -14.0, -5.0, 8.0])
 FACTORS = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
 OFF: dict[str, dict[str, float]] = {
     "nothing": {},
-    "of no magnitude": on("root", "play") | {"effect.root.compliance": 0.0, "effect.play.stiffness": 0.0},
+    "of no magnitude": on("root", "play")
+    | {"effect.root.compliance": 0.0, "effect.play.stiffness": 0.0},
 }
 DYNAMIC = sorted(set(WING) - {"place", "cell", "washout", "relief", "turned", "warmer"})
 STATIC = sorted(set(WING) - {"washout", "relief", "drifting"})
@@ -208,7 +231,9 @@ def expected(model: WingModel, given: Trial, patch: ModelPatch, health: np.ndarr
 def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -> None:
     """Within 1e-6 of the largest strain and the largest displacement."""
     patch, chosen, damage, columns = patch_of(name), OFF.get(name, on(name)), np.zeros((1, 2)), 26
-    time = np.arange({TrialKind.RINGDOWN: 31, TrialKind.STATIC: len(FORCES), TrialKind.FLIGHT: 5}[kind])
+    time = np.arange(
+        {TrialKind.RINGDOWN: 31, TrialKind.STATIC: len(FORCES), TrialKind.FLIGHT: 5}[kind]
+    )
     acting: dict[str, Any] = {}
     course: dict[str, Any] = {"steps": 30}
     if kind == TrialKind.RINGDOWN:
@@ -216,7 +241,11 @@ def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -
         chosen = chosen | {"response": 2.0, "release": 0.03}
         state = np.array([1.0, *damage[0], *STATE[1:3], 1.0, 0.0])
         shape = naming_side.wing.structure_at(state, patch.of(*STRUCTURE)).static(arrays.load_tip)
-        acting = {"release": Release(0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape))}
+        acting = {
+            "release": Release(
+                0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape)
+            )
+        }
     elif kind == TrialKind.STATIC:
         warm = 5.0 * time / len(FORCES)
         acting, course = (
@@ -226,9 +255,16 @@ def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -
     else:
         damage, columns = np.column_stack((0.15 * time, 0.1 * np.ones(5))), 24
         health = dict(zip(("z1", "z2"), damage.T, strict=True))
-        acting, course = {"load_factor": FACTORS}, {"control": {"load_factor": FACTORS}, "health": health}
-    trial = Trial.plain("trial", kind, (), (1.0 if kind == TrialKind.FLIGHT else 0.01) * time, **acting)
-    flying.reset(chosen, control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
+        acting, course = (
+            {"load_factor": FACTORS},
+            {"control": {"load_factor": FACTORS}, "health": health},
+        )
+    trial = Trial.plain(
+        "trial", kind, (), (1.0 if kind == TrialKind.FLIGHT else 0.01) * time, **acting
+    )
+    flying.reset(
+        chosen, control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]}
+    )
     begin = [flying.observe().values] * (kind == TrialKind.RINGDOWN)
     shown = np.array([*begin, *flying.simulate(**course).values])[:, :columns]
     wanted, plain = (
@@ -266,7 +302,9 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> No
 def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> None:
     many = on("slip", "crack")
     single = many | {"effect.slip.element_count": 1, "effect.crack.side": 0}
-    seen, one = (flown(patched, [(0.0, 14.0), (0.0, -6.0)], **given)[-1] for given in (many, single))
+    seen, one = (
+        flown(patched, [(0.0, 14.0), (0.0, -6.0)], **given)[-1] for given in (many, single)
+    )
     assert np.abs(seen - one).max() > 1e-3 * np.abs(seen).max()
     for name, value in (("slip.element_count", 2.5), ("slip.element_count", 0), ("crack.side", 2)):
         with pytest.raises(FmuInputError):
@@ -297,7 +335,9 @@ def test_a_byte_order_mark_means_nothing_and_an_id_that_comes_twice_is_numbered(
     record = json.loads(content())
     record["effects"] = record["effects"][:1] * 3
     again = parse_patch(b"\xef\xbb\xbf" + json.dumps(record).encode())
-    assert [effect.id for effect in again.effects] == [f"gauge_zero_drift{end}" for end in ("", "_2", "_3")]
+    assert [effect.id for effect in again.effects] == [
+        f"gauge_zero_drift{end}" for end in ("", "_2", "_3")
+    ]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Our FMUs as files, whatever is packed: sound, equal for equal input, guarded, refused in one sentence."""
+"""Our FMUs as files: sound, equal for equal input, guarded, refused in one sentence."""
 
 import json
 import os
@@ -32,187 +32,345 @@ from tests.fmu_asset.client.kinds import BINDINGS, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import STRUCTURES
 
-REFUSED, DECLARED = tables(__file__), tables(__file__, "declared")
-BIN = Path(sys.executable).parent
-PUMP = asset_scripts()["gear_pump"]
+REFUSED = tables(__file__)
+DECLARED = tables(__file__, "declared")
+PROGRAMS = Path(sys.executable).parent
+PUMP_SCRIPT = asset_scripts()["gear_pump"]
 run = partial(subprocess.run, capture_output=True, text=True)
-FURTHER = (*COMPANION_NAMES, *asset_scripts())
-TOLD = ["python", "source", "fmi3", "exchange", "exchange3", "sensing", *FURTHER]
-"""Of different model descriptions, which is all that the other tool reads."""
-SOUND = [*TOLD, "compiled", "beam", "compiled_beam", "source3_beam"]
-EQUAL = ["python", "compiled", "source3_beam", "beam", "sensing", "patched", *FURTHER]
+
+SCRIPTED = (*COMPANION_NAMES, *asset_scripts())
+DESCRIBED = ["python", "source", "fmi3", "exchange", "exchange3", "sensing", *SCRIPTED]
+"""FMUs with different model descriptions, which is all that the other tool reads."""
+SOUND = [*DESCRIBED, "compiled", "beam", "compiled_beam", "source3_beam"]
+EQUAL = ["python", "compiled", "source3_beam", "beam", "sensing", "patched", *SCRIPTED]
 
 
-def installed(program: str) -> str:
+def find_program(program: str) -> str:
     """Return the path of a program, or skip."""
-    path = shutil.which(program) or shutil.which(program, path=str(BIN))
+    path = shutil.which(program) or shutil.which(program, path=str(PROGRAMS))
     return path or pytest.skip(f"{program} is not installed")
+
+
+def findings_of(path: Path):
+    """Return what the checks of a file find."""
+    inspection, *_ = inspect_fmu(path)
+    return list(check_file(inspection))
+
+
+def without_binaries(contents: dict[str, bytes]) -> dict[str, bytes]:
+    return {name: content for name, content in contents.items() if not name.startswith("binaries/")}
 
 
 # ---------------------------------------------------------------------- what holds of all
 
 
 @pytest.mark.parametrize("name", SOUND)
-def test_a_packed_fmu_is_sound(ours, name) -> None:
-    """`fmpy validate`, the standard's rules and ours; of each kind one flies in a worker, without a word."""
-    found = [*check_file(inspect_fmu(ours(name))[0])]
-    if name in ("python", "compiled", "fmi3"):
-        binding = BINDINGS["uav_wing_fmi3"] if name == "fmi3" else None
-        check = check_fmu(ours(name), binding, cycles=5 if name != "python" else 0)
-        assert {finding.verdict for finding in check.findings} == {"ok"}
-    assert "problem" not in {finding.verdict for finding in found}
-    checks = {finding.check for finding in found if finding.verdict == "ok"}
-    assert "fmpy validate" in checks
-    assert name not in STRUCTURES or "content" in checks
+def test_a_packed_fmu_is_sound(ours, name):
+    """By `fmpy validate`, the rules of the standard and ours."""
+    findings = findings_of(ours(name))
+
+    passed = {finding.check for finding in findings if finding.verdict == "ok"}
+    assert "problem" not in {finding.verdict for finding in findings}
+    assert "fmpy validate" in passed
+    assert name not in STRUCTURES or "content" in passed
+
+
+@pytest.mark.parametrize(
+    ("name", "binding", "cycles"),
+    [("python", None, 0), ("compiled", None, 5), ("fmi3", BINDINGS["uav_wing_fmi3"], 5)],
+)
+def test_an_fmu_of_each_kind_flies_in_a_worker_without_a_word(ours, name, binding, cycles):
+    check = check_fmu(ours(name), binding, cycles=cycles)
+
+    assert {finding.verdict for finding in check.findings} == {"ok"}
 
 
 @pytest.mark.long
-def test_more_instances_in_one_process_than_python_had_room_for(fmu) -> None:
+def test_more_instances_in_one_process_than_python_had_room_for(fmu):
     assert check_fmu(fmu, cycles=1100).passed
 
 
-@pytest.mark.parametrize("name", TOLD)
-def test_another_tool_has_no_complaint(ours, name, tmp_path) -> None:
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_another_tool_has_no_complaint(ours, name, tmp_path):
     """The FMU manipulation toolbox."""
     environment = {"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}  # where it keeps its log
-    done = run([installed("fmutool"), "-input", ours(name), "-check"], env=environment)
-    said = f"{done.stdout}{done.stderr}"
+    version = 3 if "3" in name else 2
+
+    done = run([find_program("fmutool"), "-input", ours(name), "-check"], env=environment)
+
+    output = f"{done.stdout}{done.stderr}"
     assert done.returncode == 0
-    assert f"seems to be compliant with FMI-{3 if '3' in name else 2}.0" in said
-    assert "No semantic error" in said
-    assert not re.search("ERROR|WARNING", said)
+    assert f"seems to be compliant with FMI-{version}.0" in output
+    assert_no_complaint(output)
+
+
+def assert_no_complaint(output: str) -> None:
+    assert "No semantic error" in output
+    assert not re.search("ERROR|WARNING", output)
 
 
 @pytest.mark.parametrize("name", EQUAL)
-def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch) -> None:
+def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch):
     """Also in another folder."""
     expected = ours(name).read_bytes()  # skips without a C compiler, where one is needed
     elsewhere = tmp_path / "else where"
     elsewhere.mkdir()
     monkeypatch.setenv("TMPDIR", str(elsewhere))
+    target = tmp_path / "again.fmu"
+
     if name in STRUCTURES:
-        again = build_fmu(
-            ReducedModel.from_bytes(ours.model(name).to_bytes()), tmp_path / "again.fmu", **ours.options(name)
-        ).path
+        same_model = ReducedModel.from_bytes(ours.model(name).to_bytes())
+        build_fmu(same_model, target, **ours.options(name))
     else:
-        again = ours.write(name, tmp_path / "again.fmu")
-    assert again.read_bytes() == expected
+        ours.write(name, target)
+
+    assert target.read_bytes() == expected
 
 
-def test_the_environment_does_not_show_and_other_content_does(ours, model, tmp_path) -> None:
-    fmu = ours("python")
+BUILD_PROGRAM = """
+import sys
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.packing.structure_fmu import build_fmu
+build_fmu(ReducedModel.load(sys.argv[1]), sys.argv[2])
+"""
+
+
+def test_the_environment_does_not_show_in_the_bytes(ours, model, tmp_path):
     (tmp_path / "model.npz").write_bytes(model.to_bytes())
-    program = (
-        "import sys; from fe.runtime.reduced import ReducedModel; "
-        "from fmu_asset.packing.structure_fmu import build_fmu; "
-        "build_fmu(ReducedModel.load(sys.argv[1]), sys.argv[2])"
-    )
     environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "LC_ALL": "C"}
-    run_python(program, tmp_path / "model.npz", tmp_path / "other.fmu", env=environment)
-    assert (tmp_path / "other.fmu").read_bytes() == fmu.read_bytes()
-    stiffer = build_fmu(replace(model, damping=2.0 * model.damping), tmp_path / "stiffer.fmu")
+
+    run_python(BUILD_PROGRAM, tmp_path / "model.npz", tmp_path / "other.fmu", env=environment)
+
+    assert (tmp_path / "other.fmu").read_bytes() == ours("python").read_bytes()
+
+
+@pytest.fixture
+def stiffer(model, tmp_path):
+    """The FMU of a model with more damping."""
+    return build_fmu(replace(model, damping=2.0 * model.damping), tmp_path / "stiffer.fmu")
+
+
+def test_another_model_or_state_has_another_identity(ours, model, stiffer, tmp_path):
     tailored = build_fmu(model, tmp_path / "e.fmu", state=DigitalState(young_modulus_factor=1.02))
-    assert len({read_fmu(fmu).guid, stiffer.guid, tailored.guid}) == 3
-    modules = [{name for name in members(path) if name.endswith(".py")} for path in (fmu, stiffer.path)]
-    assert not modules[0] & modules[1]
+
+    assert len({read_fmu(ours("python")).guid, stiffer.guid, tailored.guid}) == 3
+
+
+def names_of_modules(path: Path) -> set[str]:
+    return {name for name in members(path) if name.endswith(".py")}
+
+
+def test_modules_of_two_fmus_have_names_of_their_own(ours, stiffer):
+    """So that both can be loaded in one process."""
+    assert not names_of_modules(ours("python")) & names_of_modules(stiffer.path)
+
+
+def test_another_script_has_another_identity(ours, tmp_path):
     script = tmp_path / "gear_pump.py"
-    script.write_text(PUMP.read_text("utf-8").replace("AMBIENT = 40.0", "AMBIENT = 41.0"))
-    assert build_script_fmu(script, tmp_path / "pump.fmu").guid != read_fmu(ours("gear_pump")).guid
+    text = PUMP_SCRIPT.read_text("utf-8")
+    script.write_text(text.replace("AMBIENT = 40.0", "AMBIENT = 41.0"))
+
+    built = build_script_fmu(script, tmp_path / "pump.fmu")
+
+    assert built.guid != read_fmu(ours("gear_pump")).guid
     assert not list(tmp_path.glob("__pycache__"))
 
 
-CHANGED = {
-    "python": [("design.json", b'_hash": "', b'_hash": "x'), ("slavemodule.txt", b"", b"\xff")],
-    "compiled": [("sources/structure_static.c", b"", b" "), ("resources/reduced_model.bin", b"", b" ")],
-}
-
-
-@pytest.mark.parametrize("kind", CHANGED)
-def test_a_changed_part_is_noticed(ours, kind, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "ending", "old", "new"),
+    [
+        ("python", "design.json", b'_hash": "', b'_hash": "x'),
+        ("python", "slavemodule.txt", b"", b"\xff"),
+        ("compiled", "sources/structure_static.c", b"", b" "),
+        ("compiled", "resources/reduced_model.bin", b"", b" "),
+    ],
+)
+def test_a_changed_part_is_noticed(ours, kind, ending, old, new, tmp_path):
+    """A text is exchanged, or one is appended."""
     contents = members(ours(kind))
-    for entry, old, new in CHANGED[kind]:
-        name = next(name for name in contents if name.endswith(entry))
-        content = contents[name].replace(old, new) if old else contents[name] + new
-        changed = archive_of(tmp_path / "changed.fmu", contents | {name: content})
-        findings = check_file(inspect_fmu(changed)[0])
-        (said,) = (finding.text for finding in findings if finding.check == "content")
-        assert said.endswith("the file was changed after its build."), entry
+    name = next(name for name in contents if name.endswith(ending))
+    content = contents[name].replace(old, new) if old else contents[name] + new
+    changed = archive_of(tmp_path / "changed.fmu", contents | {name: content})
+
+    (text,) = (finding.text for finding in findings_of(changed) if finding.check == "content")
+
+    assert text.endswith("the file was changed after its build.")
 
 
-def test_what_cannot_be_packed_is_one_sentence(model, ours, tmp_path) -> None:
-    target, state = tmp_path / "x.fmu", DigitalState(young_modulus_factor=2.0)
-    for name, text, words in REFUSED["scripts"]:
-        (tmp_path / name).write_text(text)
-        with pytest.raises(errors.FmuBuildError, match=words):
-            build_script_fmu(tmp_path / name, target)
-    for options, words in (
-        ({"state": state}, r"start value .* of young_modulus_factor"),
+# ---------------------------------------------------------------------- what cannot be packed
+
+
+@pytest.mark.parametrize(("name", "text", "sentence"), REFUSED["scripts"])
+def test_a_script_that_is_no_slave_is_refused(tmp_path, name, text, sentence):
+    (tmp_path / name).write_text(text)
+
+    with pytest.raises(errors.FmuBuildError, match=sentence):
+        build_script_fmu(tmp_path / name, tmp_path / "x.fmu")
+
+    assert not (tmp_path / "x.fmu").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (
+            {"state": DigitalState(young_modulus_factor=2.0)},
+            r"start value .* of young_modulus_factor",
+        ),
         ({"resources": {"a/b.json": b"x"}}, "cannot have the name"),
         *REFUSED["builds"],
-    ):
-        with pytest.raises(errors.FmuBuildError, match=words):
-            build_fmu(model, target, **options)
-    for build, source, path, words in (
-        (build_fmu, model, tmp_path / "wing.zip", r"suffix \.fmu"),
-        (build_fmu, model, ours("python"), "exists"),
-        (build_script_fmu, PUMP, ours("gear_pump"), "exists"),
-        (build_script_fmu, tmp_path / "missing.py", target, "cannot be read"),
-    ):
-        with pytest.raises(errors.FmuBuildError, match=words):
-            build(source, path)
-    assert not target.exists()
+    ],
+)
+def test_impossible_options_are_refused(model, tmp_path, options, sentence):
+    with pytest.raises(errors.FmuBuildError, match=sentence):
+        build_fmu(model, tmp_path / "x.fmu", **options)
+
+    assert not (tmp_path / "x.fmu").exists()
+
+
+def test_another_suffix_is_refused(model, tmp_path):
+    with pytest.raises(errors.FmuBuildError, match=r"suffix \.fmu"):
+        build_fmu(model, tmp_path / "wing.zip")
+
+
+def test_an_fmu_is_not_overwritten(model, ours):
+    with pytest.raises(errors.FmuBuildError, match="exists"):
+        build_fmu(model, ours("python"))
+
+
+def test_an_fmu_of_a_script_is_not_overwritten(ours):
+    with pytest.raises(errors.FmuBuildError, match="exists"):
+        build_script_fmu(PUMP_SCRIPT, ours("gear_pump"))
+
+
+def test_a_missing_script_is_refused(tmp_path):
+    with pytest.raises(errors.FmuBuildError, match="cannot be read"):
+        build_script_fmu(tmp_path / "missing.py", tmp_path / "x.fmu")
+
+    assert not (tmp_path / "x.fmu").exists()
 
 
 # ---------------------------------------------------------------------- what is declared
 
 
-@pytest.mark.parametrize("name", DECLARED)
-def test_what_is_declared_of_variables(ours, name) -> None:
+@pytest.mark.parametrize(
+    ("name", "variable"),
+    [(name, variable) for name, variables in DECLARED.items() for variable in variables],
+)
+def test_variables_are_declared_as_listed(ours, name, variable):
+    expected = DECLARED[name][variable]
     variables = {each.name: each for each in read_model_description(str(ours(name))).modelVariables}
-    for variable, told in DECLARED[name].items():
-        seen = {key: getattr(variables[variable], key) for key in told}
-        assert told == {k: float(v) if isinstance(told[k], float) else v for k, v in seen.items()}
+
+    declared = {}
+    for key, value in expected.items():
+        attribute = getattr(variables[variable], key)
+        declared[key] = float(attribute) if isinstance(value, float) else attribute
+
+    assert declared == expected
 
 
-def test_the_compiled_one_declares_the_same_and_all_of_its_sources(ours) -> None:
-    description, compiled = (read_model_description(str(ours(name))) for name in ("python", "compiled"))
-    assert description.variableNamingConvention == "structured"
-    factors = {u.name: {d.name: float(d.factor) for d in u.displayUnits} for u in description.unitDefinitions}
-    assert factors["1"]["microstrain"] == 1e6
-    told = "name", "valueReference", "type", "causality", "unit", "displayUnit", "min", "max", "start"
-    facts = [[*map(attrgetter(*told), each.modelVariables)] for each in (description, compiled)]
-    assert facts[0] == facts[1]
-    for each in (description, compiled):
-        assert each.coSimulation.canHandleVariableCommunicationStepSize
-        assert not each.coSimulation.canBeInstantiatedOnlyOncePerProcess
-    listed = set(compiled.buildConfigurations[0].sourceFileSets[0].sourceFiles)
-    assert listed == {n.removeprefix("sources/") for n in members(ours("compiled")) if n.endswith(".c")}
-    text = members(ours("source3_beam"))[DESCRIPTION].decode()
-    assert all(f'<Float64 name="{name}" ' in text for name in ("strain", "health"))
+@pytest.fixture(scope="module")
+def python_description(ours):
+    return read_model_description(str(ours("python")))
 
 
-def test_a_structure_of_the_wings_name_is_no_wing(ours) -> None:
+@pytest.fixture(scope="module")
+def compiled_description(ours):
+    return read_model_description(str(ours("compiled")))
+
+
+VARIABLE_FACTS = attrgetter(
+    "name", "valueReference", "type", "causality", "unit", "displayUnit", "min", "max", "start"
+)
+
+
+def test_the_compiled_fmu_declares_the_variables_of_the_one_in_python(
+    python_description, compiled_description
+):
+    python_facts = [VARIABLE_FACTS(each) for each in python_description.modelVariables]
+    compiled_facts = [VARIABLE_FACTS(each) for each in compiled_description.modelVariables]
+
+    assert compiled_facts == python_facts
+
+
+def test_names_of_variables_are_structured(python_description):
+    assert python_description.variableNamingConvention == "structured"
+
+
+def test_strains_can_be_shown_in_microstrain(python_description):
+    units = {unit.name: unit for unit in python_description.unitDefinitions}
+    factors = {unit.name: float(unit.factor) for unit in units["1"].displayUnits}
+
+    assert factors["microstrain"] == 1e6
+
+
+@pytest.mark.parametrize("kind", ["python_description", "compiled_description"])
+def test_steps_may_vary_and_instances_may_be_many(request, kind):
+    co_simulation = request.getfixturevalue(kind).coSimulation
+
+    assert co_simulation.canHandleVariableCommunicationStepSize
+    assert not co_simulation.canBeInstantiatedOnlyOncePerProcess
+
+
+def test_the_compiled_fmu_lists_all_of_its_sources(ours, compiled_description):
+    (configuration,) = compiled_description.buildConfigurations
+    (sources,) = configuration.sourceFileSets
+
+    c_files = [name for name in members(ours("compiled")) if name.endswith(".c")]
+
+    assert set(sources.sourceFiles) == {name.removeprefix("sources/") for name in c_files}
+
+
+@pytest.mark.parametrize("name", ["strain", "health"])
+def test_fmi_3_declares_arrays(ours, name):
+    description = members(ours("source3_beam"))[DESCRIPTION].decode()
+
+    assert f'<Float64 name="{name}" ' in description
+
+
+def test_a_structure_of_the_wings_name_is_no_wing(ours):
     model = ours.model("beam")
+
     table, roles = structure_table(replace(model, name=WING_MODEL_NAME), {})
+
+    expected_table, _ = structure_table(model, {})
     assert roles.displacement_bound == "displacement_error_bound"
-    assert [row.name for row in table] == [row.name for row in structure_table(model, {})[0]]
+    assert [row.name for row in table] == [row.name for row in expected_table]
 
 
-def test_a_note_and_a_further_file(model, fmu, tmp_path) -> None:
-    note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
-    path = build_fmu(model, tmp_path / "a.fmu", note=note, resources={"calibration.json": content}).path
-    assert {finding.verdict for finding in check_file(inspect_fmu(path)[0])} == {"ok"}
-    described, inside = read_model_description(str(path)), members(path)
-    assert described.description.endswith(note)
-    assert described.guid != read_model_description(str(fmu)).guid
-    assert inside["resources/calibration.json"] == content
-    assert "Wing &lt;7&gt; &amp; é" in inside["documentation/index.html"].decode()
+NOTE = 'Calibrated for "Wing <7> & é".'
+FURTHER_FILE = b'{"asset": "Wing <7>"}\n'
+
+
+@pytest.fixture(scope="module")
+def noted_fmu(model, tmp_path_factory):
+    """An FMU with a note and a further file."""
+    path = tmp_path_factory.mktemp("noted") / "a.fmu"
+    return build_fmu(model, path, note=NOTE, resources={"calibration.json": FURTHER_FILE}).path
+
+
+def test_an_fmu_with_a_note_and_a_further_file_is_sound(noted_fmu):
+    assert {finding.verdict for finding in findings_of(noted_fmu)} == {"ok"}
+
+
+def test_a_note_stands_in_the_description_and_in_the_documentation(noted_fmu):
+    documentation = members(noted_fmu)["documentation/index.html"].decode()
+
+    assert read_model_description(str(noted_fmu)).description.endswith(NOTE)
+    assert "Wing &lt;7&gt; &amp; é" in documentation
+
+
+def test_a_further_file_lies_in_the_resources(noted_fmu):
+    assert members(noted_fmu)["resources/calibration.json"] == FURTHER_FILE
+
+
+def test_an_fmu_with_a_note_has_another_identity(noted_fmu, python_description):
+    assert read_model_description(str(noted_fmu)).guid != python_description.guid
 
 
 # ---------------------------------------------------------------------- the kind in Python
 
-
-ALONE = """
+RUN_ALONE = """
 name = open("resources/slavemodule.txt").read()
 Wing = getattr(__import__(name), "Structure_" + name.rpartition("_")[2])
 wing = Wing(instance_name="a", resources="resources")
@@ -220,99 +378,179 @@ wing.enter_initialization_mode(); wing.exit_initialization_mode()
 assert wing.do_step(0.0, 1.0) is True, wing.log_queue
 assert wing.get_real([12])[0] != 0.0
 """
+IMPORT_OF_PROJECT = re.compile(rb"^\s*(?:from|import) (?:fe|fmu_asset|reporting)\b", re.MULTILINE)
 
 
-def test_it_needs_numpy_alone(ours, tmp_path) -> None:
-    """The runtime loads where there is nothing of the project and no other package."""
-    project = re.compile(rb"^\s*(?:from|import) (?:fe|fmu_asset|reporting)\b", re.MULTILINE)
-    for name in ("python", "sensing", "patched"):
-        texts = {entry: text for entry, text in members(ours(name)).items() if entry.endswith(".py")}
-        assert not [entry for entry, text in texts.items() if project.search(text)]
+@pytest.mark.parametrize("name", ["python", "sensing", "patched"])
+def test_an_fmu_in_python_imports_nothing_of_the_project(ours, name):
+    contents = members(ours(name))
+
+    importing = [
+        entry
+        for entry, text in contents.items()
+        if entry.endswith(".py") and IMPORT_OF_PROJECT.search(text)
+    ]
+
+    assert importing == []
+
+
+def test_an_fmu_in_python_needs_numpy_alone(ours, tmp_path):
+    """Its code runs where there is nothing of the project and no other package."""
     shutil.unpack_archive(ours("python"), tmp_path, "zip")
-    assert {path.name for path in (tmp_path / "binaries").iterdir()} == {"linux64", "win64"}
     for folder in Path(np.__file__).parents[1].glob("numpy*"):
         (tmp_path / "resources" / folder.name).symlink_to(folder)
     environment = {"PYTHONPATH": str(tmp_path / "resources")}
-    done = run([sys.executable, "-S", "-c", ALONE], cwd=tmp_path, env=environment)
+
+    done = run([sys.executable, "-S", "-c", RUN_ALONE], cwd=tmp_path, env=environment)
+
     assert done.returncode == 0, done.stderr
+
+
+def test_an_fmu_in_python_has_binaries_of_two_platforms(ours):
+    binaries = [name for name in members(ours("python")) if name.startswith("binaries/")]
+
+    assert {Path(name).parts[1] for name in binaries} == {"linux64", "win64"}
 
 
 # ---------------------------------------------------------------------- the compiled kind
 
 
-def test_the_sources_alone_are_the_same_fmu_without_a_binary(ours, model, tmp_path, monkeypatch) -> None:
-    whole = members(ours("compiled"))
-    with monkeypatch.context() as patch:
-        patch.setenv("PATH", str(tmp_path))  # needs no compiler
-        sources = build_fmu(model, tmp_path / "source.fmu", kind="source")
-    assert sources.guid == read_model_description(str(ours("compiled"))).guid
-    assert members(sources.path) == {n: c for n, c in whole.items() if not n.startswith("binaries/")}
-    assert len(whole) == len(members(sources.path)) + 1
-    assert json.loads(whole["resources/design.json"]) == {"design_hash": model.design_hash}
+@pytest.fixture(scope="module")
+def source_fmu(model, tmp_path_factory):
+    """The FMU of sources alone, which is packed without a compiler."""
+    folder = tmp_path_factory.mktemp("source")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", str(folder))
+        return build_fmu(model, folder / "source.fmu", kind="source")
+
+
+def test_the_sources_alone_are_the_compiled_fmu_without_its_binary(ours, source_fmu):
+    compiled = members(ours("compiled"))
+    sources = members(source_fmu.path)
+
+    assert sources == without_binaries(compiled)
+    assert len(compiled) == len(sources) + 1
+
+
+def test_the_sources_alone_have_the_identity_of_the_compiled_fmu(source_fmu, compiled_description):
+    assert source_fmu.guid == compiled_description.guid
+
+
+def test_the_sources_alone_cannot_be_flown(source_fmu):
     with pytest.raises(errors.FmuUnsupportedError, match="no binary for this platform"):
-        FmiAsset(sources.path, WING_BINDING)
+        FmiAsset(source_fmu.path, WING_BINDING)
+
+
+def test_the_compiled_fmu_has_the_hash_of_its_design(ours, model):
+    design = json.loads(members(ours("compiled"))["resources/design.json"])
+
+    assert design == {"design_hash": model.design_hash}
 
 
 @pytest.mark.long
-def test_fmpy_compiles_the_sources(ours, tmp_path) -> None:
+def test_fmpy_compiles_the_sources(ours, tmp_path):
     """As a user of another platform does: the sources alone, through fmpy's own CMake project."""
-    installed("cmake")
-    kept = {n: c for n, c in members(ours("compiled")).items() if not n.startswith("binaries/")}
-    path = archive_of(tmp_path / "wing.fmu", kept)
-    words = [BIN / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"]
-    run(words, check=True, env={**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"})
+    find_program("cmake")
+    path = archive_of(tmp_path / "wing.fmu", without_binaries(members(ours("compiled"))))
+    search_path = f"{PROGRAMS}{os.pathsep}{os.environ['PATH']}"
+
+    run(
+        [PROGRAMS / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"],
+        check=True,
+        env={**os.environ, "PATH": search_path},
+    )
+
     assert check_fmu(path).passed
     with FmiAsset(path, WING_BINDING) as theirs, FmiAsset(ours("compiled"), WING_BINDING) as mine:
         for z1 in (0.0, 0.5):
-            seen = [asset.step({"load_factor": 3.0}, {"z1": z1}) for asset in (theirs, mine)]
-            np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
+            their_step = theirs.step({"load_factor": 3.0}, {"z1": z1})
+            my_step = mine.step({"load_factor": 3.0}, {"z1": z1})
+            np.testing.assert_allclose(their_step.values, my_step.values, rtol=1e-12)
 
 
-def test_cmake_builds_the_sources(model, compiler, tmp_path) -> None:
+def test_cmake_builds_the_sources(model, compiler, tmp_path):
     """As on another platform: the project among the sources puts the binary in its place."""
-    cmake, wing = installed("cmake"), tmp_path / "wing"
-    shutil.unpack_archive(build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=3).path, wing, "zip")
-    place = ["-S", wing / "sources", "-B", tmp_path / "build", "-DCMAKE_C_FLAGS=-O0 -Werror"]
-    for words in ([*place, "-DCMAKE_BUILD_TYPE=Debug"], ["--build", tmp_path / "build"]):
-        run([cmake, *words], check=True)
+    cmake = find_program("cmake")
+    wing = tmp_path / "wing"
+    build_folder = tmp_path / "build"
+    packed = build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=3)
+    shutil.unpack_archive(packed.path, wing, "zip")
+
+    folders = ["-S", wing / "sources", "-B", build_folder]
+    flags = ["-DCMAKE_C_FLAGS=-O0 -Werror", "-DCMAKE_BUILD_TYPE=Debug"]
+    run([cmake, *folders, *flags], check=True)
+    run([cmake, "--build", build_folder], check=True)
+
     identifier = read_model_description(str(wing)).coSimulation.modelIdentifier
-    assert [path.name for path in (wing / "binaries" / "x86_64-linux").iterdir()] == [f"{identifier}.so"]
+    binaries = [path.name for path in (wing / "binaries" / "x86_64-linux").iterdir()]
+    assert binaries == [f"{identifier}.so"]
 
 
-def test_compilers_that_are_not_there_fail_or_are_chosen(compiler, model, tmp_path, monkeypatch) -> None:
+# ---------------------------------------------------------------------- compilers
+
+
+def test_an_error_of_the_compiler_is_shown_with_its_line(compiler):
     with pytest.raises(errors.FmuBuildError, match=r"failed with exit code 1.*(?s:.*)wing\.c:1"):
         compile_library({"wing.c": b"this is no C;\n"})
+
+
+def test_a_compiler_is_chosen_with_its_options(compiler, monkeypatch):
     monkeypatch.setenv("CC", f"{compiler[0]} -DANSWER=fmi2_answer")
-    assert find_compiler()[1:] == ["-DANSWER=fmi2_answer"]
     source = b'__attribute__((visibility("default"))) int ANSWER(void) { return 42; }\n'
+
+    assert find_compiler()[1:] == ["-DANSWER=fmi2_answer"]
     assert b"fmi2_answer" in compile_library({"answer.c": source})
+
+
+def test_a_compiler_that_writes_nothing_has_failed(compiler, monkeypatch):
     monkeypatch.setenv("CC", shutil.which("true") or "true")
+
     with pytest.raises(errors.FmuBuildError, match="failed with exit code 0"):
         compile_library({"wing.c": b"int wing;\n"})
+
+
+def test_a_chosen_compiler_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler -m64")
+
     with pytest.raises(errors.FmuBuildError, match="looked for: CC=no-such-compiler -m64"):
         find_compiler()
+
+
+def test_without_a_compiler_the_sources_can_be_packed(model, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CC")
-    words = r"looked for: cc, gcc, clang\); install one .* --kind source"
-    with pytest.raises(errors.FmuBuildError, match=words):
+    monkeypatch.delenv("CC", raising=False)
+    sentence = r"looked for: cc, gcc, clang\); install one .* --kind source"
+
+    with pytest.raises(errors.FmuBuildError, match=sentence):
         build_fmu(model, tmp_path / "wing.fmu", kind="compiled")
+
     assert not (tmp_path / "wing.fmu").exists()
 
 
 # ---------------------------------------------------------------------- another host
 
+SIMULATE_WITH_REFUSED_STEP = """
+import sys
+import numpy as np
+from fmpy import simulate_fmu
+
+types = [("time", "f8"), ("load_factor", "f8")]
+load_factor = np.array([(0.0, 1.0), (3.0, 99.0)], dtype=types)
+result = simulate_fmu(
+    sys.argv[1], stop_time=5.0, step_size=1.0, output_interval=1.0, input=load_factor,
+    output=["strain[1]"],
+)
+print(result["time"].tolist())
+"""
+
 
 @pytest.mark.parametrize("kind", ["compiled", "python"])
-def test_fmpy_ends_a_simulation_at_a_refused_step(ours, kind) -> None:
-    """In a process with a time limit: a host that is not told to end repeats the refused step for ever."""
-    program = (
-        "import sys, numpy as np; from fmpy import simulate_fmu\n"
-        "course = np.array([(0.0, 1.0), (3.0, 99.0)], dtype=[('time', 'f8'), ('load_factor', 'f8')])\n"
-        "seen = simulate_fmu(sys.argv[1], stop_time=5.0, step_size=1.0, output_interval=1.0, input=course,"
-        " output=['strain[1]'])\n"
-        "print(seen['time'].tolist())"
-    )
-    said = run_python(program, ours(kind), timeout=60)
-    assert said.splitlines()[-1] == "[0.0, 1.0, 1.0]"
-    assert kind == "python" or "load_factor = 33.6" in said
+def test_fmpy_ends_a_simulation_at_a_refused_step(ours, kind):
+    """In a process with a time limit.
+
+    A host that is not told to end repeats the refused step for ever.
+    """
+    output = run_python(SIMULATE_WITH_REFUSED_STEP, ours(kind), timeout=60)
+
+    assert output.splitlines()[-1] == "[0.0, 1.0, 1.0]"
+    assert kind == "python" or "load_factor = 33.6" in output

@@ -28,16 +28,23 @@ def elements(variable: VariableInfo) -> list[str]:
 class Slave:
     """An instance whose statuses and log messages are kept; none is an exception.
 
-    Elements of the arrays of FMI 3 go by the names and value references of FMI 2: those of ours begin at the
-    array's. With `like`, another instance of the FMU that one has extracted.
+    Elements of the arrays of FMI 3 go by the names and value references of FMI 2: those of our
+    FMUs begin at the reference of the array. With `like`, this is another instance of the FMU that
+    the other one has extracted.
     """
 
     def __init__(self, path: Path, *, like: "Slave | None" = None) -> None:
         self.description = read_fmu(path) if like is None else like.description
         self.folder = extract_fmu(self.description) if like is None else like.folder
         self._owns_folder = like is None
-        self._instance = open_instance(Plan(str(self.folder), self.description.identity, "wing", (), ()))
-        self.fmu, self.log, self.take = self._instance._fmu, self._instance.messages, self._instance.log
+        self._instance = open_instance(
+            Plan(str(self.folder), self.description.identity, "wing", (), ())
+        )
+        self.fmu, self.log, self.take = (
+            self._instance._fmu,
+            self._instance.messages,
+            self._instance.log,
+        )
         self.three = self.description.major_version == 3
         self.real, self.whole = ("Float64", "Int64") if self.three else ("Real", "Integer")
         self.reference: dict[str, int] = {}
@@ -49,7 +56,9 @@ class Slave:
             self.reference |= dict(zip(names, places, strict=True))
             self.variables |= dict.fromkeys(names, variable)
             self._arrays |= dict.fromkeys(places, places)
-        real = {n: v for n, v in self.variables.items() if v.kind in FLOAT_KINDS and v.name != "time"}
+        real = {
+            n: v for n, v in self.variables.items() if v.kind in FLOAT_KINDS and v.name != "time"
+        }
         self.names = list(real)
         self.inputs = [name for name, variable in real.items() if variable.causality == "input"]
 
@@ -94,7 +103,10 @@ class Slave:
 
     def derivative(self, unknowns: Sequence[str], seed: Mapping[str, float]) -> np.ndarray:
         """Return the directional derivative of variables."""
-        places, given = [self.reference[n] for n in unknowns], {self.reference[n]: v for n, v in seed.items()}
+        places, given = (
+            [self.reference[n] for n in unknowns],
+            {self.reference[n]: v for n, v in seed.items()},
+        )
         (results, order), (knowns, sown) = self._whole(places), self._whole(list(given))
         count = [len(order)] if self.three else []
         seeds = [given.get(place, 0.0) for place in sown]
@@ -124,7 +136,10 @@ class Slave:
         getattr(self.fmu, f"set{self.whole}")([self.reference["response"]], [response])
 
     def start(self, *, response: int | None = 1, anew: bool = True, **values: float) -> int:
-        """Reset if `anew`, set values, dots in their names written as two underscores, and initialise."""
+        """Reset if `anew`, set values, and initialise.
+
+        Dots in the names of values are written as two underscores.
+        """
         if anew:
             self.fmu.reset()
         self.initialising()

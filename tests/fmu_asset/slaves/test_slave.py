@@ -1,353 +1,637 @@
-"""What runs inside our FMUs, called as FMI says: in Python, and compiled of FMI 2 and of FMI 3, alike.
+"""What runs inside our FMUs, called as FMI says.
 
-Phases, refusals that change nothing, lazy outputs, serialised state; and that all give the same numbers.
+There are FMUs in Python and compiled ones, of FMI 2 and of FMI 3. All have the same phases,
+refusals that change nothing, lazy outputs and serialised state, and all give the same numbers.
 """
 
 import ctypes
 import math
-import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
 from fmpy.fmi3 import fmi3IntermediateUpdateCallback, fmi3LogMessageCallback
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.slaves import variables
+from fmu_asset.slaves.variables import Status
 from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.slaves.flights import assert_same_numbers, fly_at_random
 from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave
 
 RESULTS = slice(10, None)
-"""Places in `everything()` of a wing, the real variables in order."""
-GOOD, STILL = [2.0, 0.1, 0.2, 1.0], [1.0, 0.0, 0.0, 0.0]
+"""Places of the results in `everything()` of a wing, behind inputs and parameters."""
+GOOD_INPUTS = [2.0, 0.1, 0.2, 1.0]
+"""Load factor, health of both regions, force at the tip."""
+LEVEL_FLIGHT = [1.0, 0.0, 0.0, 0.0]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two instances of one kind."""
+
+    first: Slave
+    twin: Slave
 
 
 @pytest.fixture(scope="module", params=["python", "compiled", "fmi3"])
-def pair(request: pytest.FixtureRequest, ours: OurFmus) -> Iterator[tuple[Slave, Slave]]:
-    """Two instances of one kind; every test starts them anew."""
-    with closing(Slave(ours(request.param))) as one, closing(Slave(ours(request.param))) as two:
-        yield one, two
+def pair(request: pytest.FixtureRequest, ours: OurFmus) -> Iterator[Pair]:
+    """Every test starts both instances anew."""
+    path = ours(request.param)
+    with closing(Slave(path)) as first, closing(Slave(path)) as twin:
+        yield Pair(first, twin)
 
 
 @pytest.fixture
-def slave(pair: tuple[Slave, Slave]) -> Slave:
-    return pair[0]
+def slave(pair: Pair) -> Slave:
+    return pair.first
+
+
+@pytest.fixture(scope="module")
+def python_slave(ours: OurFmus) -> Iterator[Slave]:
+    with closing(Slave(ours("python"))) as slave:
+        yield slave
+
+
+@pytest.fixture(scope="module", params=["compiled", "fmi3"])
+def compiled_slave(request: pytest.FixtureRequest, ours: OurFmus) -> Iterator[Slave]:
+    with closing(Slave(ours(request.param))) as slave:
+        yield slave
 
 
 def is_compiled(slave: Slave) -> bool:
     return slave.description.path.stem != "python"
 
 
-# ---------------------------------------------------------------------- numbers
+# ---------------------------------------------------------------------- the same numbers
 
 
-def random_flight(slave: Slave, seed: int, response: int, damping: str = "", steps: int = 25) -> np.ndarray:
-    """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
-    rng = np.random.default_rng(seed)
-    ranged = {
-        n: (v.minimum, v.maximum, v.causality) for n, v in slave.variables.items() if v.maximum is not None
-    }
-    start = {
-        name.replace(".", "__"): rng.uniform(low, high)
-        for name, (low, high, causality) in ranged.items()
-        if causality == "parameter" and not name.startswith(("damping", "initial", "response"))
-    }
-    alpha, beta = rng.choice([0.0, rng.uniform(0.5, 5.0)]), rng.uniform(3e-4, 1e-3)
-    if "initial_tip_displacement" in slave.reference:
-        start["initial_tip_displacement"] = rng.uniform(-0.1, 0.1)
-        start["damping__beta"] = {"": beta, "over": 20.0 * beta, "none": 0.0}[damping]
-    start["damping__alpha"] = {"": alpha, "over": rng.uniform(60.0, 900.0), "none": 0.0}[damping]
-    assert slave.start(response=response, **start) == OK, slave.log
-    values = {name: float(name == "load_factor") for name in slave.inputs}
-    time, seen = 0.0, [slave.everything()]
-    for _ in range(steps):
-        for name in values:
-            if rng.random() < (0.3 if name.startswith("health") else 0.5):
-                values[name] = float(rng.uniform(*ranged[name][:2]))
-        if rng.random() < 0.2:
-            values[str(rng.choice([name for name in values if not name.startswith("health")]))] = 0.0
-        size = float(rng.choice([1e-5, 1e-4, 1e-3, 0.01, 0.1, 1.0][: 4 if damping == "none" else 6]))
-        assert slave.step(list(values.values()), time, size) == OK, slave.log
-        time += size
-        seen.append(slave.everything())
-    return np.array(seen)
+@dataclass(frozen=True)
+class Response:
+    """A value of the parameter `response`, and damping as `draw_parameters` has it."""
+
+    number: int
+    damping: str = ""
 
 
-def assert_same_numbers(
-    names: list[str], ours: np.ndarray, expected: np.ndarray, *, so_far: bool = True
-) -> None:
-    """Compare to 1e-12: with the largest of its kind in the flight (so far), modal outputs with each.
-
-    A bound is made of strains or displacements that cancel; accelerations jump.
-    """
-    each = np.abs(expected)
-    largest = np.maximum.accumulate(each)
-    kinds = [re.match("strain|acceleration|(tip_|load_point_)?displacement|", name)[0][-6:] for name in names]
-    for number, kind in enumerate(kinds):
-        alike = largest[:, [other == kind for other in kinds]].max(axis=1) if kind else each[:, number]
-        scale = alike[-1] if kind == "ration" or (kind and not so_far) else alike
-        assert np.all(np.abs(ours[:, number] - expected[:, number]) <= 1e-12 * scale), names[number]
+RESPONSES = {
+    "steady": Response(1),
+    "transient": Response(2),
+    "overdamped": Response(2, "over"),
+    "undamped": Response(2, "none"),
+}
 
 
-RESPONSES = {"steady": (1, ""), "transient": (2, ""), "overdamped": (2, "over"), "undamped": (2, "none")}
+@dataclass(frozen=True)
+class Flights:
+    """All real variables of six flights at random, and their names."""
+
+    names: list[str]
+    rows: list[NDArray[np.float64]]
+
+
+@pytest.fixture(scope="module")
+def fly_six_times(ours: OurFmus) -> Callable[[str, str], Flights]:
+    """Fly an FMU with a response, once for all tests that ask for it."""
+
+    @cache
+    def fly(name: str, response: str) -> Flights:
+        number = RESPONSES[response].number
+        damping = RESPONSES[response].damping
+        with closing(Slave(ours(name))) as slave:
+            rows = [fly_at_random(slave, seed, number, damping) for seed in range(6)]
+            return Flights(slave.names, rows)
+
+    return fly
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-@pytest.mark.parametrize("file", ["compiled", "fmi3", "compiled_beam"])
-def test_the_compiled_ones_give_the_numbers_of_that_in_python(ours, file, response) -> None:
+@pytest.mark.parametrize(
+    ("compiled_name", "python_name"),
+    [("compiled", "python"), ("fmi3", "python"), ("compiled_beam", "beam")],
+)
+def test_compiled_fmus_give_the_numbers_of_the_one_in_python(
+    fly_six_times, compiled_name, python_name, response
+):
     """Strains, displacements, accelerations, bounds, frequencies, damping ratios."""
-    python = file.removeprefix("compiled_") if "_" in file else "python"
-    with closing(Slave(ours(file))) as one, closing(Slave(ours(python))) as two:
-        for seed in range(6):
-            seen = [random_flight(each, seed, *RESPONSES[response]) for each in (one, two)]
-            assert_same_numbers(two.names, *seen, so_far=python == "python")
-            if file == "compiled_beam":
-                shaken = seen[0][1:, one.names.index("acceleration.shake")]
-                assert (np.abs(shaken).max() > 0.0) == (response != "steady")
+    compiled = fly_six_times(compiled_name, response)
+    python = fly_six_times(python_name, response)
+
+    for compiled_rows, python_rows in zip(compiled.rows, python.rows, strict=True):
+        assert_same_numbers(
+            python.names, compiled_rows, python_rows, so_far=python_name == "python"
+        )
+
+
+@pytest.mark.parametrize("response", RESPONSES)
+def test_a_beam_has_accelerations_unless_its_response_is_steady(fly_six_times, response):
+    beam = fly_six_times("compiled_beam", response)
+    column = beam.names.index("acceleration.shake")
+
+    for rows in beam.rows:
+        _, *accelerations = rows[:, column]
+        assert (np.abs(accelerations).max() > 0.0) == (response != "steady")
+
+
+def beam_with_close_modes(model):
+    """Return a beam with a double mode, two modes 1e-7 apart and two 1e-3, whatever its loss."""
+    size = model.modal_load.shape[1]
+    term_count = len(model.modal_stiffness)
+    random = np.random.default_rng(5)
+    rotation, _ = np.linalg.qr(random.normal(size=(size, size)))
+    squares = 1e6 * np.arange(1.0, size + 1.0) ** 2
+    squares[2] = squares[1]
+    squares[4] = squares[3] * (1.0 + 1e-7)
+    squares[6] = squares[5] * 1.001
+    stiffness = (rotation * squares) @ rotation.T
+    masses = np.zeros_like(model.modal_mass)
+    masses[0] = np.eye(size)
+    return replace(
+        model,
+        modal_stiffness=np.multiply.outer(np.full(term_count, 1.0 / term_count), stiffness),
+        modal_mass=masses,
+        cross_mass=np.zeros_like(model.cross_mass),
+    )
+
+
+def test_modes_that_coincide_are_those_in_python(compiler, ours, tmp_path):
+    """Motion and frequencies agree to 1e-9."""
+    model = beam_with_close_modes(ours.model("beam"))
+    compiled_path = build_fmu(model, tmp_path / "compiled.fmu", kind="compiled").path
+    python_path = build_fmu(model, tmp_path / "python.fmu").path
+
+    with closing(Slave(compiled_path)) as compiled, closing(Slave(python_path)) as python:
+        for seed in range(3):
+            compiled_rows = fly_at_random(compiled, seed, 2)
+            python_rows = fly_at_random(python, seed, 2)
+
+            scale = np.maximum(np.abs(python_rows).max(axis=0), 1e-300)
+            error = np.abs(compiled_rows - python_rows).max(axis=0)
+            assert (error <= 1e-9 * scale).all()
+
+
+# ---------------------------------------------------------------------- initialisation
+
+
+def initialise(slave, response, load_factors, inputs):
+    """Set load factors one after another while initialising, and read everything after each."""
+    slave.initialising(3.0)
+    slave.choose(response)
+    values = []
+    for load_factor in load_factors:
+        slave.set(inputs | {"load_factor": load_factor, "health.z1": 0.4})
+        values = slave.everything()
+    assert slave.status_of(slave.fmu.exitInitializationMode) == OK
+    return values
+
+
+@pytest.fixture(scope="module", params=["python", "compiled", "fmi3", "sensing"])
+def initialised_kind(request, ours):
+    """The path of a kind, and what its inputs need."""
+    inputs = {"effect.coupling.active": 1.0} if request.param == "sensing" else {}
+    return ours(request.param), inputs
 
 
 @pytest.mark.parametrize("response", [1, 2])
-@pytest.mark.parametrize("file", ["python", "compiled", "fmi3", "sensing"])
-def test_what_is_read_while_initialising_is_that_of_the_start(ours, file, response) -> None:
-    """And leaves no trace."""
-    seen, given = [], {"effect.coupling.active": 1.0} if file == "sensing" else {}
-    for factors in ((2.5, 3.5), (3.5,)):
-        with closing(Slave(ours(file))) as slave:
-            slave.initialising(3.0)
-            slave.choose(response)
-            for factor in factors:
-                slave.set(given | {"load_factor": factor, "health.z1": 0.4})
-                told = slave.everything()
-            assert slave.status_of(slave.fmu.exitInitializationMode) == OK
-            assert slave.everything() == told
+def test_what_is_read_while_initialising_is_that_of_the_start(initialised_kind, response):
+    path, inputs = initialised_kind
+
+    with closing(Slave(path)) as slave:
+        while_initialising = initialise(slave, response, (2.5, 3.5), inputs)
+
+        assert slave.everything() == while_initialising
+
+
+@pytest.mark.parametrize("response", [1, 2])
+def test_values_that_were_set_before_the_last_ones_leave_no_trace(initialised_kind, response):
+    path, inputs = initialised_kind
+
+    after_step = []
+    for load_factors in ((2.5, 3.5), (3.5,)):
+        with closing(Slave(path)) as slave:
+            initialise(slave, response, load_factors, inputs)
             assert slave.status_of(slave.fmu.doStep, 3.0, 0.5) == OK
-            seen.append(slave.everything())
-    assert seen[0] == seen[1]
+            after_step.append(slave.everything())
+
+    assert after_step[0] == after_step[1]
 
 
-def test_modes_that_coincide_are_those_in_python(compiler, ours, tmp_path) -> None:
-    """A double mode, two 1e-7 apart, two 1e-3, whatever the loss: motion and frequencies to 1e-9."""
-    beam_model = ours.model("beam")
-    size, terms = beam_model.modal_load.shape[1], len(beam_model.modal_stiffness)
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(size, size)))[0]
-    squares = 1e6 * np.arange(1.0, size + 1.0) ** 2
-    squares[2], squares[4], squares[6] = squares[1], squares[3] * (1.0 + 1e-7), squares[5] * 1.001
-    masses = np.zeros_like(beam_model.modal_mass)
-    masses[0] = np.eye(size)
-    model = replace(
-        beam_model,
-        modal_stiffness=np.multiply.outer(np.full(terms, 1.0 / terms), (turn * squares) @ turn.T),
-        modal_mass=masses,
-        cross_mass=np.zeros_like(beam_model.cross_mass),
-    )
-    compiled = build_fmu(model, tmp_path / "compiled.fmu", kind="compiled").path
-    python = build_fmu(model, tmp_path / "python.fmu").path
-    with closing(Slave(compiled)) as one, closing(Slave(python)) as two:
-        for seed in range(3):
-            seen, expected = (random_flight(each, seed, 2) for each in (one, two))
-            scale = np.maximum(np.abs(expected).max(axis=0), 1e-300)
-            assert (np.abs(seen - expected).max(axis=0) <= 1e-9 * scale).all()
+# ---------------------------------------------------------------------- refused steps
 
 
-# ---------------------------------------------------------------------- refusals
+@dataclass(frozen=True)
+class RefusedStep:
+    """A step that is refused with Discard.
+
+    Attributes
+    ----------
+    status : Status
+        The output `status` after it.
+    place : int or None
+        The input that is wrong, if one is.
+    value : float
+        What it is set to.
+    time, length : float
+        The communication point and the length of the step [s].
+    """
+
+    status: Status
+    place: int | None = None
+    value: float = 0.0
+    time: float = 0.01
+    length: float = 0.01
+
+    @property
+    def inputs(self) -> list[float]:
+        inputs = list(GOOD_INPUTS)
+        if self.place is not None:
+            inputs[self.place] = self.value
+        return inputs
+
+    def sentence(self, slave: Slave) -> str:
+        """Return what the log must say: the wrong input, or where the instance stands."""
+        if self.place is not None:
+            health = "health[{}]" if slave.three else "health.z{}"
+            names = ("load_factor", health.format(1), health.format(2), "tip_force")
+            return names[self.place]
+        return "stands at t = 0.01" if self.time in (0.0, 0.5) else ""
 
 
-WRONG_VALUES = st.sampled_from([math.nan, math.inf, -math.inf]) | st.floats(130.0, 1e300).map(
-    lambda value: value if value % 2.0 else -value
+PLACES = st.integers(0, 3)
+FAR_VALUES = st.floats(130.0, 1e300).map(lambda value: value if value % 2.0 else -value)
+WRONG_INPUTS = st.one_of(
+    st.builds(
+        RefusedStep,
+        status=st.just(Status.NOT_FINITE),
+        place=PLACES,
+        value=st.sampled_from([math.nan, math.inf, -math.inf]),
+    ),
+    st.builds(RefusedStep, status=st.just(Status.OUTSIDE_RANGE), place=PLACES, value=FAR_VALUES),
 )
-WRONG_TIMES = [(0.01, size) for size in (0.0, -1.0, math.nan, math.inf)]
-WRONG_TIMES += [(time, 0.01) for time in (0.0, 0.5, math.nan)]
+WRONG_TIMES = st.sampled_from(
+    [RefusedStep(Status.BAD_STEP, length=length) for length in (0.0, -1.0, math.nan, math.inf)]
+    + [RefusedStep(Status.BAD_STEP, time=time) for time in (0.0, 0.5, math.nan)]
+)
 
 
-def both_step(pair: tuple[Slave, Slave], time: float) -> None:
-    for one in pair:
-        assert one.step(GOOD, time, 0.01) == OK
-        assert one.status == variables.Status.OK
-    assert pair[0].everything() == pair[1].everything()
+def step_both(pair: Pair, time: float) -> None:
+    """Make a good step with both instances, and compare them."""
+    for slave in (pair.first, pair.twin):
+        assert slave.step(GOOD_INPUTS, time, 0.01) == OK
+        assert slave.status == Status.OK
+    assert pair.first.everything() == pair.twin.everything()
 
 
 @settings(deadline=None)
-@given(st.tuples(st.integers(0, 3), WRONG_VALUES) | st.sampled_from(WRONG_TIMES), st.sampled_from([1, 2]))
-def test_refused_steps_change_nothing(pair, wrong, response) -> None:
+@given(WRONG_INPUTS | WRONG_TIMES, st.sampled_from([1, 2]))
+def test_refused_steps_change_nothing(pair, refused_step, response):
     """They are refused with Discard; the other instance never makes them."""
-    slave, twin = pair
-    for one in pair:
-        one.start(response=response, initial_tip_displacement=0.01)
-    both_step(pair, 0.0)
-    inputs, times, status, said = list(GOOD), (0.01, 0.01), variables.Status.BAD_STEP, ""
-    if wrong in WRONG_TIMES:
-        times = wrong
-        said = "stands at t = 0.01" if times[0] in (0.0, 0.5) else ""
-    else:
-        index, inputs[wrong[0]] = wrong
-        status = variables.Status.OUTSIDE_RANGE if math.isfinite(wrong[1]) else variables.Status.NOT_FINITE
-        health = "health[{}]" if slave.three else "health.z{}"
-        said = ("load_factor", health.format(1), health.format(2), "tip_force")[index]
-    before = slave.everything()
-    assert slave.step(inputs, *times) == DISCARD
-    assert slave.status == status
-    assert slave.log[-1][0] == DISCARD
-    assert said in slave.log[-1][1]
-    assert slave.everything()[RESULTS] == before[RESULTS] == twin.everything()[RESULTS]
-    if not slave.three and wrong not in WRONG_TIMES:
+    slave = pair.first
+    for instance in (pair.first, pair.twin):
+        instance.start(response=response, initial_tip_displacement=0.01)
+    step_both(pair, 0.0)
+    results_before = slave.everything()[RESULTS]
+
+    status = slave.step(refused_step.inputs, refused_step.time, refused_step.length)
+
+    assert (status, slave.status) == (DISCARD, refused_step.status)
+    assert_logged(slave, DISCARD, refused_step.sentence(slave))
+    assert slave.everything()[RESULTS] == results_before == pair.twin.everything()[RESULTS]
+    if not slave.three and refused_step.place is not None:
         assert slave.status_of(slave.fmu.getRealStatus, 2) == OK
-    both_step(pair, 0.01)
+    step_both(pair, 0.01)
 
 
-def test_calls_in_the_wrong_phase(slave) -> None:
-    fmu, compiled = slave.fmu, is_compiled(slave)
-    fmu.reset()
-    assert slave.status_of(fmu.doStep, 0.0, 1.0) != OK
+def assert_logged(slave: Slave, status: int, sentence: str) -> None:
+    """Assert that the last message has a status and holds a sentence."""
+    logged_status, text = slave.log[-1]
+    assert logged_status == status
+    assert sentence in text
+
+
+# ---------------------------------------------------------------------- calls in the wrong phase
+
+
+def test_a_step_before_initialisation_is_refused(slave):
+    slave.fmu.reset()
+
+    assert slave.status_of(slave.fmu.doStep, 0.0, 1.0) != OK
     assert "before initialisation" in slave.log[-1][1]
-    assert slave.start() == OK
-    slave.status_of(fmu.enterInitializationMode)
-    assert slave.status == variables.Status.BAD_CALL
-    for kind, name, value in (
-        (slave.real, "mass.servo", 0.2),
-        (slave.whole, "response", 2),
-        (slave.real, "strain[1]", 1.0),
-        (slave.real, "response", 1.0),
-        (slave.real, "", 1.0),
-        ("Boolean", "load_factor", True),
-        ("String", "load_factor", "x"),
-    ):
-        before, call = slave.everything(), getattr(fmu, f"set{kind}")
-        assert (slave.status_of(call, [slave.reference.get(name, 999)], [value]) != OK) == compiled
-        assert slave.status == variables.Status.BAD_CALL
-        assert slave.everything() == before
-    if not compiled:
-        assert all(math.isnan(fmu.getReal(unknown)[-1]) for unknown in ([999], [49, 50, 51], [0, 999]))
-        assert (fmu.getString([0]), list(fmu.getReal([]))) == ([b""], [])
-        assert any("fixed parameter" in text for _, text in slave.log)
-    assert slave.step(STILL, 0.0, 1.0) == OK
-    fmu.terminate()
-    assert slave.step(STILL, 1.0, 1.0) != OK
-    assert "after termination" in slave.log[-1][1] or compiled
-    assert slave.everything()[10] != 0.0
-    assert slave.start() == OK
-    if compiled:
-        fmu.reset()
-        assert slave.status_of(fmu.exitInitializationMode) == ERROR
 
 
-def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
+def test_a_second_initialisation_is_refused(slave):
+    assert slave.start() == OK
+
+    slave.status_of(slave.fmu.enterInitializationMode)
+
+    assert slave.status == Status.BAD_CALL
+
+
+WRONG_SETS = {
+    "a parameter": ("real", "mass.servo", 0.2),
+    "a structural parameter": ("whole", "response", 2),
+    "an output": ("real", "strain[1]", 1.0),
+    "another type": ("real", "response", 1.0),
+    "an unknown variable": ("real", "", 1.0),
+    "a Boolean": ("Boolean", "load_factor", True),
+    "a text": ("String", "load_factor", "x"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SETS)
+def test_a_variable_that_cannot_be_set_in_flight_is_refused(slave, case):
+    """That in Python returns OK all the same, because pythonfmu has no other status."""
+    kind, name, value = WRONG_SETS[case]
+    type_name = {"real": slave.real, "whole": slave.whole}.get(kind, kind)
+    assert slave.start() == OK
+    before = slave.everything()
+
+    setter = getattr(slave.fmu, f"set{type_name}")
+    status = slave.status_of(setter, [slave.reference.get(name, 999)], [value])
+
+    assert (status != OK) == is_compiled(slave)
+    assert slave.status == Status.BAD_CALL
+    assert slave.everything() == before
+
+
+def test_a_fixed_parameter_is_named_in_the_log_of_python(python_slave):
+    assert python_slave.start() == OK
+
+    python_slave.fmu.setReal([python_slave.reference["mass.servo"]], [0.2])
+
+    assert any("fixed parameter" in text for _, text in python_slave.log)
+
+
+@pytest.mark.parametrize("references", [[999], [49, 50, 51], [0, 999]])
+def test_unknown_variables_in_python_are_not_a_number(python_slave, references):
+    assert python_slave.start() == OK
+
+    assert math.isnan(python_slave.fmu.getReal(references)[-1])
+
+
+def test_no_variables_in_python_have_no_values(python_slave):
+
+    assert python_slave.fmu.getString([0]) == [b""]
+    assert list(python_slave.fmu.getReal([])) == []
+
+
+def test_a_step_after_termination_is_refused(slave):
+    assert slave.start() == OK
+    assert slave.step(LEVEL_FLIGHT, 0.0, 1.0) == OK
+    slave.fmu.terminate()
+
+    assert slave.step(LEVEL_FLIGHT, 1.0, 1.0) != OK
+
+    first_result = slave.everything()[RESULTS.start]
+    assert first_result != 0.0
+    assert "after termination" in slave.log[-1][1] or is_compiled(slave)
+
+
+def test_an_instance_starts_again_after_termination(slave):
+    assert slave.start() == OK
+    slave.fmu.terminate()
+
+    assert slave.start() == OK
+
+
+def test_an_initialisation_that_was_not_entered_cannot_be_left(compiled_slave):
+    compiled_slave.fmu.reset()
+
+    assert compiled_slave.status_of(compiled_slave.fmu.exitInitializationMode) == ERROR
+
+
+# ---------------------------------------------------------------------- calls of FMI 3 itself
+
+
+@dataclass(frozen=True)
+class Fmi3Call:
+    """A wrong call, its status, and what the log says."""
+
+    name: str
+    arguments: tuple[object, ...]
+    status: int
+    sentence: str
+
+
+@pytest.fixture(scope="module")
+def flying_fmi3(ours) -> Iterator[Slave]:
+    """A wing of FMI 3 after one step, with a loss of stiffness that the next step would refuse."""
     with closing(Slave(ours("fmi3"))) as wing:
         assert wing.start(anew=False) == OK
-        assert wing.step(GOOD, 0.0, 1.0) == OK
-        before = wing.everything()
-        health, second, tip = ((ctypes.c_uint * 1)(wing.reference["health.z1"] + n) for n in (0, 1, 34))
-        values, reached = (ctypes.c_double * 3)(0.1, 0.2, 0.3), ctypes.c_double()
-        flags = [ctypes.byref(item) for item in (*(ctypes.c_bool() for _ in range(3)), reached)]
-        times = ctypes.c_double(1.0), ctypes.c_double(1.0), ctypes.c_bool(True)
+        assert wing.step(GOOD_INPUTS, 0.0, 1.0) == OK
         wing.set({"health.z1": 0.95})
-        for name, arguments, status, said in (
-            ("SetFloat64", (health, 1, values, 1), DISCARD, "not the number that the variables have"),
-            ("GetFloat64", (health, 1, values, 3), DISCARD, "not the number that the variables have"),
-            ("GetFloat64", (second, 1, values, 1), ERROR, "value reference 2"),
-            ("SetFloat64", (tip, 1, values, 1), DISCARD, ""),
-            ("GetInt32", (health, 1, (ctypes.c_int32 * 1)(), 1), DISCARD, ""),
-            ("EnterEventMode", (), DISCARD, ""),
-            (
-                "DoStep",
-                (*times, *flags),
-                DISCARD,
-                "health[1] = 0.94999999999999996 lies outside its range 0 to 0.8",
-            ),
-        ):
-            assert int(getattr(wing.fmu.dll, f"fmi3{name}")(wing.fmu.component, *arguments)) == status
-            assert said in wing.log[-1][1]
-        assert reached.value == 1.0
-        assert wing.everything()[RESULTS] == before[RESULTS]
-        assert wing.read([51]) == [1.0]
-        callbacks = fmi3LogMessageCallback(wing.take), fmi3IntermediateUpdateCallback()
-        for token, path in (("{wrong}", b"x"), (wing.fmu.guid, b"/nowhere/")):
-            words = (b"wing", token.encode(), path, False, False, False, False, None, 0, None)
-            assert not wing.fmu.dll.fmi3InstantiateCoSimulation(*words, *callbacks)
-        assert "/nowhere//reduced_model.bin" in wing.log[-1][1]
+        yield wing
+
+
+REACHED_TIME = ctypes.c_double()
+
+
+def wrong_calls(health_reference: int) -> list[Fmi3Call]:
+    """Return calls of functions of FMI 3 with wrong numbers of values, types and modes."""
+
+    def reference(offset: int) -> object:
+        return (ctypes.c_uint * 1)(health_reference + offset)
+
+    health = reference(0)
+    second_element = reference(1)
+    tip_displacement = reference(34)
+    values = (ctypes.c_double * 3)(0.1, 0.2, 0.3)
+    whole_values = (ctypes.c_int32 * 1)()
+    times = (ctypes.c_double(1.0), ctypes.c_double(1.0), ctypes.c_bool(True))
+    flags = [ctypes.byref(ctypes.c_bool()) for _ in range(3)]
+    step_arguments = (*times, *flags, ctypes.byref(REACHED_TIME))
+    wrong_count = "not the number that the variables have"
+    outside = "health[1] = 0.94999999999999996 lies outside its range 0 to 0.8"
+    return [
+        Fmi3Call("SetFloat64", (health, 1, values, 1), DISCARD, wrong_count),
+        Fmi3Call("GetFloat64", (health, 1, values, 3), DISCARD, wrong_count),
+        Fmi3Call("GetFloat64", (second_element, 1, values, 1), ERROR, "value reference 2"),
+        Fmi3Call("SetFloat64", (tip_displacement, 1, values, 1), DISCARD, ""),
+        Fmi3Call("GetInt32", (health, 1, whole_values, 1), DISCARD, ""),
+        Fmi3Call("EnterEventMode", (), DISCARD, ""),
+        Fmi3Call("DoStep", step_arguments, DISCARD, outside),
+    ]
+
+
+def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(flying_fmi3):
+    results_before = flying_fmi3.everything()[RESULTS]
+
+    for call in wrong_calls(flying_fmi3.reference["health.z1"]):
+        function = getattr(flying_fmi3.fmu.dll, f"fmi3{call.name}")
+        assert function(flying_fmi3.fmu.component, *call.arguments) == call.status, call.name
+        assert call.sentence in flying_fmi3.log[-1][1]
+
+    assert flying_fmi3.everything()[RESULTS] == results_before
+
+
+def test_the_time_stays_at_a_refused_step_of_fmi_3(flying_fmi3):
+    *_, refused_step = wrong_calls(flying_fmi3.reference["health.z1"])
+    flying_fmi3.fmu.dll.fmi3DoStep(flying_fmi3.fmu.component, *refused_step.arguments)
+
+    assert REACHED_TIME.value == 1.0
+    assert flying_fmi3.read([51]) == [1.0]
+
+
+@pytest.mark.parametrize("fault", ["another token", "a missing folder"])
+def test_a_wrong_instantiation_of_fmi_3_is_refused(flying_fmi3, fault):
+    token = "{wrong}" if fault == "another token" else flying_fmi3.fmu.guid
+    folder = b"x" if fault == "another token" else b"/nowhere/"
+    callbacks = fmi3LogMessageCallback(flying_fmi3.take), fmi3IntermediateUpdateCallback()
+    flags = (False, False, False, False)
+
+    instance = flying_fmi3.fmu.dll.fmi3InstantiateCoSimulation(
+        b"wing", token.encode(), folder, *flags, None, 0, None, *callbacks
+    )
+
+    assert not instance
+    if fault == "a missing folder":
+        assert "/nowhere//reduced_model.bin" in flying_fmi3.log[-1][1]
+
+
+# ---------------------------------------------------------------------- refused starts and failures
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "right"),
+    ("name", "wrong", "right"),
     [("mass.servo", 9.0, 0.17), ("damping.alpha", math.nan, 0.0), ("response", 3, 1)],
 )
-def test_parameters_that_are_refused_stop_the_start(slave, name, value, right) -> None:
+def test_parameters_that_are_refused_stop_the_start(slave, name, wrong, right):
     key = name.replace(".", "__")
-    slave.start(**{key: value})
-    assert slave.status in (variables.Status.OUTSIDE_RANGE, variables.Status.NOT_FINITE)
+
+    slave.start(**{key: wrong})
+
+    assert slave.status in (Status.OUTSIDE_RANGE, Status.NOT_FINITE)
     assert slave.log[-1][1].startswith(name)
-    assert slave.step(STILL, 0.0, 1.0) != OK
-    assert slave.start(anew=False, **{key: right}) == OK
-    assert slave.step(STILL, 0.0, 1.0) == OK
+    assert slave.step(LEVEL_FLIGHT, 0.0, 1.0) != OK
+    assert_starts_with(slave, key, right)
 
 
-@pytest.mark.parametrize("kind", ["python", "compiled"])
-def test_a_computation_that_fails_is_a_refusal(compiler, model, tmp_path, kind, monkeypatch) -> None:
-    """A model that is not positive definite within its own validity box: nothing changes, nothing crashes."""
+def assert_starts_with(slave: Slave, key: str, value: float) -> None:
+    """Assert that the start is made up for once the parameter is right."""
+    assert slave.start(anew=False, **{key: value}) == OK
+    assert slave.step(LEVEL_FLIGHT, 0.0, 1.0) == OK
+
+
+@pytest.fixture(params=["python", "compiled"])
+def broken(request, compiler, model, tmp_path, monkeypatch) -> Iterator[Slave]:
+    """A model that is not positive definite within its own validity box, after one good step."""
     box = model.validity_box.copy()
     box[1] = (0.0, 5.0)
-    broken = build_fmu(replace(model, validity_box=box), tmp_path / "broken.fmu", kind=kind).path
+    wider = replace(model, validity_box=box)
+    path = build_fmu(wider, tmp_path / "broken.fmu", kind=request.param).path
+    with closing(Slave(path)) as slave:
+        assert slave.start() == OK
+        assert slave.step([1.0, 0.1, 0.0, 0.0], 0.0, 1.0) == OK
+        yield slave
+
+
+def fail_in_python(slave: Slave, patch: pytest.MonkeyPatch) -> None:
+    """Let the static response fail, which Python solves without a positive definite matrix, too."""
 
     def fail(*_: object) -> None:
         raise np.linalg.LinAlgError("not positive definite")
 
-    with closing(Slave(broken)) as one, monkeypatch.context() as patch:
-        assert one.start() == OK
-        assert one.step([1.0, 0.1, 0.0, 0.0], 0.0, 1.0) == OK
-        before = one.everything()
-        if kind == "python":  # which solves it all the same
-            packed = sys.modules[f"{one.description.model_identifier}_runtime.fe.reduced"].ReducedModel
-            patch.setattr(packed, "static_response", fail)
-        assert one.step([1.0, 4.0, 0.0, 0.0], 1.0, 1.0) == DISCARD
-        assert one.status == variables.Status.INTERNAL
-        assert "not positive definite" in one.log[-1][1]
-        assert one.everything()[RESULTS] == before[RESULTS]
-        patch.undo()
-        assert one.step([1.0, 0.2, 0.0, 0.0], 1.0, 1.0) == OK
+    if not is_compiled_path(slave):
+        module = sys.modules[f"{slave.description.model_identifier}_runtime.fe.reduced"]
+        patch.setattr(module.ReducedModel, "static_response", fail)
+
+
+def is_compiled_path(slave: Slave) -> bool:
+    """Return whether the sources of an FMU are compiled, which have no module here."""
+    return f"{slave.description.model_identifier}_runtime.fe.reduced" not in sys.modules
+
+
+def test_a_computation_that_fails_is_a_refusal(broken, monkeypatch):
+    """Nothing changes, nothing crashes."""
+    results_before = broken.everything()[RESULTS]
+    with monkeypatch.context() as patch:
+        fail_in_python(broken, patch)
+        status = broken.step([1.0, 4.0, 0.0, 0.0], 1.0, 1.0)
+
+        assert (status, broken.status) == (DISCARD, Status.INTERNAL)
+        assert "not positive definite" in broken.log[-1][1]
+        assert broken.everything()[RESULTS] == results_before
+
+
+def test_steps_go_on_after_a_computation_that_failed(broken, monkeypatch):
+    with monkeypatch.context() as patch:
+        fail_in_python(broken, patch)
+        broken.step([1.0, 4.0, 0.0, 0.0], 1.0, 1.0)
+
+    assert broken.step([1.0, 0.2, 0.0, 0.0], 1.0, 1.0) == OK
 
 
 # ---------------------------------------------------------------------- state and instances
 
 
-def test_states_of_something_else_are_refused(slave, ours) -> None:
-    compiled = is_compiled(slave)
-    foreign = []
-    for name in ("python" if compiled else "compiled", "compiled_regions" if compiled else "regions"):
-        with closing(Slave(ours(name))) as other:
-            other.start()
-            foreign.append(other.saved())
+@pytest.fixture
+def started(slave: Slave) -> Slave:
+    """An instance whose input was set and not yet stepped with."""
     assert slave.start(response=2) == OK
-    slave.set({"tip_force": 3.0})  # and not yet stepped with
-    state, before = slave.saved(), slave.everything()
-    wrong = [b"", b"x" * 500, state[:-8], *foreign]
-    if compiled:
-        tagged = state[:8] + bytes([state[8] ^ 1]) + state[9:]
-        bad_count = state[:24] + b"\xff\xff\xff\xff" + state[28:]
-        not_finite = state[:-8] + np.float64(math.nan).tobytes()
-        too_short = state[:24] + (20).to_bytes(4, "little") + state[28 : 28 + 160]
-        wrong += [state + b"12345678", tagged, bad_count, not_finite, too_short]
-    for content in wrong:
-        assert slave.restore(content) == ERROR or not compiled
-        assert slave.status == variables.Status.BAD_STATE
-        assert "was not restored" in slave.log[-1][1]
-    assert slave.everything()[:36] == before[:36]
-    assert slave.step(STILL, 0.0, 1.0) == OK
-    assert slave.restore(state) == OK
-    assert slave.everything() == before
+    slave.set({"tip_force": 3.0})
+    return slave
 
 
-def test_two_instances_of_one_library_in_threads_give_what_each_gives_alone(ours) -> None:
-    def flown(one: Slave, seed: int) -> bytes:
-        return random_flight(one, seed, 2, steps=300).tobytes()
+def state_of(path) -> bytes:
+    """Return the serialised state of another FMU."""
+    with closing(Slave(path)) as other:
+        other.start()
+        return other.saved()
+
+
+def wrong_states(slave: Slave, ours: OurFmus) -> list[bytes]:
+    """Return states that are no state of an instance, made from its own state and of other FMUs."""
+    state = slave.saved()
+    states = [b"", b"x" * 500, state[:-8]]
+    if not is_compiled(slave):
+        return [*states, state_of(ours("compiled")), state_of(ours("regions"))]
+    other_tag = state[:8] + bytes([state[8] ^ 1]) + state[9:]
+    other_count = state[:24] + b"\xff\xff\xff\xff" + state[28:]
+    not_finite = state[:-8] + np.float64(math.nan).tobytes()
+    too_short = state[:24] + (20).to_bytes(4, "little") + state[28 : 28 + 160]
+    states += [state + b"12345678", other_tag, other_count, not_finite, too_short]
+    return [*states, state_of(ours("python")), state_of(ours("compiled_regions"))]
+
+
+def test_states_of_something_else_are_refused(started, ours):
+    before = started.everything()
+
+    for state in wrong_states(started, ours):
+        assert started.restore(state) == ERROR or not is_compiled(started)
+        assert started.status == Status.BAD_STATE
+        assert "was not restored" in started.log[-1][1]
+
+    real_count = 36  # results behind are not evaluated once a state was refused
+    assert started.everything()[:real_count] == before[:real_count]
+    assert started.step(LEVEL_FLIGHT, 0.0, 1.0) == OK
+
+
+def test_a_state_is_restored_with_inputs_that_were_not_yet_stepped_with(started):
+    state = started.saved()
+    before = started.everything()
+    assert started.step(LEVEL_FLIGHT, 0.0, 1.0) == OK
+
+    assert started.restore(state) == OK
+
+    assert started.everything() == before
+
+
+def test_two_instances_of_one_library_in_threads_give_what_each_gives_alone(ours):
+    def fly(slave: Slave, seed: int) -> bytes:
+        return fly_at_random(slave, seed, 2, steps=300).tobytes()
 
     path = ours("compiled")
     with closing(Slave(path)) as first, closing(Slave(path, like=first)) as twin:
-        alone = [flown(one, seed) for seed, one in enumerate((first, twin))]
+        alone = [fly(first, 0), fly(twin, 1)]
         with ThreadPoolExecutor(2) as threads:
-            assert list(threads.map(flown, (first, twin), (0, 1))) == alone
-        assert alone[0] != alone[1]
+            together = list(threads.map(fly, (first, twin), (0, 1)))
+
+    assert together == alone
+    assert alone[0] != alone[1]

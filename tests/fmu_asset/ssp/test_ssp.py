@@ -103,7 +103,11 @@ def test_fmpy_reads_and_simulates_it_as_our_jacobi_does(ssp, structure) -> None:
     # It passes the name of an enumeration's item on as if it were a number; the start value is the same item.
     parameters.parameters = [p for p in parameters.parameters if p.type != "Enumeration"]
     theirs = simulate_ssp(
-        str(ssp), stop_time=9.0, step_size=1.0, parameter_set=parameters, input={"load_factor": lambda _: 3.0}
+        str(ssp),
+        stop_time=9.0,
+        step_size=1.0,
+        parameter_set=parameters,
+        input={"load_factor": lambda _: 3.0},
     )
     ours = fly(Wiring(structure), algorithm="jacobi")
     readings = np.array([theirs[f"reading[{gauge}]"] for gauge in range(1, 25)]).T
@@ -121,7 +125,9 @@ numbers = st.floats(-1e6, 1e6).filter(lambda value: value == 0.0 or abs(value) >
     st.floats(0.0, 1.0),
     st.integers(0, 2**31 - 1),
 )
-def test_any_connection_and_value_survives(fmus, tmp_path_factory, drawn, substeps, level, seed) -> None:
+def test_any_connection_and_value_survives(
+    fmus, tmp_path_factory, drawn, substeps, level, seed
+) -> None:
     ends = [("damage.z1", "gauges.strain[1]"), ("damage.z2", "gauges.strain[2]"),
             ("gauges.reading[7]", "damage.load_factor"), ("damage.z1", "out")]  # fmt: skip
     keys = "factor", "offset", "convert_units", "delayed"
@@ -135,7 +141,9 @@ def test_any_connection_and_value_survives(fmus, tmp_path_factory, drawn, subste
         Component("gauges", fmus["gauges"]),
     )
     percent = UnitInfo("%", (0,) * 8, 0.01, 0.0, ())
-    before = SystemStructure("drawn", components, (Connector("out", "output", "%"),), connections, (percent,))
+    before = SystemStructure(
+        "drawn", components, (Connector("out", "output", "%"),), connections, (percent,)
+    )
     folder = tmp_path_factory.mktemp("drawn")
     path = write_ssp(Wiring(before), folder / "x.ssp")
     read_ssd(str(path))  # what SSP has no word for is still valid for others
@@ -215,7 +223,10 @@ def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     assert [name for name, _ in check.components] == ["damage", "structure.wing"]
 
 
-BARE = {name: re.sub(r"ss[mvc]:|xmlns:\w+=\"[^\"]+\"", "", FILES[name]) for name in ("top.ssv", "top.ssm")}
+BARE = {
+    name: re.sub(r"ss[mvc]:|xmlns:\w+=\"[^\"]+\"", "", FILES[name])
+    for name in ("top.ssv", "top.ssm")
+}
 # SSP 1.0, section 5.3: the kinds of the connectors say where a value goes, not the ends of the connection.
 TURNED = re.sub(
     r"(start|end)(?=Element=|Connector=)",
@@ -241,7 +252,9 @@ def test_what_means_the_same_is_read_alike(joined, case) -> None:
 
 def further(*parameters: tuple[str, str]) -> tuple[str, str]:
     """Return the change that gives the system a second parameter binding, with another `%` than its first."""
-    more = "".join(f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>' for name, value in parameters)
+    more = "".join(
+        f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>' for name, value in parameters
+    )
     return "</ssd:ParameterBindings>\n  <ssd:Elements>", CASES["more"] % more
 
 
@@ -286,7 +299,9 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
 
 def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
     """SSP 1.0, 5.2.3: what a parameter binding can set is everything that starts with a given value."""
-    ball = Component("ball", foreign_fmu("ball2"), {"h": ComponentSetting(3.0), "v": ComponentSetting(-1.0)})
+    ball = Component(
+        "ball", foreign_fmu("ball2"), {"h": ComponentSetting(3.0), "v": ComponentSetting(-1.0)}
+    )
     binding = bound(0.1, {"h": (["ball.h", "ball.v"], ["m", "m/s"])})
     with CoupledAsset(SystemStructure("one", (ball,)), binding, isolated=False) as asset:
         asset.reset()
@@ -294,7 +309,11 @@ def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
         assert asset.step().values[0] == pytest.approx(3.0 - 0.1 - 0.5 * 9.81 * 0.01, abs=1e-4)
 
 
-LONG = {"old": 'name="z1" kind="output"', "new": f'name="z1" kind="{"o" * 5000}"', "sentence": r"^.{,700}$"}
+LONG = {
+    "old": 'name="z1" kind="output"',
+    "new": f'name="z1" kind="{"o" * 5000}"',
+    "sentence": r"^.{,700}$",
+}
 
 
 @pytest.mark.parametrize("case", [*CASES["refused"], LONG], ids=lambda case: case["sentence"][:40])
@@ -331,7 +350,10 @@ def test_an_algebraic_loop_is_reported(theirs) -> None:
     )
     check = check_ssp(theirs(change))
     assert check.problems == ()
-    assert "algebraic loop (structure.wing.tip_displacement -> structure.wing.load_factor" in check.loops[0]
+    assert (
+        "algebraic loop (structure.wing.tip_displacement -> structure.wing.load_factor"
+        in check.loops[0]
+    )
 
 
 # ---------------------------------------------------------------------- the step, and what FMUs are called
@@ -406,9 +428,13 @@ def test_a_failing_fmu_is_named_as_in_the_file(foreign_fmu, alarm) -> None:
 
 
 def test_an_fmu_for_another_platform_is_named_as_in_the_file(fmus, alarm, tmp_path) -> None:
-    contents = {n: c for n, c in members(fmus["wing"]).items() if not n.startswith("binaries/linux64")}
+    contents = {
+        n: c for n, c in members(fmus["wing"]).items() if not n.startswith("binaries/linux64")
+    }
     (sentence,) = check_ssp(alarm(archive_of(tmp_path / "elsewhere.fmu", contents))).problems
-    assert re.match(r"resources/horn\.fmu in \S+/alarm\.ssp has no binary for this platform", sentence)
+    assert re.match(
+        r"resources/horn\.fmu in \S+/alarm\.ssp has no binary for this platform", sentence
+    )
 
 
 def test_the_stop_time_of_a_system_is_told_to_its_fmus(foreign_fmu, alarm) -> None:
@@ -418,7 +444,9 @@ def test_the_stop_time_of_a_system_is_told_to_its_fmus(foreign_fmu, alarm) -> No
 def test_an_enumeration_in_a_system_is_set_by_name(alarm, tmp_path) -> None:
     wiring = join_ssp(read_ssp(alarm(), tmp_path / "fmus"))
     experiment = default_experiment(system_description(wiring), values={"siren.loudness": "loud"})
-    with CoupledAsset(wiring, experiment.binding, isolated=False, parameters=experiment.parameters) as asset:
+    with CoupledAsset(
+        wiring, experiment.binding, isolated=False, parameters=experiment.parameters
+    ) as asset:
         assert asset.step().values[0] == 10.0
 
 

@@ -49,7 +49,10 @@ def alarm(foreign_fmu, tmp_path: Path) -> Pack:
     """Return what packs a siren with a parameter set: `alarm("siren2", binding, name=value element)`."""
 
     def pack(model: str, binding: str, parameters: dict[str, str]) -> Path:
-        rows = (f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>' for name, value in parameters.items())
+        rows = (
+            f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>'
+            for name, value in parameters.items()
+        )
         values = SET.format(parameters="".join(rows))
         contents = {
             "SystemStructure.ssd": SYSTEM.format(binding=binding.format(set=values)),
@@ -76,7 +79,9 @@ def heard(wiring: Wiring) -> float:
     ],
     ids=["in the file", "in a file of its own", "by a mapping"],
 )
-def test_a_text_and_an_item_are_set_on_the_fmu(alarm, binding, text_name, item_name, tmp_path) -> None:
+def test_a_text_and_an_item_are_set_on_the_fmu(
+    alarm, binding, text_name, item_name, tmp_path
+) -> None:
     """Also a text that looks like a number; both are written as they were read."""
     parameters = {
         text_name: '<ssv:String value="1,25 é"/>',
@@ -96,7 +101,9 @@ def test_a_text_and_an_item_are_set_on_the_fmu(alarm, binding, text_name, item_n
 
 @pytest.mark.parametrize("model", ["siren1", "siren3"])
 def test_an_fmu_of_another_version_takes_a_text(alarm, model, tmp_path) -> None:
-    plain = alarm(model, BESIDE, {"siren.broken": '<ssv:Real value="0"/>'}).rename(tmp_path / "plain.ssp")
+    plain = alarm(model, BESIDE, {"siren.broken": '<ssv:Real value="0"/>'}).rename(
+        tmp_path / "plain.ssp"
+    )
     path = alarm(model, BESIDE, {"siren.label": '<ssv:String value="horn"/>'})
     sounds = [heard(join_ssp(read_ssp(each, tmp_path / each.stem))) for each in (path, plain)]
     assert sounds[0] == sounds[1] + len("horn")
@@ -124,7 +131,11 @@ def test_a_text_stays_after_a_reset_and_another_one_is_another_system(foreign_fm
     ("name", "value", "sentence"),
     [
         ("label", '<ssv:Real value="3"/>', r"to 3\.0: it is of the type String, and takes a text"),
-        ("label", '<ssv:Binary value="0a"/>', r"to b'\\n': it is of the type String, and takes a text"),
+        (
+            "label",
+            '<ssv:Binary value="0a"/>',
+            r"to b'\\n': it is of the type String, and takes a text",
+        ),
         ("broken", '<ssv:String value="no"/>', r"to 'no': .* takes a number"),
         ("broken", '<ssv:Binary value="0a"/>', r"to b'\\n': .* takes a number"),
         ("loudness", '<ssv:Enumeration value="shrill"/>', r"to 'shrill': .*quiet.*loud"),

@@ -44,7 +44,10 @@ def hostile(foreign_fmu: Any) -> Hostile:
 
 def cases(table: str) -> pytest.MarkDecorator:
     """Return the parametrisation by a table of the file: what is done, the error, and its sentence."""
-    rows = [(row["what"], getattr(errors, row["error"]), row["sentence"]) for row in MISBEHAVIOURS[table]]
+    rows = [
+        (row["what"], getattr(errors, row["error"]), row["sentence"])
+        for row in MISBEHAVIOURS[table]
+    ]
     return pytest.mark.parametrize(("what", "kind", "sentence"), rows, ids=[row[0] for row in rows])
 
 
@@ -128,7 +131,9 @@ def test_what_goes_wrong_at_the_end_leaves_nothing(hostile, scratch, what) -> No
     with hostile(*what) as asset:
         assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
         if "START_PROCESS_ELSEWHERE" in what:
-            assert len(processes(scratch)) == 3  # the supervisor, the worker, and what the FMU has started
+            assert (
+                len(processes(scratch)) == 3
+            )  # the supervisor, the worker, and what the FMU has started
     await_nothing(scratch)
 
 
@@ -153,7 +158,9 @@ def test_what_cannot_be_replayed_says_so(hostile) -> None:
         asset.step()
         saved = asset.save_state()
         asset.close()
-        with pytest.raises(errors.FmuStateError, match="does not give equal outputs for equal inputs"):
+        with pytest.raises(
+            errors.FmuStateError, match="does not give equal outputs for equal inputs"
+        ):
             asset.restore_state(saved)
 
 
@@ -193,7 +200,9 @@ def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[
     )
     told = json.dumps(binding.model_dump(exclude_none=True, mode="json"))
     command = [sys.executable, "-c", program + "\n".join(lines), fmu, told]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
         try:
             yield process
         finally:
@@ -230,7 +239,9 @@ def test_nothing_is_left_when_the_supervisor_is_killed(hostile, scratch, end) ->
 ASKED = "asset.step(), asset.step()", "print(asset.worker_process_id, flush=True)"
 
 
-def test_nothing_is_left_when_twin_and_worker_end_before_the_supervisor_looks(foreign_fmu, scratch) -> None:
+def test_nothing_is_left_when_twin_and_worker_end_before_the_supervisor_looks(
+    foreign_fmu, scratch
+) -> None:
     with twin(foreign_fmu("hostile2"), HOSTILE, *ASKED, "sys.stdin.read()") as process:
         worker = int(process.stdout.readline())
         _, supervisor = state_and_supervisor(worker)
@@ -240,7 +251,9 @@ def test_nothing_is_left_when_twin_and_worker_end_before_the_supervisor_looks(fo
     await_nothing(scratch)
 
 
-def test_what_a_dead_twin_without_a_supervisor_left_is_removed_by_the_next(foreign_fmu, scratch) -> None:
+def test_what_a_dead_twin_without_a_supervisor_left_is_removed_by_the_next(
+    foreign_fmu, scratch
+) -> None:
     with twin(foreign_fmu("hostile2", "ESCAPE=hang()"), HOSTILE, *ASKED, "asset.step()") as process:
         worker = int(process.stdout.readline())
         await_processes(scratch, 3)
@@ -248,7 +261,9 @@ def test_what_a_dead_twin_without_a_supervisor_left_is_removed_by_the_next(forei
         kill_supervisor(worker)
     await_processes(scratch, 2)
     (scratch / "somebody-else").mkdir()
-    run_python("from fmu_asset.folders import plain_folder, remove_folder; remove_folder(plain_folder())")
+    run_python(
+        "from fmu_asset.folders import plain_folder, remove_folder; remove_folder(plain_folder())"
+    )
     wait_until(lambda: not processes(scratch))
     assert [path.name for path in scratch.iterdir()] == ["somebody-else"]
 
@@ -268,7 +283,9 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(foreign_fmu, scra
 
 
 @pytest.mark.parametrize(("misbehaviour", "kind", "sentence"), MISBEHAVIOURS["spoilt"])
-def test_an_fmu_in_python_that_spoils_what_we_share(spring_mass, misbehaviour, kind, sentence) -> None:
+def test_an_fmu_in_python_that_spoils_what_we_share(
+    spring_mass, misbehaviour, kind, sentence
+) -> None:
     with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         with pytest.raises(getattr(errors, kind), match=sentence) as caught:
             asset.step(load={"misbehaviour": misbehaviour})

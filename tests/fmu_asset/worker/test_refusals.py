@@ -19,7 +19,9 @@ from tests.fmu_asset.client.kinds import HOSTILE, SPRING_BINDING
 from tests.fmu_asset.making import changed
 from tests.fmu_asset.worker.test_hostile import ASKED, await_nothing, twin
 
-pytestmark = pytest.mark.skipif(landlock_version() < 6, reason="the kernel is older than Linux 6.12")
+pytestmark = pytest.mark.skipif(
+    landlock_version() < 6, reason="the kernel is older than Linux 6.12"
+)
 
 Told = Callable[..., str]
 
@@ -39,7 +41,11 @@ def told(foreign_fmu: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> T
         monkeypatch.setenv("HOSTILE_TARGET", str(target or tmp_path / "key"))
         (tmp_path / "key").write_text("the private key")
         with watch_for_refusals() as report:
-            fly(FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={what}"), changed(HOSTILE, limits=limits)))
+            fly(
+                FmiAsset(
+                    foreign_fmu("hostile2", f"ATTEMPT={what}"), changed(HOSTILE, limits=limits)
+                )
+            )
             return report.sentence()
 
     return attempt
@@ -105,7 +111,9 @@ def test_what_was_granted_is_not_counted(told, tmp_path) -> None:
     assert told("look_into(TARGET)", read=[str(tmp_path)]) == "The sandbox refused nothing."
 
 
-def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refused(spring_mass) -> None:
+def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refused(
+    spring_mass,
+) -> None:
     def outputs() -> list[float]:
         with FmiAsset(spring_mass, SPRING_BINDING) as asset:
             return [float(asset.step().values[0]) for _ in range(3)]
@@ -118,7 +126,14 @@ def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refuse
 
 @pytest.mark.parametrize(
     "case",
-    [["SEGFAULT"], ["HANG"], ["KILL"], ["EXIT"], ["HOP"], ["START_PROCESS_ELSEWHERE", "GROUP=setsid()"]],
+    [
+        ["SEGFAULT"],
+        ["HANG"],
+        ["KILL"],
+        ["EXIT"],
+        ["HOP"],
+        ["START_PROCESS_ELSEWHERE", "GROUP=setsid()"],
+    ],
     ids=lambda case: case[0],
 )
 def test_a_watched_worker_ends_with_all_that_it_has_started(foreign_fmu, scratch, case) -> None:
@@ -128,9 +143,14 @@ def test_a_watched_worker_ends_with_all_that_it_has_started(foreign_fmu, scratch
         assert report.sentence() == "The sandbox refused nothing."
 
 
-def test_a_watched_worker_that_makes_calls_without_end_ends_with_its_twin(foreign_fmu, scratch) -> None:
+def test_a_watched_worker_that_makes_calls_without_end_ends_with_its_twin(
+    foreign_fmu, scratch
+) -> None:
     endless = foreign_fmu("hostile2", "ATTEMPT=({for(;;)getppid();0;})")
-    lines = "from fmu_asset.worker.refusals import watch_for_refusals", "watch = watch_for_refusals()"
+    lines = (
+        "from fmu_asset.worker.refusals import watch_for_refusals",
+        "watch = watch_for_refusals()",
+    )
     watched = *lines, "watch.__enter__()", *ASKED, "asset.step()"
     with twin(endless, HOSTILE, *watched) as process:
         assert int(process.stdout.readline())

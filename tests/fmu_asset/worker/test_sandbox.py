@@ -26,7 +26,9 @@ from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.sampling import sample_library
 
-pytestmark = pytest.mark.skipif(landlock_version() < 6, reason="the kernel is older than Linux 6.12")
+pytestmark = pytest.mark.skipif(
+    landlock_version() < 6, reason="the kernel is older than Linux 6.12"
+)
 
 
 @pytest.fixture
@@ -53,7 +55,9 @@ def attempting(foreign_fmu: Any, monkeypatch: pytest.MonkeyPatch) -> Attempting:
     return make
 
 
-def listening(cleaner: ExitStack, family: int, kind: int, address: Any = ("127.0.0.1", 0)) -> object:
+def listening(
+    cleaner: ExitStack, family: int, kind: int, address: Any = ("127.0.0.1", 0)
+) -> object:
     line = cleaner.enter_context(socket.socket(family, kind))
     line.bind(address)
     if kind == socket.SOCK_STREAM:
@@ -81,7 +85,12 @@ Target = Callable[[str], str]
 @pytest.fixture
 def target(tmp_path: Path, key: Path) -> Iterator[Target]:
     """Return what is attempted upon, by name, as the FMU is told it; it says whether it reached it."""
-    inet, unix, stream, datagram = socket.AF_INET, socket.AF_UNIX, socket.SOCK_STREAM, socket.SOCK_DGRAM
+    inet, unix, stream, datagram = (
+        socket.AF_INET,
+        socket.AF_UNIX,
+        socket.SOCK_STREAM,
+        socket.SOCK_DGRAM,
+    )
     queue = f"uav-twin-{os.getpid()}"
     ways: dict[str, Callable[[], object]] = {
         "file": lambda: key,
@@ -96,7 +105,9 @@ def target(tmp_path: Path, key: Path) -> Iterator[Target]:
         "share": lambda: shared(cleaner, "shm", 4096),
         "semaphore": lambda: shared(cleaner, "sem", 1),
         "message": lambda: shared(cleaner, "msg"),
-        "queue": lambda: cleaner.callback(ctypes.CDLL(None).mq_unlink, f"/{queue}".encode()) and queue,
+        "queue": lambda: (
+            cleaner.callback(ctypes.CDLL(None).mq_unlink, f"/{queue}".encode()) and queue
+        ),
         "process": lambda: process(cleaner),
     }
     with ExitStack() as cleaner:
@@ -129,11 +140,16 @@ def test_what_is_not_its_own_is_out_of_reach(attempting, target, key, row) -> No
     granted(attempting(row["call"], told, sandbox=False))
 
 
-def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(attempting, key, spring_mass) -> None:
+def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
+    attempting, key, spring_mass
+) -> None:
     silent = attempting("look_into(TARGET)", key, "SILENT")
     refused(silent, r"The system refused it something \(Permission denied\)")
     words = rf"\(Permission denied; the last .* tried was open\('{key}', 'r'\)\)"
-    with FmiAsset(spring_mass, SPRING_BINDING) as asset, pytest.raises(errors.FmuCallError, match=words):
+    with (
+        FmiAsset(spring_mass, SPRING_BINDING) as asset,
+        pytest.raises(errors.FmuCallError, match=words),
+    ):
         asset.step(load={"misbehaviour": 13.0})
 
 
@@ -195,7 +211,10 @@ def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch) -> 
                 pass
         said += caplog.messages
         monkeypatch.setattr(instance_host, "landlock_version", lambda: 0)
-    assert said[0] == f"{fmu}: its binding turns the sandbox off, so that it has all rights of its user."
+    assert (
+        said[0]
+        == f"{fmu}: its binding turns the sandbox off, so that it has all rights of its user."
+    )
     assert said[1].startswith("This kernel has no Landlock (Linux 5.13 or later)")
     assert len(said) == 2
 
@@ -213,18 +232,25 @@ def test_components_and_samplers_are_confined_too(attempting, key, tmp_path) -> 
     fmu = attempting("unlink(TARGET)", key).description.path
     binding = bound(1.0, {"y": ("thief.y", "m")}, control={"u": ("thief.u", "m/s")})
     words = rf"it cannot have {key}: Permission denied"
-    refused(CoupledAsset(system([Component("thief", fmu)], []), binding), f"(?s)component thief: .*{words}")
+    refused(
+        CoupledAsset(system([Component("thief", fmu)], []), binding),
+        f"(?s)component thief: .*{words}",
+    )
     with pytest.raises(errors.FmuCallError, match=words):
         sample_library(sampled(fmu), tmp_path / "library.nc", workers=1)
     assert key.exists()
 
 
-def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(attempting, tmp_path) -> None:
+def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(
+    attempting, tmp_path
+) -> None:
     """The processes of a sampling send each other pickles, and the FMU is in none of them."""
     made = tmp_path / "made"
     order = f"cos\nmkdir\n(V{made}\ntR."  # who unpickles it makes the folder
     grid = sampled(attempting("write_message(TARGET)", order).description.path)
-    with pytest.raises(errors.FmuWorkerError, match="closed its pipe, or wrote something else into it"):
+    with pytest.raises(
+        errors.FmuWorkerError, match="closed its pipe, or wrote something else into it"
+    ):
         sample_library(grid, tmp_path / "library.nc", workers=1)
     assert not made.exists()
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -36,7 +35,8 @@ from twin_master.fleet.plan import Fleet, Member, ensemble, load_fleet
 from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import result_of_unflown
-from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
+from twin_master.fleet.store import ENDED, FLOWN, STORE_NAME, fallbacks_of, in_credible_set, stored_variables
+from twin_master.fleet.store_layout import FORMER_DIMENSIONS, FORMER_PATHS
 from twin_master.fleet_command import choose_engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
@@ -57,15 +57,53 @@ def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fly_fleet(growing(library_file), tmp_path_factory.mktemp("whole") / "fleet").folder
 
 
+def write_former_store(whole: Path, folder: Path) -> None:
+    """Write the store of a fleet as earlier versions did: one group, other names, no coordinates."""
+    group = open_fleet(whole)["growing_damage"]
+    variables = {name: group[name] for name in ("status", "seed", "delay", "early", "credible")}
+    variables |= {name: group[path] for name, path in FORMER_PATHS.items()}
+    variables["observed"] = group["observed/strain"]
+    names = {present: former_name for former_name, present in FORMER_DIMENSIONS.items()}
+    for name, variable in variables.items():
+        bare = variable.drop_vars([*variable.coords])
+        variables[name] = bare.rename({axis: names[axis] for axis in bare.dims if axis in names})
+    former = xr.Dataset(variables)
+    former.attrs |= {"step_name": "step", "factors": ["z1", "z2"]}
+    shutil.rmtree(folder / STORE_NAME)
+    former.to_zarr(folder / STORE_NAME, group="growing_damage", consolidated=False, zarr_format=3)
+
+
 def test_a_store_of_an_earlier_version_is_read_with_one_sentence(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "former")
-    for path in folder.rglob("zarr.json"):
-        text = path.read_text(encoding="utf-8")
-        path.write_text(re.sub(r'(?<!: )"step"', '"turn"', text), encoding="utf-8")  # of the dimensions
-    with pytest.warns(FormerNameWarning, match=r"fleet\.zarr: `turn` is now called `step`"):
+    write_former_store(whole, folder)
+    said = r"fleet\.zarr: `turn` is now called `step`, `factor` is now called `region`"
+    with pytest.warns(FormerNameWarning, match=said):
         group = open_fleet(folder)["growing_damage"]
-    assert group.identical(open_fleet(folder)["growing_damage"])  # a second warning were an error
-    assert group.identical(open_fleet(whole)["growing_damage"])
+    assert group.equals(open_fleet(folder)["growing_damage"])  # a second warning were an error
+    present = open_fleet(whole)["growing_damage"]
+    assert group.equals(present)
+    for node in present.subtree:
+        for name, variable in node.variables.items():
+            assert group[node.relative_to(present)][name].attrs == variable.attrs, name
+    assert group_figures(group) == group_figures(present)
+
+
+def test_a_fleet_is_chosen_from_by_the_labels_of_a_run(library_file, whole, tmp_path):
+    fleet = open_fleet(whole)
+    first_region = fleet.sel(region="z1")["growing_damage"]
+    group = fleet["growing_damage"]
+    for path in ("filtered/mean", "filtered/standard_deviation", "truth/state"):
+        assert first_region[path].dims == ("twin", "step")
+        assert np.array_equal(first_region[path], group[path].values[..., 0])
+    assert group.sel(twin="seed-3", step=5)["observed"].sel(sensor=12)["strain"].shape == ()
+    assert group["filtered"].sel(region="z2")["mean"].equals(group["filtered/mean"].sel(region="z2"))
+    last_belief = group["filtered/last_probability"]
+    assert last_belief.coords["z1"].dims == last_belief.coords["z2"].dims == ("state",)
+    run = open_run(new_run("growing_damage", tmp_path / "one", {"strain_library": library_file}).folder)
+    for tree in (run, fleet):  # the whole, and each group that has regions
+        assert tree.sel(region="z1").sizes.get("region") is None
+    for name in ("filtered", "smoothed", "predicted", "truth"):
+        assert "region" not in run[name].sel(region="z1").dims
 
 
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_path):
@@ -73,10 +111,13 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_p
     group = open_fleet(str(whole))["growing_damage"]
     tree = open_run(new_run("growing_damage", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
-    theirs = {"observed": "observed/strain", "mean": "filtered/mean", "state": "truth/state"}
-    for ours, path in (theirs | {"control_index": "observed/control_index"}).items():
-        single = tree[path].values
-        assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
+    for path in ("observed/strain", "observed/control_index", "filtered/mean", "truth/state"):
+        ours, single = group[path], tree[path]
+        assert np.array_equal(ours.values[row], single.values.astype(ours.dtype)), path
+        assert ours.dims == ("twin", *single.dims)
+        assert ours.attrs["units"] == single.attrs["units"]
+        for name, coordinate in single.coords.items():
+            assert np.array_equal(ours.coords[name], coordinate), name
     figures, study = group_figures(group), Outcomes.from_store(group)
     names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
     assert [figures[name] for name in names] == [study.log_evidence, study.rms[1], study.bias[1]]
@@ -88,7 +129,7 @@ def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
     first, second = (open_fleet(folder)["growing_damage"] for folder in (whole, cut.folder))
     xr.testing.assert_equal(first, second)
     assert (first["status"].values == 1).all()
-    assert len(np.unique(first["state"].values[:, -1], axis=0)) > 1
+    assert len(np.unique(first["truth/state"].values[:, -1], axis=0)) > 1
 
 
 def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monkeypatch):
@@ -373,7 +414,9 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
     for row, steps in enumerate(flown):
         if ends or steps == 35:
             assert kept["status"][row] == (ENDED if found.ended[row] else FLOWN)
-            np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, steps - 1].astype("f4"))
+            np.testing.assert_array_equal(
+                kept["filtered/last_probability"][row], found.filtered[row, steps - 1].astype("f4")
+            )
             inside = in_credible_set(knowledge.model, found.filtered[row, :steps], found.state[row, :steps])
             assert kept["credible"][row] == np.float32(inside.mean())
 

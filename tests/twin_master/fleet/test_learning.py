@@ -230,13 +230,13 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     (stored,) = open_fleet(folder).values()
     (group,) = fleet.groups
     known = load_knowledge(group_folder(folder, group, 0), group.scenarios[0])
-    rows, control = stored["observed"].values, stored["control_index"].values.astype(int)
+    rows, control = stored["observed/strain"].values, stored["observed/control_index"].values.astype(int)
     assert np.isfinite(rows[:, 0, 24:]).all()
     family = TransitionFamily.learnable(known.scenario)
     model = with_noise_factor(known.sensor_model, 1.0)  # as the lessons are learnt with
     scaled, common = scaled_likelihood(model, rows.astype(float), control)
     found = transition_evidence(family, family.assumed[None], scaled, control)[:, 0] + common
-    np.testing.assert_allclose(found, stored["log_evidence"].values.sum(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(found, stored["filtered/log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
 def test_what_was_learnt_must_fit(tmp_path):
@@ -332,7 +332,7 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
     table = scenario.portable().to_dict()
     record = {"name": name, "members": [["a", 3, 0], ["b", 4, 1]], "scenarios": [table, table]}
     two = group.isel(twin=slice(2))
-    control = two["control_index"].values[:, -1]
+    control = two["observed/control_index"].values[:, -1]
     np.testing.assert_array_equal(
         leaving_probabilities(tmp_path, record, two), [control[0] != 1, control[1] != 0]
     )
@@ -382,7 +382,10 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
     text = write_fleet_report(folder).read_text()
     (group,) = open_fleet(folder).values()
     delay = group["delay"].values[~np.isnan(group["delay"].values)]
-    control, mean = group["control_index"].values[:, -1], group["mean"].values[:, -1].astype(float)
+    control, mean = (
+        group["observed/control_index"].values[:, -1],
+        group["filtered/mean"].values[:, -1].astype(float),
+    )
     opening = (
         f"60 of 60 assets have flown. In {len(delay)} assets the damage called for another control; the "
         f"fallback came within 2 steps of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
@@ -414,7 +417,10 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
     )
 
     # Who gave an alarm comes first, then who leaves soon; with the same percentage by its state.
-    beliefs, alarms = group["belief"].values.astype(float), group["notices"].values[:, 0]
+    beliefs, alarms = (
+        group["filtered/last_probability"].values.astype(float),
+        group["notice/count"].values[:, 0],
+    )
     soon = [
         probability_of_leaving(knowledge, own[None], int(u))[0]
         for own, u in zip(beliefs, control, strict=True)

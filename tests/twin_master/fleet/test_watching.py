@@ -299,23 +299,25 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     for row, steps in enumerate((3, STEPS, STEPS)):
         lines = journal(tmp_path / "alone" / f"wing-{row}")
         last = {record["step"]: record for record in lines}
-        assert group["control_index"].values[row].tolist() == FLOWN[:steps] + [-1] * (STEPS - steps)
-        assert np.isnan(group["log_evidence"].values[row, steps:]).all()
-        assert np.array_equal(group["belief"].values[row], np.array(last[steps - 1]["filtered"], np.float32))
+        assert group["observed/control_index"].values[row].tolist() == FLOWN[:steps] + [-1] * (STEPS - steps)
+        assert np.isnan(group["filtered/log_evidence"].values[row, steps:]).all()
+        assert np.array_equal(
+            group["filtered/last_probability"].values[row], np.array(last[steps - 1]["filtered"], np.float32)
+        )
         for step in range(steps):
-            evidence = group["log_evidence"].values[row, step]
+            evidence = group["filtered/log_evidence"].values[row, step]
             late = row == 2 and step in (2, 3)  # written down before the late message came
             assert late or evidence == np.float32(last[step]["log_evidence"])
             seen = np.array(last[step]["observed"], np.float32)
-            assert late or np.array_equal(group["observed"].values[row, step], seen, equal_nan=True)
+            assert late or np.array_equal(group["observed/strain"].values[row, step], seen, equal_nan=True)
         told = [(line["step"], notice["kind"]) for line in lines for notice in line.get("notices", ())]
         for place, kind in enumerate(("alarm", "gauge_left_out")):
             noticed = [step for step, one in told if one == kind and step < steps]
             if row != 2:  # whose late message tells of steps before it
-                assert group["notices"].values[row, place] == len(noticed)
-                assert group["first_notice"].values[row, place] == min(noticed, default=-1)
-        alarmed += bool(group["notices"].values[row, 0])
-    assert group["notices"].values[1, 1] >= 1
+                assert group["notice/count"].values[row, place] == len(noticed)
+                assert group["notice/first_step"].values[row, place] == min(noticed, default=-1)
+        alarmed += bool(group["notice/count"].values[row, 0])
+    assert group["notice/count"].values[1, 1] >= 1
     assert alarmed >= 1
     figures = group_figures(group)
     assert (figures["flown"], figures["raised an alarm"]) == (3, alarmed)

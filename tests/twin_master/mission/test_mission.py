@@ -302,7 +302,7 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
     assert [*fleet.ended.values()] == [said.replace(f"{part.folder}/", "")]
     (group,) = open_fleet(fleet.folder).values()
     assert group["status"].values.tolist() == [ENDED]
-    assert (group["control_index"].values >= 0).sum() == 20
+    assert (group["observed/control_index"].values >= 0).sum() == 20
     assert "1 of 1 assets ended their simulation" in write_fleet_report(fleet.folder).read_text()
     with ScenarioEnvironment(loaded) as environment:
         environment.reset(seed=4)

@@ -141,8 +141,12 @@ def test_twins_of_an_ensemble_fly_what_runs_fly(library_file, module, tmp_path):
     folder = uav_twin.fly_fleet(fleet, tmp_path / "many", **parts).folder
     group = uav_twin.open_fleet(folder)["paper_level_turns"]
     alone = uav_twin.fly(mission(), tmp_path / "one", {**overrides, "seed": 1}, report=False, **parts).tree
-    np.testing.assert_array_equal(group["control_index"].values[1], alone["observed"]["control_index"].values)
-    np.testing.assert_allclose(group["mean"].values[1], alone["filtered"]["mean"].values, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(
+        group["observed/control_index"].values[1], alone["observed"]["control_index"].values
+    )
+    np.testing.assert_allclose(
+        group["filtered/mean"].values[1], alone["filtered"]["mean"].values, rtol=0, atol=1e-12
+    )
     with pytest.raises(RunFolderError, match="another fleet"):
         uav_twin.fly_fleet(fleet, folder)
     record = json.loads((folder / "config.json").read_text())["fleet"]["parts"]

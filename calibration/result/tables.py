@@ -1,0 +1,136 @@
+"""The tables of a calibration, with their titles and captions, for console and page."""
+
+from math import isfinite
+
+from calibration.result.record import Calibration, ChannelFit, FigureReading, ParameterPrior
+from reporting.page import PageColumn, Table
+from reporting.record_table import (
+    RecordColumn,
+    TitledTable,
+    number_cells,
+    table_of_records,
+    text_cells,
+)
+from reporting.words import between, plus_minus
+
+PROCEDURES = {
+    "quadrature": "by quadrature",
+    "Gaussian": "a Gaussian, checked along its axes",
+    "several optima": "several optima, each a Gaussian",
+    "joint": "of all experiments together, by importance sampling",
+    "paper": "by the paper's procedure, step after step",
+}
+
+
+def parameters_table(result: Calibration) -> TitledTable:
+    """Return the table of the parameters before and after the calibration."""
+
+    def posterior(prior: ParameterPrior) -> str:
+        return plus_minus(result.mean(prior.name), result.standard_deviation(prior.name))
+
+    def interval(prior: ParameterPrior) -> str:
+        low, high = result.interval(prior.name)
+        return between(low, high, result.standard_deviation(prior.name))
+
+    def prior_left(prior: ParameterPrior) -> str:
+        percent = 100 * result.kept_share(prior.name)
+        decimals = 0 if percent > 9.5 else 1
+        return f"{percent:.{decimals}f} %"
+
+    columns: list[RecordColumn[ParameterPrior]] = [
+        text_cells("parameter", lambda prior: prior.figure.title),
+        text_cells("unit", lambda prior: prior.figure.shown_unit),
+        number_cells("prior", lambda prior: _prior_text(result, prior.name)),
+        number_cells("posterior", posterior),
+        number_cells("90 % interval", interval),
+        number_cells("left of the prior", prior_left),
+    ]
+    caption = (
+        f"Mean ± standard deviation. The posterior is {PROCEDURES[result.procedure]}; "
+        f"calibration.nc has {len(result.samples)} samples of it. Left of the prior: the standard "
+        "deviation of the posterior as a fraction of that of the prior."
+    )
+    if result.information is not None:
+        caption += f" Information gained: {result.information:.2f} nat."
+    return TitledTable(table_of_records(columns, result.priors), "Parameters", caption)
+
+
+def _prior_text(result: Calibration, name: str) -> str:
+    """Return mean and standard deviation of a figure before the calibration."""
+    mean, deviation = result.prior_moments(name)
+    return plus_minus(mean, deviation)
+
+
+def readings_table(result: Calibration) -> TitledTable:
+    """Return the table of measured figures beside those of the model before and after."""
+    units = {figure.name: figure.shown_unit for figure in reversed(result.figures)}
+    columns: list[RecordColumn[FigureReading]] = [
+        text_cells("experiment", lambda reading: reading.experiment),
+        text_cells("figure", lambda reading: reading.name),
+        text_cells("unit", lambda reading: units[reading.name]),
+        number_cells("measured", lambda reading: plus_minus(reading.value, reading.deviation)),
+        number_cells("before", lambda reading: _prior_text(result, reading.name)),
+        number_cells(
+            "after",
+            lambda reading: plus_minus(
+                result.mean(reading.name), result.standard_deviation(reading.name)
+            ),
+        ),
+        number_cells(
+            "model less reading, in standard deviations",
+            lambda reading: f"{result.score(reading):+.1f}",
+        ),
+    ]
+    return TitledTable(
+        table_of_records(columns, result.readings),
+        title="Measured and modelled",
+        caption=(
+            "Mean ± standard deviation: measured, and of the model before and after the "
+            "calibration. The last column is the difference of model and reading over the "
+            "standard deviation of both together."
+        ),
+    )
+
+
+def channels_table(result: Calibration) -> TitledTable:
+    """Return the table of the residuals of each channel before and after the calibration."""
+    columns: list[RecordColumn[ChannelFit]] = [
+        text_cells("channel", lambda channel: channel.name),
+        text_cells("trials", lambda channel: channel.trials),
+        number_cells("readings", lambda channel: str(channel.readings)),
+        number_cells("rms before", lambda channel: _rms_text(channel.before)),
+        number_cells("rms after", lambda channel: _rms_text(channel.after)),
+    ]
+    return TitledTable(
+        table_of_records(columns, result.channels),
+        title="Residuals",
+        caption=(
+            "Rms residual in standard deviations of the noise, with the parameters at their prior "
+            "means and at the most probable values; gains, zeros and initial states are fitted in "
+            "both. Held-out trials took no part in the calibration."
+        ),
+    )
+
+
+def _rms_text(rms: float) -> str:
+    """Return an rms residual over the noise as text."""
+    return f"{rms:.2f}" if isfinite(rms) else "noise unknown"
+
+
+def origin_table(result: Calibration) -> TitledTable:
+    """Return the table of where a calibration comes from."""
+    versions = result.provenance["versions"].items()
+    items = {
+        "asset": result.asset,
+        "model": f"{result.model}, SHA-256 {result.model_hash[:16]}",
+        "measured": result.source,
+        "seed": str(result.seed),
+        "priors": ", ".join(f"{prior.name}: {prior.stated_by}" for prior in result.priors),
+        "software": ", ".join(f"{name} {version}" for name, version in versions),
+    }
+    rows = [[item, value] for item, value in items.items() if value]
+    return TitledTable(
+        Table([PageColumn("item"), PageColumn("value")], rows),
+        title="Where it comes from",
+        caption="calibration.nc has everything.",
+    )

@@ -1,0 +1,173 @@
+"""Sizes of added effects in SI units, as the sentences of a verdict show them."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+from discrepancy.campaign.records import Campaign, Quantity
+from discrepancy.campaign.units import UNITS
+from discrepancy.document import PRIMITIVE_UNITS
+from discrepancy.files.verdict import PrimitiveInterval
+from discrepancy.report.text import NAMING, unit_text
+from discrepancy.system.interface import Model
+from discrepancy.system.response import EITHER, MOVES, TURNS
+from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.workflow import Investigation
+from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
+from reporting.words import between, rounded
+
+BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
+"""Parameters of primitives that say where or when an effect acts, and not how large it is."""
+
+
+def si_sizes(
+    patch: ModelPatch, intervals: Sequence[PrimitiveInterval], model: Model, campaign: Campaign
+) -> str:
+    """Return the sizes of a patch that have a unit, such as "slip force 0.53 N (0.52 to 0.54)".
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        Patch of one effect.
+    intervals : sequence of PrimitiveInterval
+        Intervals of its numbers.
+    model : Model
+        The model, which knows whether a port moves or turns.
+    campaign : Campaign
+        The campaign, which knows what a channel measures.
+
+    Returns
+    -------
+    str
+        Sizes with 90 % intervals; empty if none has a unit.
+    """
+    sizes: dict[str, None] = {}  # each once, in order
+    for size in intervals:
+        primitive = patch.primitives[size.primitive]
+        unit = definite_unit(size.unit, primitive, model, campaign)
+        if not unit or size.parameter in BESIDE or size.value == 0.0:
+            continue
+        half_width = 0.0
+        interval = ""
+        if isfinite(size.low) and isfinite(size.high) and size.low < size.high:
+            half_width = 0.5 * (size.high - size.low)
+            interval = f" ({between(size.low, size.high, half_width)})"
+        name = _size_name(size.parameter, primitive, unit)
+        place_text = _location_text(primitive, size, model, campaign)
+        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
+    return ", ".join(sizes)
+
+
+def size_sentence(
+    investigation: Investigation,
+    effects: Sequence[NamedEffect],
+    intervals: Sequence[Sequence[PrimitiveInterval]],
+) -> str:
+    """Return the sizes of the effects of a patch in one sentence; empty if none has a unit.
+
+    Parameters
+    ----------
+    investigation : Investigation
+        The investigation.
+    effects : sequence of NamedEffect
+        Effects of the patch.
+    intervals : sequence of sequence of PrimitiveInterval
+        Intervals of the numbers of each effect.
+    """
+    is_named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
+    is_only_effect = is_named and len(effects) == 1
+    phrases = []
+    for effect, intervals_of_effect in zip(effects, intervals, strict=True):
+        sizes = si_sizes(
+            effect.patch, intervals_of_effect, investigation.model, investigation.campaign
+        )
+        name = f"a law of the family {effect.family}" if effect.shape else effect.name
+        if sizes:
+            phrases.append(sizes if is_only_effect else f"{name}, {sizes}")
+    if not phrases:
+        return ""
+    begin = "In SI units"
+    if not is_named:
+        begin = "In SI units, were it the most probable member, which is not named"
+    has_intervals = any(" to " in phrase for phrase in phrases)
+    brackets = "; 90 % intervals in brackets" if has_intervals else ""
+    return f"{begin}: {'; '.join(phrases)}{brackets}."
+
+
+def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
+    """Return the name of a primitive's parameter in words: a force, a moment, a flow, ..."""
+    if parameter == "coefficient" and unit.endswith("capacity"):
+        return "flow"  # into or out of a state
+    name = parameter.replace("_", " ")
+    if parameter == "coefficient" and primitive.kind in ("power_damping", "power_stiffness"):
+        name = "force"
+    is_at_turning_port = unit == "N m"
+    return name.replace("force", "moment") if is_at_turning_port else name
+
+
+def _location_text(
+    primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign
+) -> str:
+    """Return the reference speed or displacement of a force, or the station of a mass.
+
+    It is a phrase such as " at 0.3 m/s"; empty for other sizes.
+    """
+    if primitive.kind == "point_mass" and size.parameter == "mass":
+        return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009
+    if size.parameter != "coefficient":
+        return ""
+    marks = []
+    for exponent in ("velocity_exponent", "displacement_exponent", "exponent"):
+        reference = "reference_displacement"
+        if exponent.startswith("velocity"):
+            reference = "reference_velocity"
+        value = getattr(primitive, reference, None)
+        if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
+            reference_unit = PRIMITIVE_UNITS[primitive.kind][reference]
+            unit = definite_unit(reference_unit, primitive, model, campaign)
+            marks.append(f"{value:.3g} {unit}")
+    return f" at {' and '.join(marks)}" if marks else ""
+
+
+def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
+    """Return the unit of a primitive's parameter, as its port and its channel determine it.
+
+    Parameters
+    ----------
+    unit : str
+        Unit of the kind of primitive, which may be that of a channel, or one "or" another.
+    primitive : Primitive
+        The primitive, with a port or a channel.
+    model, campaign
+        Model and campaign.
+
+    Returns
+    -------
+    str
+        The unit; empty for a plain number, or if it is not determined.
+    """
+    if unit.startswith(CHANNEL_UNIT):
+        return _channel_unit(primitive, campaign) if unit == CHANNEL_UNIT else ""
+    if " or " not in unit:
+        return unit_text(unit)
+    port = str(getattr(primitive, "port", ""))
+    unit_if_moving, unit_if_turning = unit.split(" or ")
+    force_unit, state_unit = model.port_units(port)
+    if force_unit == MOVES[0]:
+        return unit_if_moving
+    if force_unit == TURNS[0]:
+        return unit_if_turning
+    if force_unit == EITHER[0]:
+        return unit
+    return state_unit if unit.startswith("m/s") else force_unit
+
+
+def _channel_unit(primitive: Primitive, campaign: Campaign) -> str:
+    """Return the unit of a primitive's channels; empty if they have several."""
+    name = getattr(primitive, "channel", "*")
+    names = campaign.channels if name == "*" else (name,)
+    units = set()
+    for channel_name in names:
+        if channel_name in campaign.channels:
+            quantity = campaign.channels[channel_name].quantity
+            units.add("1" if quantity is Quantity.SIGNAL else UNITS[quantity].si)
+    return unit_text(units.pop()) if len(units) == 1 else ""

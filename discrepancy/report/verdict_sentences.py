@@ -1,0 +1,220 @@
+"""Sentences on a verdict, for the report and for the summary on the terminal."""
+
+import re
+from collections.abc import Iterable
+from math import isnan
+
+from discrepancy.judgement.closed_share import closed_share_text
+from discrepancy.judgement.conclusion import effects_text, probability_text
+from discrepancy.proof_record import Proof, Scores
+from discrepancy.report.text import (
+    NAMING,
+    estimate_text,
+    nats,
+    number,
+    parameter_text,
+    unit_text,
+)
+from discrepancy.verdict import ForceAtPort, ForceLeft, NamedEffect, Verdict, VerdictKind
+from discrepancy.workflow import Investigation
+from reporting.words import counted, listing
+
+ROLE_OF_PROBABILITY = {
+    VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
+    VerdictKind.GROUP: "together they have the probability",
+    VerdictKind.FAMILY: "probability",
+    VerdictKind.BELOW_LIMIT: "together with none they have the probability",
+}
+"""What the probability of a verdict is the probability of; other kinds say it themselves."""
+
+MOTION_OF_FORCE_UNIT = {
+    "N": ("force", "m", "m/s"),
+    "N m": ("moment", "rad", "rad/s"),
+    "N or N m": ("force", "m or rad", "m/s or rad/s"),
+}
+"""What is missing at a port, and the units of its displacement and speed, by the unit of force."""
+
+
+def headline(verdict: Verdict) -> str:
+    """Return the verdict in one sentence, with its probability.
+
+    Identifiers of effects in the sentence are replaced by their names.
+    """
+    sentence = verdict.sentence.rstrip(".")
+    effects = [*verdict.effects]
+    for hypothesis in verdict.hypotheses:
+        effects += hypothesis.effects
+    for identifier, name in {effect.identifier: effect.name for effect in effects}.items():
+        # names first, because a name may contain the identifier
+        name_or_identifier = rf"{re.escape(name)}|\b{identifier}\b"
+        sentence = re.sub(name_or_identifier, name.replace("\\", r"\\"), sentence)
+    role = ROLE_OF_PROBABILITY.get(verdict.kind)
+    if isnan(verdict.probability) or "probability" in sentence or role is None:
+        return f"{sentence}."
+    return f"{sentence} ({role} {probability_text(verdict.probability)})."
+
+
+def group_members(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
+    """Return the effects of each member of a group by its name; empty for any other verdict."""
+    if verdict.kind is not VerdictKind.GROUP:
+        return {}
+    effects_of_hypotheses = {}
+    for hypothesis in reversed(verdict.hypotheses):  # the first of several counts
+        effects_of_hypotheses[" + ".join(hypothesis.identifiers)] = hypothesis.effects
+    members = {}
+    for member in verdict.group:
+        if member in effects_of_hypotheses:
+            effects = effects_of_hypotheses[member]
+        else:
+            effects = tuple(effect for effect in verdict.effects if effect.identifier == member)
+        members[effects_text(effects) or member] = effects
+    return members
+
+
+def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
+    """Return the name of a missing force and the units of its port's motion.
+
+    Returns
+    -------
+    name : str
+        "force", "moment" or "flow".
+    displacement_unit, speed_unit : str
+        Units of the port's displacement and speed; at a port of a state, the first is empty and the
+        second that of the state.
+    """
+    of_state = ("flow", "", force.unit.partition("/s times")[0])
+    return MOTION_OF_FORCE_UNIT.get(force.unit, of_state)
+
+
+def force_sentence(force: ForceAtPort) -> str:
+    """Return the sentences on a missing force: its port, its size, and what its law leaves.
+
+    The first one also compares the evidence for the port with that for the second best port.
+    """
+    name, displacement_unit, speed_unit = port_motion_units(force)
+    evidence = force.evidence[force.port]
+    other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
+    size = (
+        f"A {name} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, "
+        f"at most {number(abs(force.largest.force))}"
+    )
+    motion = f"{number(force.largest.speed)} {speed_unit}"
+    if displacement_unit:
+        motion = f"{number(force.largest.displacement)} {displacement_unit} and {motion}"
+    comparison = f"evidence {nats(evidence)} nat over none"
+    if other_ports:
+        nearest = max(other_ports, key=lambda port: other_ports[port])
+        ahead = evidence - other_ports[nearest]
+        more_or_less = "more" if ahead >= 0.0 else "less"
+        comparison += f", {nats(abs(ahead))} {more_or_less} than at {nearest}"
+    sentence = f"{size} at {motion}{_order_phrase(force)} ({comparison})."
+    return f"{sentence} {_sentence_on_law(force)}".rstrip()
+
+
+def _order_phrase(force: ForceAtPort) -> str:
+    """Return by what a missing force without a law is ordered, as the end of a clause."""
+    if force.law:
+        return ""
+    if not force.ordered_by:
+        return ", ordered by none of displacement, velocity and time"
+    return f", ordered by {listing(force.ordered_by)} ({ordered_percent(force)} % of its variance)"
+
+
+def ordered_percent(force: ForceAtPort) -> str:
+    """Return the largest fraction of a missing force's variance that one variable orders, in %."""
+    return f"{100.0 * max(force.orders.values()):.0f}"
+
+
+def _sentence_on_law(force: ForceAtPort) -> str:
+    """Return how much of a missing force remains beside its law; empty if it was not tested."""
+    phrases = []
+    for role, remainder in tested_trials(force):
+        trials = counted(remainder.trials, f"{role} trial")
+        phrases.append(
+            f"{number(remainder.left)} of {number(remainder.whole)} {force.unit} (rms) are left "
+            f"in {trials}"
+        )
+    return f"Beside {force.law} {', and '.join(phrases)}." if phrases else ""
+
+
+def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
+    """Return how much of a missing force its law leaves unexplained.
+
+    There is one entry for the fitted trials and one for the held-out trials, named "fitted" and
+    "held-out". An entry is left out if the law could not be tested in these trials.
+    """
+    if force is None:
+        return []
+    tested = []
+    for role, remainder in (("fitted", force.fitted), ("held-out", force.held_out)):
+        if remainder is not None and remainder.tested:
+            tested.append((role, remainder))
+    return tested
+
+
+def proof_scores(proof: Proof) -> tuple[Scores, Scores, str]:
+    """Return the scores without and with the added effects, and the kind of the scored trials.
+
+    The held-out trials are taken if there are any ("held-out"), else the fitted ones ("fitted").
+    """
+    if proof.held_out_before is not None and proof.held_out_after is not None:
+        return proof.held_out_before, proof.held_out_after, "held-out"
+    return proof.fitted_before, proof.fitted_after, "fitted"
+
+
+def error_sentence(investigation: Investigation) -> str:
+    """Return the sentence that says which fraction of the model's error the added effects explain.
+
+    If that fraction could not be computed, it is the sentence with the reason. It is empty if
+    nothing was added to the model.
+    """
+    proof = investigation.proof
+    before = investigation.before
+    after = investigation.after
+    if proof is None or before is None or after is None:
+        return ""
+    if proof.closed is None:
+        return proof.closed_reason
+    is_named = investigation.verdict.kind in NAMING
+    # the clause begins with the subject "it", which is replaced
+    predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
+    if proof.closed.has_grown:
+        subject = "With it" if is_named else "With the best hypothesis, which is no name,"
+    else:
+        subject = "It" if is_named else "The best hypothesis, which is no name,"
+    return f"{subject} {predicate}."
+
+
+def noise_levels(proof: Proof) -> tuple[str, str]:
+    """Return the rms of the residuals over the noise, without and with the effects, as texts."""
+    before, after, _ = proof_scores(proof)
+    rms_before = number(before.chi_square_per_sample**0.5, 2)
+    rms_after = number(after.chi_square_per_sample**0.5, 2)
+    return rms_before, rms_after
+
+
+def remainders_sentence(verdict: Verdict) -> str:
+    """Return the sentence on what remains unexplained in each channel; empty if nothing does."""
+    phrases = []
+    for remainder in verdict.remainders:
+        phrase = (
+            f"{remainder.channel} {number(remainder.size, 2)} noises over "
+            f"{number(remainder.time, 2)} s"
+        )
+        if remainder.frequency > 0.0:
+            phrase += f", swinging at {number(remainder.frequency)} Hz"
+        phrases.append(phrase)
+    return f"What is left beside the noise: {'; '.join(phrases)}." if phrases else ""
+
+
+def parameters_sentence(effects: Iterable[NamedEffect]) -> str:
+    """Return the parameters of named effects with their 90 % intervals; empty if there is none."""
+    phrases = []
+    for effect in effects:
+        for parameter in effect.parameters:
+            value, interval = estimate_text(parameter)
+            with_unit = f"{value} {unit_text(parameter.unit)}".rstrip()
+            phrases.append(f"{parameter_text(parameter)} {with_unit} ({interval})")
+    if not phrases:
+        return ""
+    return f"Its size: {'; '.join(phrases)}; 90 % intervals in brackets."

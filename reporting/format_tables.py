@@ -1,0 +1,306 @@
+"""The keys of a file format as tables of Markdown, from its JSON Schema."""
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+from reporting.format_schema import JsonSchema
+from reporting.words import listing
+
+Notation = Literal["toml", "json"]
+"""The language of the files of a format, in which places are written."""
+
+_TYPE_NAMES = {
+    "string": "text",
+    "number": "number",
+    "integer": "integer",
+    "boolean": "true or false",
+    "null": "null",
+    "object": "table",
+    "array": "list",
+}
+_BOUND_SIGNS = {
+    "minimum": "≥",
+    "exclusiveMinimum": ">",
+    "maximum": "≤",
+    "exclusiveMaximum": "<",
+}
+_NULL = {"type": "null"}
+_ALTERNATIVES = ("anyOf", "oneOf")
+_HEADER = "| key | type | unit | default | range | meaning |\n| --- | --- | --- | --- | --- | --- |"
+
+
+class KeyRow(NamedTuple):
+    """A row of a table of keys; each entry is a text of Markdown."""
+
+    key: str
+    type: str
+    unit: str
+    default: str
+    range: str
+    meaning: str
+
+
+@dataclass
+class KeyTable:
+    """A table of a format, with its keys.
+
+    Attributes
+    ----------
+    schema : dict
+        The JSON Schema of the table.
+    places : list of str
+        Where the table can stand in a file; empty for the file as a whole.
+    """
+
+    schema: JsonSchema
+    places: list[str] = field(default_factory=list)
+
+
+def format_page(schema: JsonSchema, notation: Notation) -> str:
+    """Return the tables of all keys of a format as text of Markdown.
+
+    Parameters
+    ----------
+    schema : dict
+        The JSON Schema of the format.
+    notation : {"toml", "json"}
+        The language of its files.
+    """
+    tables = _TableFinder(schema, notation).tables
+    headings = {id(table.schema): _heading(table) for table in tables}
+
+    def link(table_schema: JsonSchema) -> str:
+        heading = headings[id(table_schema)]
+        return f"[table](#{_anchor(heading)})"
+
+    sections = []
+    for table in tables:
+        rows = _rows(table.schema, schema, link)
+        lines = [f"| {' | '.join(cell or ' ' for cell in row)} |" for row in rows]
+        summary = table.schema.get("description", "")
+        paragraphs = [
+            f"## {headings[id(table.schema)]}",
+            _markdown(summary),
+            "\n".join([_HEADER, *lines]),
+        ]
+        sections.append("\n\n".join(text for text in paragraphs if text))
+    return "\n\n".join(sections) + "\n"
+
+
+def undocumented_keys(schema: JsonSchema) -> list[str]:
+    """Return the keys of a format that lack a description, and those of numbers without a unit."""
+    keys = []
+    for table in _TableFinder(schema, "json").tables:
+        for key, key_schema in table.schema["properties"].items():
+            place = f"{' '.join(table.places)} {key}".strip()
+            if "description" not in key_schema:
+                keys.append(f"{place}: no description")
+            elif "unit" not in key_schema and "number" in _basic_types(key_schema, schema):
+                keys.append(f"{place}: no unit")
+    return keys
+
+
+class _TableFinder:
+    """Finds all tables of a format, each once, in the order in which a reader meets them."""
+
+    def __init__(self, schema: JsonSchema, notation: Notation) -> None:
+        self.tables: list[KeyTable] = []
+        self._root = schema
+        self._notation = notation
+        self._waiting: list[tuple[JsonSchema, str]] = [(schema, "")]
+        while self._waiting:
+            node, place = self._waiting.pop(0)
+            self._visit(node, place)
+
+    def _visit(self, node: JsonSchema, place: str) -> None:
+        """Add the tables that a part of the schema describes, and remember those inside them."""
+        node = _resolved(node, self._root)
+        for key in _ALTERNATIVES:
+            for alternative in node.get(key, ()):
+                self._visit(alternative, place)
+        if "items" in node:
+            self._visit(node["items"], self._place_of_row(place))
+        for entry in node.get("prefixItems", ()):
+            self._visit(entry, place)
+        if isinstance(node.get("additionalProperties"), dict):
+            self._visit(node["additionalProperties"], self._place_in(place, "NAME"))
+        if "properties" in node:
+            self._add_table(node, place)
+
+    def _add_table(self, node: JsonSchema, place: str) -> None:
+        """Add a table, or a further place of a table that was found before."""
+        for table in self.tables:
+            if table.schema is node:
+                if place not in table.places:
+                    table.places.append(place)
+                return
+        self.tables.append(KeyTable(node, [place]))
+        for key, key_schema in node["properties"].items():
+            self._waiting.append((key_schema, self._place_in(place, key)))
+
+    def _place_in(self, place: str, key: str) -> str:
+        """Return the place of a table in another one."""
+        if self._notation == "json":
+            return f"{place}.{key}".lstrip(".")
+        inner_place = place.strip("[]")
+        return f"[{inner_place}.{key}]".replace("[.", "[")
+
+    def _place_of_row(self, place: str) -> str:
+        """Return the place of a table in a list of tables."""
+        return f"{place}[]" if self._notation == "json" else f"[{place}]"
+
+
+def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:
+    """Return a part of a schema, or the definition to which it refers."""
+    reference = node.get("$ref")
+    if reference is None:
+        return node
+    definition: JsonSchema = root["$defs"][reference.rpartition("/")[2]]
+    return _resolved(definition, root)
+
+
+def _heading(table: KeyTable) -> str:
+    """Return the heading of a table: its places, and its kind if there are several."""
+    places = [f"`{place}`" for place in table.places if place]
+    heading = listing(places) if places else "The file"
+    kind = table.schema["properties"].get("kind", {}).get("const")
+    if kind is not None:
+        return f'{heading}, kind "{kind}"'
+    variant = table.schema.get("variant")
+    return f"{heading}, {variant}" if variant else heading
+
+
+def _anchor(heading: str) -> str:
+    """Return the anchor that GitHub and MyST give a heading."""
+    text = re.sub(r"[^\w\- ]", "", heading.lower())
+    return text.replace(" ", "-")
+
+
+def _rows(
+    table: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]
+) -> Iterator[KeyRow]:
+    """Yield the rows of a table of keys.
+
+    Parameters
+    ----------
+    table : dict
+        The JSON Schema of the table.
+    root : dict
+        The JSON Schema of the format.
+    link : callable
+        Returns the link to a table, given its schema.
+    """
+    required = table.get("required", ())
+    for key, key_schema in table["properties"].items():
+        unit = key_schema.get("unit", "")
+        if "same_as" in key_schema:
+            yield KeyRow(f"`{key}`", "", unit, "", "", f"As `{key_schema['same_as']}`.")
+            continue
+        yield KeyRow(
+            key=f"`{key}`",
+            type=_type_text(key_schema, root, link),
+            unit="" if unit == "1" else unit,
+            default="needed" if key in required else _default_text(key_schema),
+            range=_range_text(key_schema, root),
+            meaning=_markdown(key_schema.get("description", "")),
+        )
+
+
+def _markdown(text: str) -> str:
+    """Return a text without characters that would end a cell of a table."""
+    return text.replace("|", "\\|").replace("``", "`").replace("<", "\\<")
+
+
+def _default_text(schema: JsonSchema) -> str:
+    """Return the default of a key; empty if it has none that can be written."""
+    default = schema.get("default")
+    if default is None or default in ("", [], {}) or isinstance(default, dict):
+        return ""
+    return f"`{json.dumps(default, ensure_ascii=False)}`"
+
+
+def _type_text(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]) -> str:
+    """Return the type of a value in words, with a link if it is a table."""
+    node = _resolved(node, root)
+    if "const" in node:
+        return f"`{json.dumps(node['const'])}`"
+    if "enum" in node:
+        return listing([f"`{json.dumps(word)}`" for word in node["enum"]], "or")
+    for key in _ALTERNATIVES:
+        if key in node:
+            entries = [entry for entry in node[key] if entry != _NULL]
+            return " or ".join(dict.fromkeys(_type_text(entry, root, link) for entry in entries))
+    if "properties" in node:
+        return link(node)
+    if isinstance(node.get("additionalProperties"), dict):
+        return f"by name: {_entry_type(node['additionalProperties'], root, link)}"
+    if "prefixItems" in node:
+        entries = dict.fromkeys(_type_text(entry, root, link) for entry in node["prefixItems"])
+        return f"list of {len(node['prefixItems'])}: {', '.join(entries)}"
+    if "items" in node:
+        return f"list of: {_entry_type(node['items'], root, link)}"
+    types = node.get("type", [])
+    names = [_TYPE_NAMES[name] for name in ([types] if isinstance(types, str) else types)]
+    return " or ".join(names) or "any value"
+
+
+def _entry_type(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]) -> str:
+    """Return the type of the entries of a list or table; in brackets if there are alternatives."""
+    text = _type_text(node, root, link)
+    return f"({text})" if " or " in text else text
+
+
+def _range_text(node: JsonSchema, root: JsonSchema) -> str:
+    """Return the bounds of a value, or of the numbers in it, in words."""
+    bounds = dict.fromkeys(_bounds(node, root))
+    # A bound that is excluded by one part of a type is not repeated as an included one.
+    return ", ".join(
+        bound
+        for bound in bounds
+        if bound.replace("≥", ">").replace("≤", "<") not in {*bounds} - {bound}
+    )
+
+
+def _bounds(node: JsonSchema, root: JsonSchema) -> Iterator[str]:
+    """Yield the bounds of a value and of the entries of a list; not those of the keys of tables."""
+    node = _resolved(node, root)
+    for key, sign in _BOUND_SIGNS.items():
+        if key in node:
+            yield f"{sign} {node[key]:.10g}"
+    if node.get("minItems", 0) > 1 and "prefixItems" not in node:
+        yield f"at least {node['minItems']} entries"
+    if "maxItems" in node and "prefixItems" not in node:
+        yield f"at most {node['maxItems']} entries"
+    for entry in _inner_schemas(node):
+        yield from _bounds(entry, root)
+
+
+def _inner_schemas(node: JsonSchema) -> Iterator[JsonSchema]:
+    """Yield the schemas of alternatives, and of the entries of a list or of a table by names."""
+    for key in (*_ALTERNATIVES, "prefixItems"):
+        yield from node.get(key, ())
+    for key in ("items", "additionalProperties"):
+        if isinstance(node.get(key), dict):
+            yield node[key]
+
+
+def _basic_types(node: JsonSchema, root: JsonSchema) -> set[str]:
+    """Return the types of JSON that a value can have, and those of its entries, without tables."""
+    node = _resolved(node, root)
+    types: set[str] = set()
+    if "properties" in node:
+        return types
+    if isinstance(node.get("type"), str):
+        types.add(node["type"])
+    for entry in _inner_schemas(node):
+        types |= _basic_types(entry, root)
+    return types
+
+
+def keys_of_format(schema: Mapping[str, Any]) -> set[str]:
+    """Return the names of all keys of a format."""
+    tables = _TableFinder(dict(schema), "json").tables
+    return {key for table in tables for key in table.schema["properties"]}

@@ -1,0 +1,76 @@
+"""The keys that a table of a file may have, from the class that describes the file."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel
+
+
+def known_keys(model: object, location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys that the table at a location of a file may have; empty if it is not known.
+
+    Parameters
+    ----------
+    model : type
+        The class that describes the file.
+    location : tuple of int and str
+        The keys and indices that lead to the table. Entries that are neither, such as the names of
+        types that pydantic adds, are passed over.
+    """
+    types = [*_alternatives(model)]
+    for step in location:
+        inner_types: list[object] = []
+        for candidate in types:
+            inner_types += _inner_types(candidate, step)
+        types = inner_types or types
+    keys: dict[str, None] = {}
+    for candidate in types:
+        keys |= dict.fromkeys(_types_of_keys(candidate))
+    return list(keys)
+
+
+def _alternatives(annotation: object) -> Iterator[object]:
+    """Yield the types of which a value may be, without their metadata."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        yield from _alternatives(get_args(annotation)[0])
+    elif origin in (Union, UnionType):
+        for alternative in get_args(annotation):
+            yield from _alternatives(alternative)
+    else:
+        yield annotation
+
+
+def _inner_types(annotation: object, step: int | str) -> list[object]:
+    """Return the types of the value at a key or an index of a value; empty if it has none there."""
+    if isinstance(step, int):
+        entries = [entry for entry in get_args(annotation) if entry is not Ellipsis]
+        return [inner for entry in entries for inner in _alternatives(entry)]
+    types_of_keys = _types_of_keys(annotation)
+    if step in types_of_keys:
+        return [*_alternatives(types_of_keys[step])]
+    arguments = get_args(annotation)
+    if isinstance(get_origin(annotation), type) and len(arguments) == 2 and _is_mapping(annotation):
+        return [*_alternatives(arguments[1])]
+    return []
+
+
+def _is_mapping(annotation: object) -> bool:
+    """Return whether a type is a dictionary or another mapping."""
+    origin: Any = get_origin(annotation)
+    return issubclass(origin, Mapping)
+
+
+def _types_of_keys(annotation: object) -> dict[str, object]:
+    """Return the type of each key of a model or dataclass, by the key; empty for other types."""
+    if not isinstance(annotation, type):
+        return {}
+    if issubclass(annotation, BaseModel):
+        model_fields = annotation.model_fields
+        return {field.alias or name: field.annotation for name, field in model_fields.items()}
+    if is_dataclass(annotation):
+        hints = get_type_hints(annotation)
+        return {field.name: hints[field.name] for field in fields(annotation)}
+    return {}

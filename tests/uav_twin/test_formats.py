@@ -1,0 +1,158 @@
+"""The formats of files: their JSON Schemas, their pages and the command that prints them."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks import format_pages
+from discrepancy.campaign.schema import parse_campaign
+from discrepancy.catalogue.effect_file import effects_of_file
+from discrepancy.errors import CampaignFileError, CatalogueError, ModelError
+from discrepancy.system.lumped_file import LumpedDescription
+from fe.runtime.errors import InvalidDesignError
+from fe.structure.design import parse_structure
+from fe.wing.design import parse_design
+from fmu_asset.client.binding import parse_binding
+from fmu_asset.errors import BindingError
+from reporting.format_tables import undocumented_keys
+from scenarios import binding_files, scenario_files, structure_files
+from tests.refusals import refused
+from twin_master.errors import ScenarioError
+from twin_master.scenario.reading import parse_scenario
+from uav_twin.cli import app
+from uav_twin.formats import FORMATS, SCHEMA_FOLDER, schema_line
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = {
+    "scenario": [*scenario_files().values()],
+    "binding": [*binding_files().values()],
+    "structure": [*structure_files().values()],
+    "wing": [*(ROOT / "fe" / "designs").glob("*.toml")],
+    "lumped-model": [*(ROOT / "discrepancy").glob("lumped_models/*.toml")],
+    "effects": [*(ROOT / "discrepancy" / "catalogue").glob("[!r]*.toml")],
+}
+"""The shipped files of each format, whose first line names the schema."""
+FILES = {
+    **SHIPPED,
+    "campaign": [
+        ROOT / f"discrepancy/sources/rigs/{name}/campaign.toml" for name in ("pendulum", "two_tanks")
+    ],
+    "fmu-model": [
+        ROOT / "tests" / "discrepancy" / "system" / "inputs" / f"{name}.toml" for name in ("console", "wing")
+    ],
+}
+
+
+def content_of(path):
+    """Return the content of a TOML file."""
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_key_of_a_format_has_a_description_and_every_number_a_unit(name):
+    assert undocumented_keys(FORMATS[name].schema()) == []
+
+
+def test_schemas_and_pages_are_those_of_the_classes():
+    """If this fails: python -m benchmarks.format_pages."""
+    written = dict(format_pages.pages())
+    for path, text in written.items():
+        assert path.read_text(encoding="utf-8") == text, path
+    folders = (format_pages.FOLDER, SCHEMA_FOLDER)
+    assert {path for folder in folders for path in folder.iterdir()} == set(written)
+
+
+@pytest.mark.parametrize(("name", "path"), [(name, path) for name in FILES for path in FILES[name]])
+def test_shipped_files_fit_their_schemas(name, path):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = FORMATS[name].schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(content_of(path), schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**content_of(path), "no_such_key": 1}, schema)
+
+
+@pytest.mark.parametrize(("name", "path"), [(name, path) for name in SHIPPED for path in SHIPPED[name]])
+def test_shipped_files_name_their_schemas_to_editors(name, path):
+    directive, _, target = path.read_text(encoding="utf-8").partition("\n")[0].partition(" ")
+    assert directive == "#:schema"
+    assert (path.parent / target).resolve() == FORMATS[name].schema_file
+
+
+def test_the_command_lists_prints_and_writes_schemas(tmp_path):
+    runner = CliRunner()
+    listed = runner.invoke(app, ["schema"]).stdout
+    assert [line.split()[0] for line in listed.splitlines()] == list(FORMATS)
+    assert json.loads(runner.invoke(app, ["schema", "--json"]).stdout).keys() == FORMATS.keys()
+    printed = runner.invoke(app, ["schema", "campaign"]).stdout
+    assert json.loads(printed) == FORMATS["campaign"].schema()
+    out = tmp_path / "campaign.schema.json"
+    told = runner.invoke(app, ["schema", "campaign", "--out", str(out)]).stdout
+    assert out.read_text(encoding="utf-8") == printed
+    assert "#:schema ./campaign.schema.json" in told
+    assert runner.invoke(app, ["schema", "--out", str(out)]).exit_code == 2
+    unknown = runner.invoke(app, ["schema", "campaigns"])
+    assert unknown.exit_code != 0
+    assert "Did you mean `campaign`?" in str(unknown.exception)
+
+
+def test_the_line_for_editors_names_a_shipped_file():
+    directive, _, uri = schema_line("binding").strip().partition(" ")
+    assert directive == "#:schema"
+    assert Path(uri.removeprefix("file://")) == FORMATS["binding"].schema_file
+
+
+def read_binding(content, source):
+    """Return the binding in the content of a file."""
+    return parse_binding(content, where=source)
+
+
+SCENARIO = scenario_files()["level_turns"]
+CHAIN = ROOT / "discrepancy" / "lumped_models" / "three_mass_chain.toml"
+TANKS = ROOT / "discrepancy" / "sources" / "rigs" / "two_tanks" / "campaign.toml"
+READERS = {
+    "scenario": (parse_scenario, SCENARIO, ScenarioError),
+    "wing": (parse_design, ROOT / "fe" / "designs" / "uav_wing.toml", InvalidDesignError),
+    "structure": (parse_structure, structure_files()["bracket"], InvalidDesignError),
+    "binding": (read_binding, binding_files()["uav_wing"], BindingError),
+    "lumped-model": (LumpedDescription.parse, CHAIN, ModelError),
+    "campaign": (parse_campaign, TANKS, CampaignFileError),
+}
+"""The reader of a format, a good file, and the error that it raises."""
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "wrong", "nearest"),
+    [
+        ("scenario", ("mission",), "stepps", "steps"),
+        ("scenario", ("state", 0), "levels_precent", "levels_percent"),
+        ("wing", ("planform",), "semispan", "semi_span"),
+        ("structure", ("material", 0), "young_modulos", "young_modulus"),
+        ("binding", ("binding",), "step_sise", "step_size"),
+        ("lumped-model", ("output", 0), "quantty", "quantity"),
+        ("campaign", ("trial", 0), "held_aut", "held_out"),
+    ],
+)
+def test_a_misspelt_key_is_refused_with_the_nearest_one(name, place, wrong, nearest):
+    parse, path, error = READERS[name]
+    content = content_of(path)
+    table = content
+    for step in place:
+        table = table[step]
+    table[wrong] = 1
+    with refused(error, rf"{wrong}.*Did you mean `{nearest}`\?$"):
+        parse(content, "the file")
+
+
+def test_a_misspelt_key_or_word_of_an_effect_is_refused_with_the_nearest_one(tmp_path):
+    text = (ROOT / "discrepancy" / "catalogue" / "outflow.toml").read_text(encoding="utf-8")
+    path = tmp_path / "effects.toml"
+    path.write_text(text.replace("signature", "signatur", 1), encoding="utf-8")
+    with refused(CatalogueError, r"'signatur' is not a key of an effect. Did you mean `signature`\?$"):
+        effects_of_file(path)
+    path.write_text(text.replace('"log_normal"', '"lognormal"', 1), encoding="utf-8")
+    with refused(CatalogueError, r"'lognormal' came. Did you mean `log_normal`\?$"):
+        effects_of_file(path)

@@ -1,0 +1,321 @@
+"""The layout of a fleet's store: groups, names, axes and units are those of a run's `run.nc`.
+
+`store/run.toml` lists the variables. Stores of earlier versions, whose variables stood in one group
+under other names, are read in the present layout.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from math import prod
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reporting.arrays import Float
+from twin_master.scenario.schema import Scenario
+from twin_master.store.mission_result import SCHEMA, SEVERAL_UNITS
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+NOTICE_KINDS = ("alarm", "gauge_left_out")
+"""The kinds of notices that are kept of each twin."""
+
+_NO_CONTROL = -1
+"""Value of `control_index` in steps that were not flown."""
+_NO_STEP = -1
+"""Value of `notice/first_step` for a kind of notice that was never given."""
+_FILL_VALUES = {"observed/control_index": _NO_CONTROL, "notice/first_step": _NO_STEP}
+"""Values of twins that have not flown, for variables in which 0 has a meaning."""
+
+FORMER_DIMENSIONS = {
+    "turn": "step",
+    "factor": "region",
+    "level": "state",
+}
+"""The present name of each dimension of a store of an earlier version."""
+FORMER_PATHS = {
+    "control_index": "observed/control_index",
+    "mean": "filtered/mean",
+    "standard_deviation": "filtered/standard_deviation",
+    "log_evidence": "filtered/log_evidence",
+    "belief": "filtered/last_probability",
+    "state": "truth/state",
+    "unexplained": "notice/none_of_these",
+    "notices": "notice/count",
+    "first_notice": "notice/first_step",
+}
+"""The present path of each variable that had another name in a store of an earlier version."""
+_FORMER_OBSERVED = "observed"
+"""The former variable with the sensors and, behind them, what else was read in a step."""
+
+
+class StoredVariable(NamedTuple):
+    """A variable of the store.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Its dimensions beside `twin`.
+    unit, title : str
+        Its unit and its name in words.
+    dtype : str
+        The type of its values, such as "f4".
+    fill_value : float
+        The value of twins that have not flown.
+    """
+
+    axes: tuple[str, ...]
+    unit: str
+    title: str
+    dtype: str
+    fill_value: float
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """The attributes of the variable, as those of a run."""
+        return {"units": self.unit, "long_name": self.title}
+
+
+class Coordinate(NamedTuple):
+    """A coordinate of the store.
+
+    Attributes
+    ----------
+    axis : str
+        Its dimension.
+    unit, title : str
+        Its unit, empty for names, and what it is in words.
+    values : (N,) array
+        Its values.
+    """
+
+    axis: str
+    unit: str
+    title: str
+    values: NDArray[Any]
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """The attributes of the coordinate, as those of a run."""
+        units = {"units": self.unit} if self.unit else {}
+        return {**units, "long_name": self.title}
+
+
+def dimension_sizes(scenario: Scenario) -> dict[str, int]:
+    """Return the sizes of the store's dimensions for a scenario, by name."""
+    observation = scenario.observation
+    return {
+        "step": scenario.mission.steps,
+        "sensor": observation.count,
+        "pair": observation.width - observation.count,
+        "region": len(scenario.state),
+        "notice_kind": len(NOTICE_KINDS),
+        "state": prod(len(factor.levels) for factor in scenario.state),
+    }
+
+
+def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[str, StoredVariable]:
+    """Return the variables of the store of a group, by their paths.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of the group.
+    parameters : sequence of str
+        The names of the true parameters that differ from twin to twin.
+    """
+    observation = scenario.observation
+    different_units = dict.fromkeys(observation.sensor_units)
+    common_fields = {
+        "role": observation.role,
+        "sensor_unit": SEVERAL_UNITS if len(different_units) > 1 else observation.sensor_units[0],
+        "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
+    }
+    layout = {}
+    for template, row in SCHEMA["fleet"].items():
+        for own_fields in _fields_of_entries(template, scenario, parameters):
+            fields = common_fields | own_fields
+            path = template.format(**fields)
+            axes, unit, title, dtype = (text.format(**fields) for text in row)
+            usual_fill_value = np.nan if dtype[0] == "f" else 0
+            fill_value = _FILL_VALUES.get(path, usual_fill_value)
+            layout[path] = StoredVariable(tuple(axes.split()), unit, title, dtype, fill_value)
+    return layout
+
+
+def _fields_of_entries(
+    template: str, scenario: Scenario, parameters: Sequence[str]
+) -> Iterator[dict[str, str]]:
+    """Yield the values of the own fields of each variable that a row of the schema describes."""
+    if "{reading}" in template:
+        for reading in scenario.readings:
+            yield {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
+    elif "{parameter}" in template:
+        for parameter in parameters:
+            yield {"parameter": parameter}
+    elif "_covariance" not in template or scenario.observation.modes is not None:
+        yield {}
+
+
+def store_coordinates(scenario: Scenario, twins: Sequence[str]) -> dict[str, Coordinate]:
+    """Return the coordinates of the store of a group, by their names.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of the group.
+    twins : sequence of str
+        The names of the twins.
+    """
+    observation = scenario.observation
+    values: dict[str, ArrayLike] = {
+        "twin": list(twins),
+        "step": np.arange(scenario.mission.steps),
+        "sensor": np.arange(1, observation.count + 1),
+        "region": scenario.state_names,
+        "notice_kind": NOTICE_KINDS,
+    }
+    if len({*observation.sensor_units}) > 1:
+        values["sensor_unit"] = observation.sensor_units
+    if observation.titles:
+        values["sensor_title"] = observation.titles
+    rows = SCHEMA["coordinates"] | SCHEMA["fleet_coordinates"]
+    coordinates = {}
+    for name, labels in values.items():
+        axis, unit, title = rows[name]
+        coordinates[name] = Coordinate(axis, unit, title, np.asarray(labels))
+    # The levels of each factor in each joint state, of which the last factor varies fastest.
+    levels = np.array(list(product(*[factor.levels for factor in scenario.state])))
+    axis, _, _ = rows["{factor}"]
+    for column, factor in enumerate(scenario.state):
+        coordinates[factor.name] = Coordinate(axis, factor.unit, factor.name, levels[:, column])
+    return coordinates
+
+
+def coordinates_of_groups(
+    layout: Mapping[str, StoredVariable], coordinates: Mapping[str, Coordinate]
+) -> dict[str, dict[str, Coordinate]]:
+    """Return the coordinates of each group of a store: those whose axes its variables have.
+
+    Parameters
+    ----------
+    layout : mapping of str to StoredVariable
+        The variables by their paths.
+    coordinates : mapping of str to Coordinate
+        The coordinates by their names.
+
+    Returns
+    -------
+    dict of str to dict
+        The coordinates by name, for each group by its path; the path of the outermost one is empty.
+    """
+    axes_of_group: dict[str, set[str]] = {}
+    for path, variable in layout.items():
+        group, _, _ = path.rpartition("/")
+        axes_of_group.setdefault(group, {"twin"}).update(variable.axes)
+    return {
+        group: {name: entry for name, entry in coordinates.items() if entry.axis in axes}
+        for group, axes in axes_of_group.items()
+    }
+
+
+def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
+    """Return where each observed variable stands in the row of observations of a step.
+
+    Returns
+    -------
+    dict of str to slice or int
+        The columns of the sensors and of the covariance of modes, and the column of each reading
+        of an inspection, by the paths of the variables.
+    """
+    observation = scenario.observation
+    columns: dict[str, slice | int] = {f"observed/{observation.role}": slice(observation.count)}
+    if observation.modes is not None:
+        covariance = slice(observation.count, observation.width)
+        columns[f"observed/{observation.role}_covariance"] = covariance
+    for number, reading in enumerate(scenario.readings):
+        columns[f"observed/{reading.name}"] = observation.width + number
+    return columns
+
+
+def observation_rows(group: "xr.DataTree", scenario: Scenario) -> Float:
+    """Return the rows of observations of the twins of a group, a (B, T, W) array.
+
+    A row has the values of the sensors, the covariance of modes, and the readings of inspections.
+    """
+    twin_count = group.sizes["twin"]
+    rows = np.empty((twin_count, scenario.mission.steps, scenario.row_width))
+    for path, columns in observed_columns(scenario).items():
+        rows[..., columns] = group[path].values
+    return rows
+
+
+def is_former_layout(dataset: "xr.Dataset") -> bool:
+    """Return whether the group of a store was written by an earlier version."""
+    return not FORMER_PATHS.keys().isdisjoint(dataset.data_vars)
+
+
+def in_present_layout(
+    dataset: "xr.Dataset", scenario: Scenario, twins: Sequence[str]
+) -> "xr.DataTree":
+    """Return a group of a store of an earlier version in the present layout.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        The group, whose variables have their former names.
+    scenario : Scenario
+        The scenario of the group.
+    twins : sequence of str
+        The names of the twins.
+    """
+    import xarray as xr
+
+    dimensions = {
+        former: present for former, present in FORMER_DIMENSIONS.items() if former in dataset.dims
+    }
+    variables = {}
+    for name, stored in dataset.data_vars.items():
+        variable = stored.rename(
+            {former: present for former, present in dimensions.items() if former in stored.dims}
+        )
+        if name == _FORMER_OBSERVED:
+            for path, columns in observed_columns(scenario).items():
+                variables[path] = variable.isel(sensor=columns)
+            continue
+        path = FORMER_PATHS.get(str(name), str(name))
+        if path not in SCHEMA["fleet"]:  # a true parameter
+            path = f"truth/{name}"
+        variables[path] = variable
+    parameters = [path.partition("/")[2] for path in variables if path.startswith("truth/")]
+    layout = stored_layout(scenario, [name for name in parameters if name != "state"])
+    groups: dict[str, dict[str, Any]] = {"": {}}
+    for path, variable in variables.items():
+        group, _, name = path.rpartition("/")
+        entry = variable.variable.copy(deep=False)
+        entry.attrs = layout[path].attributes
+        groups.setdefault(group, {})[name] = entry
+    datasets = {}
+    coordinates = coordinates_of_groups(layout, store_coordinates(scenario, twins))
+    for group, entries in groups.items():
+        labels = {
+            name: xr.Variable((coordinate.axis,), coordinate.values, coordinate.attributes)
+            for name, coordinate in coordinates[group].items()
+        }
+        datasets[f"/{group}"] = xr.Dataset(entries, labels)
+    datasets["/"].attrs.update(dataset.attrs)
+    return xr.DataTree.from_dict(datasets)
+
+
+def former_names_used(dataset: "xr.Dataset") -> Mapping[str, str]:
+    """Return the present name of each former name that the group of a store has.
+
+    Names of dimensions come first, then those of variables, which become paths.
+    """
+    dimensions = {
+        name: present for name, present in FORMER_DIMENSIONS.items() if name in dataset.dims
+    }
+    paths = {name: path for name, path in FORMER_PATHS.items() if name in dataset.data_vars}
+    return dimensions | paths

@@ -1,0 +1,359 @@
+"""The JSON records that runs and watches write, key by key, for their schemas and pages.
+
+A key with `NotRequired` is in the record only if there is something to say.
+"""
+
+from typing import Any, NotRequired
+
+from typing_extensions import TypedDict
+
+
+class NoticeRecord(TypedDict):
+    """Something that the operator should know."""
+
+    kind: str
+    """What the notice is about, such as "alarm" or "gauge_left_out"."""
+    sensors: list[int]
+    """The sensors that the notice concerns, numbered from 1."""
+    value: float | None
+    """The number on which the notice is based; null if there is none [SI]."""
+    sentence: str
+    """The notice in words."""
+    since: int | None
+    """The step in which the fault probably began; null if it is not known."""
+
+
+class LearntRecord(TypedDict):
+    """Posterior of a quantity that does not change in time."""
+
+    mean: float
+    """Mean [unit of the entry]."""
+    standard_deviation: float
+    """Standard deviation [unit of the entry]."""
+    lower: float
+    """Lower end of the central 90 % interval [unit of the entry]."""
+    upper: float
+    """Upper end of the central 90 % interval [unit of the entry]."""
+    unit: str
+    """Unit of the numbers."""
+
+
+class FactorRecord(TypedDict):
+    """What the twin believes of a factor of the state."""
+
+    mean: float | None
+    """Mean; null if no state is believed [unit of the entry]."""
+    standard_deviation: float | None
+    """Standard deviation; null if no state is believed [unit of the entry]."""
+    unit: str
+    """Unit of the numbers; "1" for a fraction."""
+
+
+class DecisionRecord(TypedDict):
+    """A decision, as a watch prints and publishes it."""
+
+    step: int
+    """The step that was observed; -1 before the first one."""
+    control: NotRequired[str]
+    """The control that was in force in the step."""
+    state_believed: NotRequired[bool]
+    """Whether a state of the model explains the sensors."""
+    health: NotRequired[dict[str, FactorRecord]]
+    """The belief about each factor of the state, by its name."""
+    next_control: NotRequired[str]
+    """The control that the twin proposes for the next step."""
+    probability: NotRequired[float]
+    """Probability of the proposed control [1]."""
+    lost_sensors: NotRequired[int]
+    """Number of sensors without a reading."""
+    log_evidence: NotRequired[float]
+    """Logarithm of the probability density of the observation given the earlier ones [nat]."""
+    notices: list[NoticeRecord]
+    """What the operator should know."""
+    none_of_these: NotRequired[float]
+    """Probability that no state explains the sensors; only if the twin gives notices [1]."""
+    hypotheses: NotRequired[dict[str, float]]
+    """Probability of each hypothesis by its name; only if the twin gives notices [1]."""
+    decided_by: NotRequired[str]
+    """The hypothesis that decided; only if the twin gives notices."""
+    learnt: NotRequired[dict[str, LearntRecord]]
+    """What was learnt so far, by the name of the quantity; only if the twin learns."""
+    revised_by_step: NotRequired[int]
+    """The step whose late message changed the decision."""
+    told_again: NotRequired[bool]
+    """Whether the decision may have been sent before."""
+    asset: NotRequired[str]
+    """Name of the asset; only of a fleet."""
+
+
+class ObservationMessage(TypedDict):
+    """A message of a publisher to a watch.
+
+    Every other key is a sensor, `ROLE_NUMBER` or its title, an inspection, `ACTION_STATE`, or the
+    role with a list of all sensors. A key may end with its unit: `strain_7_microstrain`. Keys that
+    begin with `_` are ignored.
+    """
+
+    step: NotRequired[int]
+    """Number of the step, from 0; without `step` and `time` it is the next one."""
+    time: NotRequired[float]
+    """Time of the step, in place of `step` [unit of `watch.time_unit`]."""
+    control: NotRequired[str]
+    """The control in force; by default the proposed one."""
+    unit: NotRequired[str]
+    """Unit of the list of all sensors."""
+    covariance: NotRequired[list[list[float]]]
+    """Covariance of identified features of modes, row by row [SI]."""
+
+
+class HeartbeatRecord(TypedDict):
+    """The state of a watch, which it publishes every 10 s."""
+
+    state: str
+    """The words "watching", "quiet" (no step came for too long), "ended" or "lost" (an error)."""
+    step: NotRequired[int]
+    """The last step; of a single asset."""
+    seconds_since_step: NotRequired[float]
+    """Time since the last step; of a single asset [s]."""
+    lag: int
+    """Number of messages that have come and are not worked off."""
+    received: NotRequired[int]
+    """Number of messages that have come; of a single asset."""
+    refused: int
+    """Number of messages that were refused."""
+    assets: NotRequired[int]
+    """Number of assets; of a fleet."""
+    steps: NotRequired[int]
+    """Number of steps of all assets; of a fleet."""
+    quiet: NotRequired[int]
+    """Number of assets of which no step came for too long; of a fleet."""
+
+
+class RejectedRecord(TypedDict):
+    """A message that was refused, a line of `rejected.jsonl`."""
+
+    message: int
+    """Number of the message among those of the watch, from 1."""
+    reason: str
+    """Why it was refused."""
+    text: str
+    """The first 200 characters of the message."""
+
+
+class SuspicionRecord(TypedDict):
+    """How well the model explains the sensors up to a step."""
+
+    none_of_these: float
+    """Posterior probability that no state of the model explains the sensors [1]."""
+    gauge_off: float
+    """Posterior probability that a single sensor is off [1]."""
+    log_evidence_none: float
+    """Log e-value that no state explains the sensors [nat]."""
+    log_evidence_any_gauge: float
+    """Log e-value that a single sensor is off [nat]."""
+    log_evidence_gauge: list[float]
+    """Log e-value of each sensor [nat]."""
+    left_out: list[bool]
+    """Whether the readings of each sensor are absurd and left out."""
+    hypotheses: dict[str, float]
+    """Probability of each hypothesis by its name [1]."""
+    decided_by: str
+    """The hypothesis that adds most to the probability of the chosen control."""
+
+
+class JournalRecord(TypedDict):
+    """A line of `journal.jsonl` after its hash.
+
+    The first line has the hash of the configuration alone. A line with `quiet`, `refused`,
+    `verdict` or `model` is an event between two steps.
+    """
+
+    config_hash: NotRequired[str]
+    """SHA-256 of `config.json`; only in the first line."""
+    step: NotRequired[int]
+    """Number of the step, from 0; of an event the last step before it."""
+    observed: NotRequired[list[float | None]]
+    """Readings of the sensors and, after them, of inspections; null if lost [SI]."""
+    control_index: NotRequired[int]
+    """Index of the control in force, from 0."""
+    next_control: NotRequired[int]
+    """Index of the proposed control, from 0."""
+    decision_probability: NotRequired[list[float]]
+    """Probability of each control in the decision [1]."""
+    filtered: NotRequired[list[float]]
+    """Belief over all joint states after the step [1]."""
+    log_evidence: NotRequired[float]
+    """Logarithm of the probability density of the observation given the earlier ones [nat]."""
+    state: NotRequired[list[float | None]]
+    """True value of each factor of the state, of a simulated asset [SI]."""
+    observation: NotRequired[list[float | None]]
+    """True values at the sensors without noise, of a simulated asset [SI]."""
+    monitors: NotRequired[dict[str, float | None]]
+    """What a simulated asset reports beside, by name [unit of the binding]."""
+    asset_state: NotRequired[str]
+    """State of the asset after the step, compressed and in base 64, from which a run resumes."""
+    learnt: NotRequired[dict[str, LearntRecord]]
+    """What was learnt so far, by the name of the quantity."""
+    notices: NotRequired[list[NoticeRecord]]
+    """What the operator should know."""
+    suspicion: NotRequired[SuspicionRecord]
+    """How well the model explains the sensors."""
+    observation_step: NotRequired[int]
+    """Of a watch: the step that the message was about."""
+    control_in_force: NotRequired[int]
+    """Of a watch: index of the control of the last step, if a late message changed an earlier."""
+    intake: NotRequired[dict[str, Any]]
+    """Of a watch: what was read of the messages, from which it resumes."""
+    settled: NotRequired[dict[str, Any]]
+    """Of a watch: the state of the twin before all steps that a late message can still change."""
+    standing: NotRequired[dict[str, Any]]
+    """Of a watch: the state of the search for causes before this line."""
+    quiet: NotRequired[DecisionRecord]
+    """Of a watch: the decision that was told again because no step came."""
+    refused: NotRequired[DecisionRecord]
+    """Of a watch: the decision that was told again because messages were refused."""
+    verdict: NotRequired[dict[str, Any]]
+    """Of a watch: the verdict of a search for the cause of an alarm."""
+    model: NotRequired[dict[str, Any]]
+    """Of a watch: the patched model that was adopted."""
+
+
+class FigureRecord(TypedDict):
+    """A figure of a mission, beside its reference."""
+
+    key: str
+    """Name of the figure for programs."""
+    title: str
+    """Name of the figure for people."""
+    value: float | str | None
+    """The figure; null if the mission gave none [unit of the entry]."""
+    unit: str
+    """Unit of `value` and `reference`, as printed."""
+    reference: float | str | None
+    """The value that the scenario states to compare with [unit of the entry]."""
+    reference_source: str
+    """Where the reference comes from."""
+
+
+class SummaryNotice(NoticeRecord):
+    """A notice of a mission, with its step."""
+
+    step: int
+    """The step of the notice."""
+
+
+class LearntSummary(TypedDict):
+    """What was learnt of a quantity; lists have an entry for each sensor."""
+
+    title: str
+    """The quantity in words."""
+    unit: str | list[str]
+    """Unit of the numbers."""
+    prior: dict[str, Any]
+    """`mean`, `standard_deviation`, `lower` and `upper` before the first step."""
+    posterior: dict[str, Any]
+    """`mean`, `standard_deviation`, `lower` and `upper` after the last step."""
+    truth: Any
+    """True value; null if it is not known."""
+
+
+class SummaryRecord(TypedDict):
+    """The content of `summary.json`."""
+
+    scenario: str
+    """Name of the scenario."""
+    title: str
+    """Title of the scenario."""
+    seed: int
+    """Seed of the mission."""
+    steps: int
+    """Number of steps that were flown."""
+    control: str
+    """When the control changed, in words."""
+    asset: str
+    """What was flown, in words."""
+    twin_model: str
+    """What the twin believed, in words."""
+    asset_and_model_differ: bool
+    """Whether the model that flew is known to differ from the one that the twin believed."""
+    figures: list[FigureRecord]
+    """The figures of the mission."""
+    learnt: NotRequired[dict[str, LearntSummary]]
+    """What was learnt, by the name of the quantity; only if the twin learns."""
+    notices: NotRequired[list[SummaryNotice]]
+    """What the operator was told."""
+
+
+class FileHash(TypedDict):
+    """A file by its name and hash."""
+
+    name: str
+    """Name of the file."""
+    sha256: str
+    """SHA-256 of the file's bytes."""
+
+
+class ProvenanceRecord(TypedDict):
+    """From which program and inputs results come."""
+
+    seed: int
+    """Seed of all random numbers."""
+    versions: dict[str, str]
+    """Version of each package that was used, by its name."""
+    source_hashes: dict[str, str]
+    """SHA-256 of the source code of each package of this program, by its name."""
+    input_hashes: dict[str, str]
+    """SHA-256 of each input, by its name."""
+
+
+class ConfigRecord(TypedDict):
+    """The content of `config.json` of a run, a watch or a fleet."""
+
+    format: int
+    """Version of the format."""
+    kind: str
+    """The words "uav-twin run" of a run or a watch, "uav-twin fleet" of a fleet."""
+    provenance: ProvenanceRecord
+    """From which program and inputs the results come."""
+    scenario: NotRequired[dict[str, Any]]
+    """The resolved scenario of a run, in SI; its keys are those of a scenario file."""
+    scenario_file: NotRequired[FileHash]
+    """The file of the scenario of a run."""
+    inputs: NotRequired[dict[str, str]]
+    """SHA-256 of the files in `asset/` of a run, by their names; once they are prepared."""
+    watched: NotRequired[bool]
+    """Whether a real asset is watched."""
+    fleet: NotRequired[dict[str, Any]]
+    """The plan of a fleet, with the scenarios, members and seeds of its groups."""
+
+
+class PartSeconds(TypedDict):
+    """Wall-clock times of one part of a step."""
+
+    total: float
+    """Sum over all steps [s]."""
+    median: float
+    """Median over the steps [s]."""
+    largest: float
+    """Longest step [s]."""
+    last: float
+    """Last step [s]."""
+
+
+class TimingRecord(TypedDict):
+    """The content of `timing.json`: wall-clock times of the last process of a run."""
+
+    resumed_at: int
+    """The first step that the process flew."""
+    steps: int
+    """Number of steps that the process flew."""
+    asset_seconds: NotRequired[PartSeconds]
+    """Times of the asset."""
+    twin_seconds: NotRequired[PartSeconds]
+    """Times of the twin."""
+    checkpoint_seconds: NotRequired[PartSeconds]
+    """Times of writing the journal."""
+    stages_seconds: dict[str, float]
+    """Time of each stage of the run, by its name [s]."""
+    total_seconds: float
+    """Time of the whole run [s]."""
