@@ -157,8 +157,12 @@ def test_twins_of_an_ensemble_fly_what_runs_fly(library_file, module, tmp_path):
 
 def test_a_fleet_says_what_it_cannot_send_and_what_it_cannot_learn_from(library_file, module, tmp_path):
     fleet = uav_twin.ensemble(mission(), range(2), {"strain_library": library_file})
+
+    def local_function(twin: Any) -> Forgetful:
+        return forgetful(twin)
+
     with pytest.raises(FleetError, match=r"cannot be sent .*FILE\.py:NAME"):
-        uav_twin.fly_fleet(fleet, tmp_path / "never", estimator=lambda _twin: None)
+        uav_twin.fly_fleet(fleet, tmp_path / "never", estimator=local_function)
     folder = uav_twin.fly_fleet(fleet, tmp_path / "noisy", sensor_model=f"{module}:noisy").folder
     with pytest.raises(FleetError, match=r"flew with the sensor model .*rig.py:noisy"):
         uav_twin.learn_from_fleet(folder, tmp_path / "learnt.toml")
