@@ -31,7 +31,7 @@ def plot_belief(run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | Non
     """Draw the believed state over the steps, with the truth where it is known.
 
     Each factor of the state has a panel with the mean and two standard deviations of the belief
-    p(D_t | o_0..o_t).
+    p(D_t | o_0..o_t), within the range of the factor's levels.
 
     Parameters
     ----------
@@ -63,7 +63,10 @@ def plot_belief(run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | Non
         scale, unit = printed_state(policy[name].attrs.get("units", "1"))
         mean = scale * filtered["mean"].sel(region=name).values
         deviation = scale * filtered["standard_deviation"].sel(region=name).values
-        style.band(panel, steps, mean - 2.0 * deviation, mean + 2.0 * deviation, style.PRESENT)
+        levels = scale * policy[name].values
+        lower = np.clip(mean - 2.0 * deviation, levels.min(), levels.max())
+        upper = np.clip(mean + 2.0 * deviation, levels.min(), levels.max())
+        style.band(panel, steps, lower, upper, style.PRESENT)
         panel.plot(steps, mean, color=style.PRESENT, label="believed, with two standard deviations")
         if "state" in truth:
             true_state = scale * truth["state"].sel(region=name).values
@@ -107,7 +110,8 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     panel.set_ylabel("number of the gauge")
     figure = panel.get_figure()
     assert figure is not None
-    figure.colorbar(image, ax=panel, extend="both", label="measured less expected (standard deviations)")
+    panel.set_title("measured less expected", loc="left")
+    figure.colorbar(image, ax=panel, extend="both", label="standard deviations")
     return panel
 
 
