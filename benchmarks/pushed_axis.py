@@ -73,7 +73,7 @@ def axis_positions(force: FloatArray) -> FloatArray:
 def pushed_axis(samples: int) -> Campaign:
     """Return two trials of so many samples each, pushed by a force of eight sines."""
     generator = np.random.default_rng(2)
-    time = np.arange(samples) * INTERVAL
+    time = np.asarray(np.arange(samples) * INTERVAL, dtype=np.float64)
     trials = []
     for name, amplitude in (("one", 60.0), ("two", 80.0)):
         frequencies = 2.0 * np.pi * generator.uniform(0.3, 3.0, 8)
@@ -87,8 +87,8 @@ def pushed_axis(samples: int) -> Campaign:
             TrialKind.FORCED,
             ("x",),
             time,
-            values=np.asarray(readings[:, None], dtype=np.float64),
-            force=np.asarray(force, dtype=np.float64),
+            values=readings[:, None],
+            force=force,
             load_place="push",
             begins=Start.UNKNOWN,
         )
