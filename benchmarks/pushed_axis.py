@@ -84,14 +84,15 @@ def pushed_axis(samples: int) -> Campaign:
         phases = generator.uniform(0.0, 2.0 * np.pi, 8)
         waves = np.sin(time[:, None] * frequencies + phases)
         force = amplitude * waves.sum(axis=1) / np.sqrt(8.0)
-        readings = axis_positions(force) + NOISE * generator.standard_normal(samples)
+        noise = NOISE * generator.standard_normal(samples)
+        readings = axis_positions(force) + noise
         trial = Trial.plain(
             name,
             TrialKind.FORCED,
             ("x",),
             time,
-            values=readings[:, None],
-            force=force,
+            values=np.asarray(readings[:, None], dtype=np.float64),
+            force=np.asarray(force, dtype=np.float64),
             load_place="push",
             begins=Start.UNKNOWN,
         )
