@@ -34,8 +34,12 @@ parameter = [
   { name = "damping", terms = "damping", deviation = 0.3, low = 0.2, high = 3.0 },
 ]
 """
-MASS, DAMPING, FRICTION = 10.0756, 17.909, 19.0
-"""Mass [kg], damping [N s/m] and dry friction [N] of the true axis."""
+MASS = 10.0756
+"""Mass of the true axis [kg]."""
+DAMPING = 17.909
+"""Damping of the true axis [N s/m]."""
+FRICTION = 19.0
+"""Dry friction of the true axis [N]."""
 NOISE = 2e-5
 """Standard deviation of the noise of the readings [m]."""
 INTERVAL = 0.002
