@@ -4,9 +4,8 @@ A wing's calibration from the folder of its laboratory and any model's from a ca
 class.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -18,6 +17,7 @@ from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
 from reporting.words import brief, comma_list, plus_minus
 
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
@@ -194,7 +194,7 @@ class Calibration:
     channels: tuple[ChannelFit, ...]
     source: str
     seed: int
-    provenance: Mapping[str, Any]
+    provenance: JsonRecord
     design_hash: str = ""
     quantities: tuple[CalibratedFigure, ...] = ()
     readings: tuple[FigureReading, ...] = ()
