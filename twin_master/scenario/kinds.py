@@ -134,7 +134,11 @@ class KindSection(FileSection):
         """Return the JSON Schema of a kind, or that of all kinds for a base class."""
         kind = cls.kind_of_class()
         if kind is None:
-            kinds = [kind for name, kind in cls.kinds().items() if name != WATCHED_KIND]
+            kinds = []
+            for name, subclass in sorted(cls.kinds().items()):
+                is_shipped = subclass.__module__.startswith(KIND_PACKAGE)
+                if is_shipped and name != WATCHED_KIND:  # users write no such table
+                    kinds.append(subclass)
             return {
                 "oneOf": [
                     kind.__get_pydantic_json_schema__(kind.__pydantic_core_schema__, handler)
