@@ -100,13 +100,18 @@ def _table_rows(rows: Mapping[str, list[str]], fields: Mapping[str, str]) -> Ite
 
     def filled(text: str) -> str:
         values = {**_MEANING_OF_FIELD, **fields}
-        return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[1].upper()), text)
+        return re.sub(r"\{(\w+)\}", lambda match: _text_of(match.group(1), values), text)
 
     for name, (axes, unit, meaning, *_) in rows.items():
         axes_text = ", ".join(filled(axes).split())
         unit_text = "" if unit == "1" else filled(unit).replace("_", " ")
         meaning_text = filled(meaning).replace("|", "\\|")
         yield f"| `{filled(name)}` | {axes_text} | {unit_text} | {meaning_text} |\n"
+
+
+def _text_of(field: str, values: Mapping[str, str]) -> str:
+    """Return the text for a field in braces: its value, or its name in upper case."""
+    return values.get(field, field.upper())
 
 
 if __name__ == "__main__":

@@ -17,12 +17,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis, Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorizer import ColorizingArtist
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullLocator
@@ -48,14 +51,74 @@ DECISION: Final = "#CC79A7"
 """Controls and policies (purple)."""
 REFERENCE: Final = "#999999"
 """Limits and reference lines (light grey)."""
+
+
+class ColorScale(TypedDict, total=False):
+    """Colours of values: the colour map, and the values at its ends."""
+
+    cmap: str | Colormap
+    vmin: float
+    vmax: float
+
+
+class MarkStyle(TypedDict, total=False):
+    """The look of marks, as arguments of `Axes.plot`."""
+
+    color: str
+    marker: str
+    markersize: float
+    markerfacecolor: str
+    markeredgecolor: str
+    markeredgewidth: float
+
+
+class LineStyle(MarkStyle, total=False):
+    """The look of a line and its marks, as arguments of `Axes.plot`."""
+
+    linewidth: float
+    linestyle: str | tuple[float, Sequence[float]]
+
+
+class IntervalStyle(MarkStyle, total=False):
+    """The look of a mean with its interval, as arguments of `Axes.errorbar`."""
+
+    capsize: float
+    elinewidth: float
+
+
+class SwatchStyle(TypedDict, total=False):
+    """The look of a patch of a legend, as arguments of `Rectangle`."""
+
+    edgecolor: str
+    linewidth: float
+
+
+class GridMargins(TypedDict, total=False):
+    """Margins of a figure, and gaps between its panels, as fractions."""
+
+    left: float
+    right: float
+    wspace: float
+    hspace: float
+
+
+class ColorBarShape(TypedDict, total=False):
+    """The shape of a scale of colours, as arguments of `Figure.colorbar`."""
+
+    pad: float
+    fraction: float
+    aspect: float
+    extend: Literal["neither", "both", "min", "max"]
+
+
 LEVELS: Final = "cividis"
 """Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
 
-RESIDUALS: Final[dict[str, Any]] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
+RESIDUALS: Final[ColorScale] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
 """Colours of a map of residuals, in standard deviations."""
 
 BAND_OPACITY: Final = 0.22
-TRUTH_LINE: Final[dict[str, Any]] = {
+TRUTH_LINE: Final[LineStyle] = {
     "color": TRUTH,
     "linewidth": 1.0,
     "linestyle": (0, (4, 1.5, 1, 1.5)),
@@ -145,7 +208,7 @@ def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
 
 
 def panels(
-    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
+    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Unpack[GridMargins]
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and its panels, row by row.
 
@@ -157,8 +220,8 @@ def panels(
         The height of the figure [in].
     top, bottom : float
         The margins above and below the panels [in].
-    **grid : float
-        Arguments of `Figure.add_gridspec`, as fractions of the figure.
+    **grid : GridMargins
+        Margins left and right, and gaps between the panels, as fractions.
     """
     figure = new_figure(height)
     margins = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
@@ -197,7 +260,17 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) 
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
-def interval(axes: Axes, x: float, mean: float, low: float, high: float, **style: Any) -> None:
+def interval(
+    axes: Axes,
+    x: float,
+    mean: float,
+    low: float,
+    high: float,
+    *,
+    label: str | None = None,
+    zorder: float = 2.0,
+    **style: Unpack[IntervalStyle],
+) -> None:
     """Draw a mean with its interval.
 
     Parameters
@@ -208,22 +281,28 @@ def interval(axes: Axes, x: float, mean: float, low: float, high: float, **style
         The horizontal coordinate.
     mean, low, high : float
         The mean and the ends of its interval. By rounding the mean may lie just outside.
-    **style : object
-        Arguments of `Axes.errorbar`.
+    label : str, optional
+        The text in the legend.
+    zorder : float
+        The order of drawing; what has a higher number covers it.
+    **style : IntervalStyle
+        The look of the mark, as arguments of `Axes.errorbar`.
     """
     lengths = [[max(mean - low, 0.0)], [max(high - mean, 0.0)]]
-    axes.errorbar([x], [mean], yerr=lengths, linestyle="none", **style)
+    axes.errorbar([x], [mean], yerr=lengths, linestyle="none", label=label, zorder=zorder, **style)
 
 
-def swatches(names: Sequence[str], colors: Sequence[str], **style: Any) -> list[Rectangle]:
+def swatches(
+    names: Sequence[str], colors: Sequence[str], **style: Unpack[SwatchStyle]
+) -> list[Rectangle]:
     """Return the patches that a legend shows for named colours.
 
     Parameters
     ----------
     names, colors : sequence of str
         The names and their colours.
-    **style : object
-        Arguments of `Rectangle`.
+    **style : SwatchStyle
+        The look of the patches, as arguments of `Rectangle`.
     """
     return [
         Rectangle((0, 0), 1, 1, facecolor=color, label=name, **style)
@@ -231,7 +310,9 @@ def swatches(names: Sequence[str], colors: Sequence[str], **style: Any) -> list[
     ]
 
 
-def shared_legend(figure: Figure, rows: int = 1, **position: Any) -> None:
+def shared_legend(
+    figure: Figure, rows: int = 1, bbox_to_anchor: tuple[float, float] = (0.53, 1.0)
+) -> None:
     """Draw one legend for all panels above them; equal labels appear once.
 
     Parameters
@@ -240,36 +321,52 @@ def shared_legend(figure: Figure, rows: int = 1, **position: Any) -> None:
         The figure.
     rows : int
         The number of rows of the legend.
-    **position : object
-        Arguments of `Figure.legend`, instead of the usual position.
+    bbox_to_anchor : (float, float)
+        The middle of the legend's upper edge, as fractions of the figure.
     """
     handle_of_label = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handle_of_label[label] = handle
     figure.legend(
-        handle_of_label.values(),
-        handle_of_label.keys(),
+        list(handle_of_label.values()),
+        list(handle_of_label),
         ncols=math.ceil(len(handle_of_label) / rows),
-        **{"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), **position},
+        loc="upper center",
+        bbox_to_anchor=bbox_to_anchor,
     )
 
 
-def color_bar(figure: Figure, artist: Any, label: str, **position: Any) -> Axes:
+def color_bar(
+    figure: Figure,
+    artist: ScalarMappable | ColorizingArtist,
+    label: str,
+    *,
+    ax: Axes | Sequence[Axes] | None = None,
+    cax: Axes | None = None,
+    location: Literal["left", "right", "top", "bottom"] | None = None,
+    **shape: Unpack[ColorBarShape],
+) -> Axes:
     """Draw the scale of the colours of an artist, and return its panel.
 
     Parameters
     ----------
     figure : Figure
         The figure.
-    artist : ScalarMappable
+    artist : ScalarMappable or ColorizingArtist
         The map or the points whose colours stand for values.
     label : str
         The quantity and its unit.
-    **position : object
-        Either `ax`, the panel beside which the scale is drawn, or `cax`, the panel in which.
+    ax : Axes or sequence of Axes, optional
+        The panels beside which the scale is drawn, if it has no panel of its own.
+    cax : Axes, optional
+        The panel in which the scale is drawn.
+    location : str, optional
+        The side of the panels on which the scale is drawn; the right by default.
+    **shape : ColorBarShape
+        Gap, size and ends of the scale.
     """
-    bar = figure.colorbar(artist, **position)
+    bar = figure.colorbar(artist, ax=ax, cax=cax, location=location, **shape)
     bar.set_label(label)
     bar.outline.set_linewidth(0.5)
     return bar.ax

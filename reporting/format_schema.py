@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from math import isfinite
 from textwrap import dedent
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import TypeAdapter, WithJsonSchema
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, JsonSchemaWarningKind
@@ -37,7 +37,7 @@ _SECTION_OF_DOCSTRING = re.compile(r"^(\w[\w ]*)\n-{3,}\n", re.MULTILINE)
 """The heading of a section of a docstring in NumPy's form."""
 
 
-def format_schema(model: object, title: str) -> JsonSchema:
+def format_schema(model: Any, title: str) -> JsonSchema:
     """Return the JSON Schema of a format, which editors and other programs can use.
 
     Parameters
@@ -123,7 +123,7 @@ class _DescribedSchema(GenerateJsonSchema):
     """Generates JSON Schemas whose keys have descriptions and units, and no titles."""
 
     # A default such as an empty array of NumPy belongs to a field that no file contains.
-    ignored_warning_kinds: ClassVar[set[JsonSchemaWarningKind]] = {
+    ignored_warning_kinds: set[JsonSchemaWarningKind] = {  # noqa: RUF012 - as in the base class
         "skipped-choice",
         "non-serializable-default",
     }

@@ -231,8 +231,9 @@ def _type_text(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], 
         return listing([f"`{json.dumps(word)}`" for word in node["enum"]], "or")
     for key in _ALTERNATIVES:
         if key in node:
-            entries = [entry for entry in node[key] if entry != _NULL]
-            return " or ".join(dict.fromkeys(_type_text(entry, root, link) for entry in entries))
+            alternatives = [entry for entry in node[key] if entry != _NULL]
+            texts = [_type_text(entry, root, link) for entry in alternatives]
+            return " or ".join(dict.fromkeys(texts))
     if "properties" in node:
         return link(node)
     if isinstance(node.get("additionalProperties"), dict):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from markupsafe import Markup
 
@@ -123,7 +123,7 @@ class Words:
         texts = self.content[kind][name]
         return {key: fill_template(texts[key], **fields) for key in ("title", "caption")}
 
-    def figure(self, name: str, figure: Any, /, **fields: object) -> ReportFigure:
+    def figure(self, name: str, figure: "Figure", /, **fields: object) -> ReportFigure:
         """Return a figure with its title and caption."""
         return ReportFigure(name, figure, **self.words("figures", name, **fields))
 
@@ -168,7 +168,7 @@ class _PageBlock(NamedTuple):
     """A block of a page, as `page.html` takes it."""
 
     kind: str
-    content: dict[str, Any]
+    content: dict[str, object]
 
 
 class Page:
@@ -188,7 +188,7 @@ class Page:
         self._head = {"title": title, "subtitle": subtitle, "footer": footer}
         self._blocks: list[_PageBlock] = []
 
-    def _add(self, kind: str, **content: Any) -> None:
+    def _add(self, kind: str, **content: object) -> None:
         """Append a block of a kind with its content."""
         self._blocks.append(_PageBlock(kind, content))
 
@@ -272,7 +272,7 @@ class Page:
     def render(self) -> str:
         """Return the page as one string of HTML."""
         has_values_in_figures = any(
-            " data-axes=" in block.content["drawing"]
+            " data-axes=" in str(block.content["drawing"])
             for block in self._blocks
             if block.kind == "figure"
         )

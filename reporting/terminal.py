@@ -62,18 +62,20 @@ def console() -> "Console":
     return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
 
 
-def say(text: str, **style: Any) -> None:
+def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
     """Print a line of the result, unless `--quiet`.
 
     Parameters
     ----------
     text : str
         The line.
-    **style : object
-        The style, such as `bold` or the colour `fg`, as `typer.secho` takes it.
+    fg : str, optional
+        The colour.
+    bold : bool, optional
+        Whether the line is bold.
     """
     if not loudness.quiet:
-        typer.secho(text, **style)
+        typer.secho(text, fg=fg, bold=bold)
 
 
 def show(blocks: "Iterable[str | TextTable]") -> None:
@@ -229,7 +231,7 @@ def interruptible(how_to_go_on: Callable[[], str] = str) -> Iterator[None]:
         raise error_exit("; ".join(parts) + ".", INTERRUPTED) from None
 
 
-def print_json(record: Mapping[str, Any]) -> None:
+def print_json(record: Mapping[str, object]) -> None:
     """Print a record as JSON; a number that is not finite becomes null."""
     from reporting.json_file import plain
 
@@ -246,7 +248,7 @@ def with_common_options(application: typer.Typer) -> Callable[..., None]:
 
     loudness.quiet = False
     loudness.verbose = False
-    command: Any = get_command(application)
+    command: _Command = get_command(application)
     _extend_commands(command, _make_common_options())
     entry_point: Callable[..., None] = command
     return entry_point

@@ -140,7 +140,7 @@ def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axe
         box_of_panel = boxes[panel]
         horizontal_gap = max(box_of_panel.x0 - box.x1, box.x0 - box_of_panel.x1, 0.0)
         vertical_gap = max(box_of_panel.y0 - box.y1, box.y0 - box_of_panel.y1, 0.0)
-        return horizontal_gap + vertical_gap
+        return float(horizontal_gap + vertical_gap)
 
     return min(panels, key=gap, default=None)
 

@@ -442,7 +442,7 @@ def _figures_by_group(folders: list[Path]) -> Figures:
 
     figures = {}
     for folder in folders:
-        for name, group in open_fleet(folder).items():
+        for name, group in open_fleet(folder).children.items():
             full_name = name if len(folders) == 1 else f"{folder}: {name}"
             figures[full_name] = group_figures(group)
     return figures

@@ -3,7 +3,7 @@
 A key with `NotRequired` is in the record only if there is something to say.
 """
 
-from typing import Any, NotRequired
+from typing import NotRequired
 
 from typing_extensions import TypedDict
 
@@ -202,19 +202,19 @@ class JournalRecord(TypedDict):
     """Of a watch: the step that the message was about."""
     control_in_force: NotRequired[int]
     """Of a watch: index of the control of the last step, if a late message changed an earlier."""
-    intake: NotRequired[dict[str, Any]]
+    intake: NotRequired[dict[str, object]]
     """Of a watch: what was read of the messages, from which it resumes."""
-    settled: NotRequired[dict[str, Any]]
+    settled: NotRequired[dict[str, object]]
     """Of a watch: the state of the twin before all steps that a late message can still change."""
-    standing: NotRequired[dict[str, Any]]
+    standing: NotRequired[dict[str, object]]
     """Of a watch: the state of the search for causes before this line."""
     quiet: NotRequired[DecisionRecord]
     """Of a watch: the decision that was told again because no step came."""
     refused: NotRequired[DecisionRecord]
     """Of a watch: the decision that was told again because messages were refused."""
-    verdict: NotRequired[dict[str, Any]]
+    verdict: NotRequired[dict[str, object]]
     """Of a watch: the verdict of a search for the cause of an alarm."""
-    model: NotRequired[dict[str, Any]]
+    model: NotRequired[dict[str, object]]
     """Of a watch: the patched model that was adopted."""
 
 
@@ -249,11 +249,11 @@ class LearntSummary(TypedDict):
     """The quantity in words."""
     unit: str | list[str]
     """Unit of the numbers."""
-    prior: dict[str, Any]
+    prior: dict[str, object]
     """`mean`, `standard_deviation`, `lower` and `upper` before the first step."""
-    posterior: dict[str, Any]
+    posterior: dict[str, object]
     """`mean`, `standard_deviation`, `lower` and `upper` after the last step."""
-    truth: Any
+    truth: object
     """True value; null if it is not known."""
 
 
@@ -315,7 +315,7 @@ class ConfigRecord(TypedDict):
     """The words "uav-twin run" of a run or a watch, "uav-twin fleet" of a fleet."""
     provenance: ProvenanceRecord
     """From which program and inputs the results come."""
-    scenario: NotRequired[dict[str, Any]]
+    scenario: NotRequired[dict[str, object]]
     """The resolved scenario of a run, in SI; its keys are those of a scenario file."""
     scenario_file: NotRequired[FileHash]
     """The file of the scenario of a run."""
@@ -323,7 +323,7 @@ class ConfigRecord(TypedDict):
     """SHA-256 of the files in `asset/` of a run, by their names; once they are prepared."""
     watched: NotRequired[bool]
     """Whether a real asset is watched."""
-    fleet: NotRequired[dict[str, Any]]
+    fleet: NotRequired[dict[str, object]]
     """The plan of a fleet, with the scenarios, members and seeds of its groups."""
 
 

@@ -100,11 +100,14 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     residual = _tree_of(run)["filtered"].to_dataset()["residual"]
     (panel,) = new_panels(1, axes)
     panel.set_facecolor("#c8c8c8")
+    colours = style.RESIDUALS.copy()
+    colours["vmin"] = -LARGEST_SHOWN
+    colours["vmax"] = LARGEST_SHOWN
     image = panel.pcolormesh(
         residual["step"].values,
         np.arange(1, residual.sizes["sensor"] + 1),
         np.ma.masked_invalid(residual.transpose("sensor", "step").values),
-        **{**style.RESIDUALS, "vmin": -LARGEST_SHOWN, "vmax": LARGEST_SHOWN},
+        **colours,
     )
     panel.set_xlabel("step")
     panel.set_ylabel("number of the gauge")

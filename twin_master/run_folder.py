@@ -183,13 +183,14 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
         If packages have changed; the sentence names them.
     """
     recorded = config["provenance"]
-    current = collect_provenance(seed).as_dict()
-    for table in ("versions", "source_hashes"):
+    current = collect_provenance(seed)
+    current_tables = {"versions": current.versions, "source_hashes": current.source_hashes}
+    for table, current_values in current_tables.items():
         recorded_values = recorded.get(table)
         if not isinstance(recorded_values, dict):
             recorded_values = {}
         changed = set()
-        for name, value in current[table].items():
+        for name, value in current_values.items():
             if recorded_values.get(name) != value:
                 changed.add(name)
         names = sorted(changed - HARMLESS_PACKAGES)

@@ -24,6 +24,7 @@ from twin_master.fleet.configuration import KIND, fleet_config
 from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps
 from twin_master.fleet.store import FAILED, flown_rows, open_group
+from twin_master.fleet.store_layout import stored_values
 from twin_master.scenario.schema import Scenario
 
 RESOLUTION = 150.0
@@ -90,14 +91,14 @@ def draw_fleet() -> Drawing:
     (record,) = fleet_config(folder, KIND)["fleet"]["groups"]
     scenario = Scenario.model_validate(record["scenarios"][0])
     group = open_group(folder, record["name"])
-    status = group["status"].values
+    status = stored_values(group, "status")
     assets = flown_rows(status)
-    mean = group["filtered/mean"].values
+    mean = stored_values(group, "filtered/mean")
     last_mean = mean[assets, last_steps(group)[assets]]
     failed = int(np.sum(status == FAILED))
     pictures = (
         map_figure(scenario, last_mean, failed),
-        course_figure(scenario, mean[assets], group["truth/state"].values[assets]),
+        course_figure(scenario, mean[assets], stored_values(group, "truth/state")[assets]),
     )
     png = stacked([to_png(figure, RESOLUTION) for figure in pictures])
     return Drawing(png, {"assets": len(status)})

@@ -4,9 +4,9 @@ A wing's calibration from the folder of its laboratory and any model's from a ca
 class.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import xarray as xr
@@ -18,6 +18,7 @@ from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
 from reporting.notebook import html_table, new_panels
 from reporting.words import brief, comma_list, plus_minus
 
@@ -198,7 +199,7 @@ class Calibration:
     channels: tuple[ChannelFit, ...]
     source: str
     seed: int
-    provenance: Mapping[str, Any]
+    provenance: JsonRecord
     design_hash: str = ""
     quantities: tuple[CalibratedFigure, ...] = ()
     readings: tuple[FigureReading, ...] = ()

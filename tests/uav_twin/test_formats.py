@@ -143,7 +143,7 @@ def test_a_misspelt_key_is_refused_with_the_nearest_one(name, place, wrong, near
     for step in place:
         table = table[step]
     table[wrong] = 1
-    with refused(error, rf"{wrong}.*Did you mean `{nearest}`\?$"):
+    with refused(error, rf"{wrong}.*; the nearest is `{nearest}`\.$"):
         parse(content, "the file")
 
 
@@ -151,8 +151,8 @@ def test_a_misspelt_key_or_word_of_an_effect_is_refused_with_the_nearest_one(tmp
     text = (ROOT / "discrepancy" / "catalogue" / "outflow.toml").read_text(encoding="utf-8")
     path = tmp_path / "effects.toml"
     path.write_text(text.replace("signature", "signatur", 1), encoding="utf-8")
-    with refused(CatalogueError, r"'signatur' is not a key of an effect. Did you mean `signature`\?$"):
+    with refused(CatalogueError, r"'signatur' is not a key of an effect; the nearest is `signature`\.$"):
         effects_of_file(path)
     path.write_text(text.replace('"log_normal"', '"lognormal"', 1), encoding="utf-8")
-    with refused(CatalogueError, r"'lognormal' came. Did you mean `log_normal`\?$"):
+    with refused(CatalogueError, r"'lognormal' came; the nearest is 'log_normal'\.$"):
         effects_of_file(path)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from reporting.files import (
     atomic_write_text,
@@ -420,7 +420,7 @@ class _FleetFlight:
             }
         )
 
-    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[Any]]":
+    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[object]]":
         """Return the arrays of a group in the store, by their paths."""
         import zarr
 

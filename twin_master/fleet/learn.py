@@ -6,12 +6,13 @@ The results are a record for the report, and `learnt.toml`, which replaces value
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text, hash_record
+from reporting.json_file import JsonObject
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
@@ -37,7 +38,7 @@ from twin_master.fleet.posterior import (
 )
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.store import open_group
-from twin_master.fleet.store_layout import observation_rows
+from twin_master.fleet.store_layout import observation_rows, stored_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
@@ -68,7 +69,7 @@ _MOST_SHARED = 2
 
 def learn_from_fleet(
     folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Learn from all twins of a fleet, and write what was learnt to a file.
 
     Learnt are the probabilities that damage grows, the noise of the sensors, and the distribution
@@ -104,7 +105,7 @@ def learn_from_fleet(
     return record
 
 
-def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
+def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> JsonObject:
     """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
 
     The prior of each probability is uniform; if there are several groups, it is a Beta
@@ -164,7 +165,7 @@ class _GroupLessons:
     family: TransitionFamily
     grid: LikelihoodGrid | None
     flown_controls: set[str]
-    record: dict[str, Any]
+    record: JsonObject
 
     @property
     def marginals(self) -> tuple[Distribution, ...]:
@@ -173,7 +174,7 @@ class _GroupLessons:
 
     def with_probabilities(
         self, posteriors: Sequence[Distribution], flown_controls: set[str]
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return the record of the group with its probabilities to worsen.
 
         Parameters
@@ -197,7 +198,7 @@ class _GroupLessons:
 
 
 def _lessons_of_groups(
-    folder: Path, records: Sequence[dict[str, Any]], progress: Progress
+    folder: Path, records: Sequence[JsonObject], progress: Progress
 ) -> dict[str, _GroupLessons]:
     """Learn from each group by itself; groups without a flown twin are left out."""
     lessons = {}
@@ -211,7 +212,7 @@ def _lessons_of_groups(
     return lessons
 
 
-def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
+def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution of probabilities that they share.
 
     They share one if several groups have learnt the same one or two probabilities to worsen.
@@ -229,7 +230,7 @@ def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
 
 def _records_with_shared_distribution(
     lessons: dict[str, _GroupLessons], grids: Sequence[LikelihoodGrid], names: Sequence[str]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the records of groups whose probabilities share a distribution.
 
     A control that was flown in any group counts as flown in all, because the shared distribution
@@ -276,7 +277,7 @@ class _WeighedSteps(NamedTuple):
 
 
 def _learn_group(
-    record: dict[str, Any], group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
+    record: JsonObject, group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
@@ -310,7 +311,7 @@ def _learn_group(
         )
     grid = _probability_grid(family, steps) if family.names else None
     rows = np.concatenate([twins.rows for twins in flown])
-    lessons: dict[str, Any] = {
+    lessons: JsonObject = {
         "twins": twin_count,
         "left_out": len(rows) - twin_count,
         "alarmed": int(np.sum(notice_counts(group, "alarm")[rows] > 0)),
@@ -335,7 +336,7 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
 def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
     observed = observation_rows(group, flown[0].knowledge.scenario)
-    control = group["observed/control_index"].values.astype(np.int64)
+    control = stored_values(group, "observed/control_index").astype(np.int64)
     # Steps that were not flown have the control -1. They have no observations, so that the
     # evidence does not depend on their control: the first control takes its place.
     control = np.maximum(control, 0)
@@ -346,7 +347,7 @@ def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> lis
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
     """Return the controls under which a twin in the rows has flown a step that is not its last."""
-    control = group["observed/control_index"].values.astype(np.int64)[rows]
+    control = stored_values(group, "observed/control_index").astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
 
@@ -518,7 +519,7 @@ def _population(
     grid: LikelihoodGrid | None,
     nodes: _ParameterNodes,
     noise_factor: float,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the record of the population of the calibrated parameter in a group.
 
     Parameters

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonRecord
 from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.store import (
@@ -20,7 +21,7 @@ from twin_master.fleet.store import (
     flown_rows,
     open_group,
 )
-from twin_master.fleet.store_layout import NOTICE_KINDS
+from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability
@@ -163,7 +164,9 @@ def open_fleet(folder: Path | str) -> "xr.DataTree":
 
 def notice_counts(group: "xr.DataTree", kind: str) -> Index:
     """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
-    return np.asarray(group["notice/count"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
+    return np.asarray(
+        stored_values(group, "notice/count")[:, NOTICE_KINDS.index(kind)], dtype=np.int64
+    )
 
 
 def believed_means(group: "xr.DataTree") -> Float:
@@ -172,14 +175,14 @@ def believed_means(group: "xr.DataTree") -> Float:
     They are NaN in steps in which the probability that no state of the model explains the
     observations is above `BELIEVED`.
     """
-    is_unexplained = group["notice/none_of_these"].values > BELIEVED
-    return np.where(is_unexplained[..., np.newaxis], np.nan, group["filtered/mean"].values)
+    is_unexplained = stored_values(group, "notice/none_of_these") > BELIEVED
+    return np.where(is_unexplained[..., np.newaxis], np.nan, stored_values(group, "filtered/mean"))
 
 
 def last_steps(group: "xr.DataTree") -> Index:
     """Return the number of the last flown step of each twin, a (B,) array; 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
-    flown_steps = (group["observed/control_index"].values >= 0).sum(axis=1)
+    flown_steps = (stored_values(group, "observed/control_index") >= 0).sum(axis=1)
     last: Index = np.maximum(flown_steps - 1, 0)
     return last
 
@@ -273,7 +276,7 @@ class TwinsOfScenario(NamedTuple):
 
 
 def flown_twins(
-    folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Iterator[TwinsOfScenario]:
     """Yield the twins of a group that have flown, scenario by scenario.
 
@@ -291,7 +294,7 @@ def flown_twins(
     RunFolderError
         If a file of the twins' prepared knowledge is missing or damaged.
     """
-    flown = flown_rows(group["status"].values)
+    flown = flown_rows(stored_values(group, "status"))
     scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[flown]
     for number in np.unique(scenario_numbers).tolist():
         knowledge_folder = folder / GROUPS / record["name"] / str(number)
@@ -302,7 +305,7 @@ def flown_twins(
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
-def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.DataTree") -> Float:
+def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree") -> Float:
     """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters
@@ -327,8 +330,8 @@ def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Da
     """
     twin_count = group.sizes["twin"]
     at_last_step = (np.arange(twin_count), last_steps(group))
-    belief = group["filtered/last_probability"].values.astype(np.float64)
-    control_in_force = group["observed/control_index"].values[at_last_step]
+    belief = stored_values(group, "filtered/last_probability").astype(np.float64)
+    control_in_force = stored_values(group, "observed/control_index")[at_last_step]
     probability = np.full(twin_count, np.nan)
     for scenario_twins in flown_twins(folder, record, group):
         for control_index in np.unique(control_in_force[scenario_twins.rows]).tolist():
@@ -337,7 +340,7 @@ def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Da
                 scenario_twins.knowledge, belief[rows], control_index
             )
     # `unexplained` is the filter's probability that no state explains the observations.
-    probability[group["notice/none_of_these"].values[at_last_step] > BELIEVED] = np.nan
+    probability[stored_values(group, "notice/none_of_these")[at_last_step] > BELIEVED] = np.nan
     return probability
 
 
@@ -347,7 +350,7 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
     The figures are means over the twins with their standard errors; a group without a flown twin
     has counts alone. Figures that need the true state are left out for real assets.
     """
-    status = group["status"].values
+    status = stored_values(group, "status")
     figures = _counts_of_twins(group)
     if not len(flown_rows(status)):
         return figures
@@ -362,7 +365,7 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
         if not np.isnan(outcomes.early_fallbacks.value):
             figures["early fallback"] = outcomes.early_fallbacks
         for name, rms, bias in zip(
-            group["filtered/region"].values, outcomes.rms, outcomes.bias, strict=True
+            stored_values(group, "filtered/region"), outcomes.rms, outcomes.bias, strict=True
         ):
             figures[f"filtered rms error of {name}"] = rms
             figures[f"bias of {name}"] = bias
@@ -374,7 +377,7 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
 
 def _counts_of_twins(group: "xr.DataTree") -> dict[str, Estimated | int]:
     """Return the numbers of twins that flew, failed, ended early, or gave notices, by title."""
-    status = group["status"].values
+    status = stored_values(group, "status")
     figures: dict[str, Estimated | int] = {
         "twins": len(status),
         "flown": int(np.sum(status == FLOWN)),

@@ -9,12 +9,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError, TwinMasterError
@@ -30,7 +31,7 @@ from twin_master.fleet.reading import (
 )
 from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
 from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows, open_group
-from twin_master.fleet.store_layout import NOTICE_KINDS
+from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
 from twin_master.fleet.watched_asset import counts_of, read_standing
 from twin_master.report.reading import PrintedFactor, printed_factors
 
@@ -104,7 +105,7 @@ def fleet_page(folder: Path, most_assets: int) -> str:
     return page.render()
 
 
-def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
+def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
     """Return the size of a fleet, its seed, and whether it is watched or flown."""
     group_count = counted(len(fleet["groups"]), "group")
     if is_watched:  # the configuration of a watched fleet has no list of assets
@@ -114,13 +115,13 @@ def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
 
 
 def _add_flown_fleet(
-    page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, records: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
-    status = np.concatenate([group["status"].values for group in groups.values()])
+    status = np.concatenate([stored_values(group, "status") for group in groups.values()])
     failures = endings_of(folder).failures
     if failures:
         page.add_notice(
@@ -139,7 +140,7 @@ def _add_flown_fleet(
         leaving = _leaving_or_explanation(page, folder, record, group)
         if leaving is not None:
             standing = replace(standing, leaving=leaving)
-        failed = int(np.sum(group["status"].values == FAILED))
+        failed = int(np.sum(stored_values(group, "status") == FAILED))
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
         _add_attention_table(page, standing, most_assets)
@@ -152,7 +153,7 @@ def _add_flown_fleet(
 
 
 def _leaving_or_explanation(
-    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Float | None:
     """Return the probability that each flown twin of a group changes its control.
 
@@ -164,7 +165,7 @@ def _leaving_or_explanation(
     except TwinMasterError as error:
         page.add_paragraph(in_one_line(f"Who leaves its control soon is not known: {error}"))
         return None
-    return probabilities[flown_rows(group["status"].values)]
+    return probabilities[flown_rows(stored_values(group, "status"))]
 
 
 def _opening(standings: Sequence[Standing], groups: "Sequence[xr.DataTree]") -> str:
@@ -184,7 +185,7 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the number of assets with an alarm and the first step of one; empty without alarms."""
     alarm_column = NOTICE_KINDS.index("alarm")
     first_alarm = np.concatenate(
-        [group["notice/first_step"].values[:, alarm_column] for group in groups]
+        [stored_values(group, "notice/first_step")[:, alarm_column] for group in groups]
     )
     steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
     if not len(steps):
@@ -194,7 +195,7 @@ def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
 
 def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
     """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
-    delay = np.concatenate([group["delay"].values for group in groups])
+    delay = np.concatenate([stored_values(group, "delay") for group in groups])
     called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
     if not len(called_for_delays):
         return ""
@@ -223,7 +224,7 @@ def _damage_sentence(standings: Sequence[Standing]) -> str:
 
 
 def _add_watched_fleet(
-    page: Page, folder: Path, groups: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, groups: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a fleet that is watched, given the records of its groups."""
     standing = read_standing(folder)
@@ -291,10 +292,10 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
     """Add the figure of the assets' states over time, if any step has an estimated state."""
-    flown = flown_rows(group["status"].values)
+    flown = flown_rows(stored_values(group, "status"))
     mean = believed_means(group)[flown]
     if standing.names and not np.isnan(mean).all():
-        figure = course_figure(standing.scenario, mean, group["truth/state"].values[flown])
+        figure = course_figure(standing.scenario, mean, stored_values(group, "truth/state")[flown])
         page.add_report_figure(WORDS.figure("course", figure))
 
 

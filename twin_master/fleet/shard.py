@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import finalize
 
 import numpy as np
@@ -117,7 +117,7 @@ class ShardResult(NamedTuple):
         The reasons of assets that ended their simulations early, by the name of the twin.
     """
 
-    variables: Mapping[str, NDArray[Any]]
+    variables: Mapping[str, NDArray[np.generic]]
     failures: dict[str, str]
     ended: dict[str, str]
 

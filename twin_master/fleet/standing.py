@@ -3,15 +3,16 @@
 They are read from the store of a flown fleet, or from the records of a watched one.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
 from twin_master.fleet.store import flown_rows
+from twin_master.fleet.store_layout import stored_values
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standing:
+def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
     """Return state, control and alarms of the flown twins of a group after their last steps.
 
     The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
@@ -82,10 +83,10 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standi
     """
     # All scenarios of a group come from one scenario file, with equal states and controls.
     scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = flown_rows(group["status"].values)
+    flown = flown_rows(stored_values(group, "status"))
     last_step = last_steps(group)[flown]
     at_last_step = (flown, last_step)
-    last_control = group["observed/control_index"].values[at_last_step]
+    last_control = stored_values(group, "observed/control_index")[at_last_step]
     names = [name for name, _seed, _scenario_number in record["members"]]
     return Standing(
         group=record["name"],
@@ -93,14 +94,14 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standi
         names=[names[row] for row in flown],
         step=last_step,
         mean=believed_means(group)[at_last_step],
-        deviation=group["filtered/standard_deviation"].values[at_last_step],
+        deviation=stored_values(group, "filtered/standard_deviation")[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm")[flown],
         leaving=np.full(len(flown), np.nan),
     )
 
 
-def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) -> Standing:
+def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
     """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
@@ -130,7 +131,7 @@ def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) ->
     )
 
 
-def _moments_of_states(scenario: Scenario, healths: list[dict[str, Any]], moment: str) -> Float:
+def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
     """Return a moment of each of F factors of the state of B assets, a (B, F) array.
 
     It is NaN where the record has None.

@@ -240,6 +240,12 @@ def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
     return columns
 
 
+def stored_values(group: "xr.DataTree", path: str) -> NDArray[Any]:
+    """Return the values of a variable in a group of a store, given its path."""
+    values: NDArray[Any] = np.asarray(group[path].values)
+    return values
+
+
 def observation_rows(group: "xr.DataTree", scenario: Scenario) -> Float:
     """Return the rows of observations of the twins of a group, a (B, T, W) array.
 
@@ -248,7 +254,7 @@ def observation_rows(group: "xr.DataTree", scenario: Scenario) -> Float:
     twin_count = group.sizes["twin"]
     rows = np.empty((twin_count, scenario.mission.steps, scenario.row_width))
     for path, columns in observed_columns(scenario).items():
-        rows[..., columns] = group[path].values
+        rows[..., columns] = stored_values(group, path)
     return rows
 
 

@@ -1,11 +1,12 @@
 """The tables of a report: columns, cells, and the fields of titles and captions in `words.toml`."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
 from reporting.page import Page, PageColumn, Table, number_column
 from reporting.words import between, in_one_line, listing, number
 from twin_master.report.captions import WORDS
@@ -181,7 +182,7 @@ def add_calibrated_table(page: Page, run: Run) -> None:
     _add_table(page, "calibrated", columns, rows, kind=kind, asset=record["asset"], origin=origin)
 
 
-def calibrated_figures(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def calibrated_figures(record: JsonRecord) -> list[JsonRecord]:
     """Return the figures in the record of a calibration: parameters first, then quantities.
 
     Empty if the run was not calibrated from a file.

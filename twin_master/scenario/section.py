@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, mo
 from pydantic_core import CoreSchema
 
 from reporting import toml_file
-from reporting.choices import did_you_mean
+from reporting.choices import nearest_word
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
 
 Table = dict[str, Any]
@@ -97,10 +97,10 @@ class Section(toml_file.Section):
             field, unit = cls.split_unit(str(key))
             if field not in cls.model_fields:
                 known_keys = ", ".join(cls._documented_key(name) for name in cls.model_fields)
-                question = did_you_mean(str(key), cls._keys_in_file())
-                stop = "." if question else ""
+                nearest_key = nearest_word(str(key), cls._keys_in_file())
+                advice = "" if nearest_key is None else f"; the nearest is `{nearest_key}`"
                 raise ValueError(
-                    f"unknown key `{key}`; the keys known there are {known_keys}{stop}{question}"
+                    f"unknown key `{key}`; the keys known there are {known_keys}{advice}"
                 )
             if field in converted:
                 raise ValueError(f"`{field}` was given with and without its unit: keep one of them")

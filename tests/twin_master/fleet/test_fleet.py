@@ -68,7 +68,7 @@ def write_former_store(whole: Path, folder: Path) -> None:
         bare = variable.drop_vars([*variable.coords])
         variables[name] = bare.rename({axis: names[axis] for axis in bare.dims if axis in names})
     former = xr.Dataset(variables)
-    former.attrs |= {"step_name": "step", "factors": ["z1", "z2"]}
+    former.attrs |= group.attrs
     shutil.rmtree(folder / STORE_NAME)
     former.to_zarr(folder / STORE_NAME, group="growing_damage", consolidated=False, zarr_format=3)
 
