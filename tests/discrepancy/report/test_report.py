@@ -117,7 +117,7 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
 
 def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(drag):
     text = drag._repr_html_()
-    assert html.escape(drag.verdict.sentence, quote=False) in html.unescape(text)
+    assert drag.verdict.sentence in html.unescape(text)
     assert "quadratic aerodynamic damping" in text.lower()
     panels = drag.plot()
     assert len(panels) == len(drag.missing.courses[:6])
