@@ -34,8 +34,12 @@ parameter = [
   { name = "damping", terms = "damping", deviation = 0.3, low = 0.2, high = 3.0 },
 ]
 """
-MASS, DAMPING, FRICTION = 10.0756, 17.909, 19.0
-"""Mass [kg], damping [N s/m] and dry friction [N] of the true axis."""
+MASS = 10.0756
+"""Mass of the true axis [kg]."""
+DAMPING = 17.909
+"""Damping of the true axis [N s/m]."""
+FRICTION = 19.0
+"""Dry friction of the true axis [N]."""
 NOISE = 2e-5
 """Standard deviation of the noise of the readings [m]."""
 INTERVAL = 0.002
@@ -73,14 +77,15 @@ def axis_positions(force: FloatArray) -> FloatArray:
 def pushed_axis(samples: int) -> Campaign:
     """Return two trials of so many samples each, pushed by a force of eight sines."""
     generator = np.random.default_rng(2)
-    time = np.arange(samples) * INTERVAL
+    time = np.asarray(np.arange(samples) * INTERVAL, dtype=np.float64)
     trials = []
     for name, amplitude in (("one", 60.0), ("two", 80.0)):
         frequencies = 2.0 * np.pi * generator.uniform(0.3, 3.0, 8)
         phases = generator.uniform(0.0, 2.0 * np.pi, 8)
         waves = np.sin(time[:, None] * frequencies + phases)
         force = amplitude * waves.sum(axis=1) / np.sqrt(8.0)
-        readings = axis_positions(force) + NOISE * generator.standard_normal(samples)
+        noise = NOISE * generator.standard_normal(samples)
+        readings = axis_positions(force) + noise
         trial = Trial.plain(
             name,
             TrialKind.FORCED,

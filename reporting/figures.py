@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal, TypedDict, Unpack
+from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike
 from reporting.errors import InvalidFigureError
 from reporting.files import atomic_write_bytes
 from reporting.hover import annotated
+from reporting.tiles import NARROW, tiles_of_figure
 
 # Okabe and Ito's palette for colour-blind readers; each colour has one meaning in all figures.
 OBSERVED: Final = "#595959"
@@ -389,7 +390,8 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
 def to_svg(figure: Figure) -> bytes:
     """Return a figure as SVG, with texts as outlines and with the values that the pointer shows.
 
-    The file has neither a date nor a document type.
+    The file has neither a date nor a document type. Its attribute ``data-tiles`` has the view boxes
+    of the tiles that a narrow page shows below one another.
     """
     buffer = io.BytesIO()
     with publication_style():
@@ -403,6 +405,8 @@ def to_svg(figure: Figure) -> bytes:
                 metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
             )
         text = annotate(buffer.getvalue().decode("utf-8"))
+        view_boxes = ", ".join(tile.view_box for tile in tiles_of_figure(figure))
+    text = text.replace("<svg ", f'<svg data-tiles="{view_boxes}" ', 1)
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)
     return text.encode("utf-8")
 
@@ -466,10 +470,38 @@ def _parse_tick_labels_of_powers(figure: Figure) -> None:
 
 _IDENTIFIER = re.compile(r'\bid="([^"]+)"')
 _REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
+_ATTRIBUTE = re.compile(r'([\w:-]+)="([^"]*)"')
+_ATTRIBUTES_OF_FILES = {"viewBox", "width", "height", "version", "data-tiles"}
+"""Attributes of an SVG that its element in a page does not have or has anew."""
+_READABLE = 1.15
+"""Pixels for each point of a drawing, at which letters of 8 points can be read."""
+_LARGEST = 1.6
+"""The most pixels for each point of a drawing."""
+_DRAWING = "drawing"
+"""Identifier of a whole drawing in a page, after its prefix."""
 
 
-def inline_svg(svg: bytes, prefix: str, description: str) -> str:
-    """Return an SVG as an element of an HTML page, scaled to the width of the page.
+class InlineDrawing(NamedTuple):
+    """A drawing as elements of an HTML page.
+
+    Attributes
+    ----------
+    full : str
+        The drawing as one element, scaled to the width of the page.
+    tiles : tuple of str
+        Elements that show the parts of the drawing on a narrow page, in their order; empty if the
+        drawing has no parts.
+    is_wide : bool
+        Whether a tile, or a drawing without tiles, is wider than a narrow page.
+    """
+
+    full: str
+    tiles: tuple[str, ...]
+    is_wide: bool
+
+
+def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
+    """Return an SVG as elements of an HTML page.
 
     Parameters
     ----------
@@ -493,16 +525,55 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> str:
         raise InvalidFigureError(
             "A figure for a page must be an SVG; the bytes given have no <svg> element."
         )
-    opening = text[start_of_tag:end_of_tag]
-    body = text[end_of_tag:].rstrip()
-    view_box = re.search(r'viewBox="([^"]+)"', opening)
-    if view_box is None:
+    attributes = dict(_ATTRIBUTE.findall(text[start_of_tag:end_of_tag]))
+    content = text[end_of_tag + 1 :].rstrip().removesuffix("</svg>")
+    if "viewBox" not in attributes:
         raise InvalidFigureError(
             "A figure for a page must have a viewBox, or it could not be scaled."
         )
-    body = _IDENTIFIER.sub(rf'id="{prefix}-\1"', body)
-    body = _REFERENCE.sub(rf"\1{prefix}-\2", body)
+    content = _IDENTIFIER.sub(rf'id="{prefix}-\1"', content)
+    content = _REFERENCE.sub(rf"\1{prefix}-\2", content)
     # Inside HTML the parser knows the namespaces, and `href` needs no prefix.
-    body = body.replace("xlink:href=", "href=")
+    content = content.replace("xlink:href=", "href=")
+    # Attributes such as the size of letters hold for all that is drawn.
+    look = ""
+    for name, value in attributes.items():
+        if name not in _ATTRIBUTES_OF_FILES and not name.startswith("xmlns"):
+            look += f' {name}="{value}"'
     label = html.escape(description)
-    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{label}"{body}'
+    view_box = attributes["viewBox"]
+    full = (
+        f'<svg viewBox="{view_box}" role="img" aria-label="{label}">'
+        f'<g id="{prefix}-{_DRAWING}"{look}>{content}</g></svg>'
+    )
+    tiles = []
+    widths = [float(view_box.split()[2])]
+    if attributes.get("data-tiles"):
+        tile_boxes = attributes["data-tiles"].split(", ")
+        widths = [float(tile_box.split()[2]) for tile_box in tile_boxes]
+        for tile_box, width in zip(tile_boxes, widths, strict=True):
+            tiles.append(_tile_element(tile_box, width, f"{prefix}-{_DRAWING}"))
+    return InlineDrawing(full, tuple(tiles), is_wide=max(widths) > NARROW)
+
+
+def _tile_element(view_box: str, width: float, drawing: str) -> str:
+    """Return the element that shows a rectangle of a drawing.
+
+    Parameters
+    ----------
+    view_box : str
+        The rectangle.
+    width : float
+        Its width [pt], in which letters have their usual size.
+    drawing : str
+        The identifier of the drawing.
+    """
+    # A tile that is wider than the screen keeps the size at which its letters can be read, and a
+    # small one is not blown up.
+    style = f"max-width:{_LARGEST * width:.0f}px"
+    if width > NARROW:
+        style = f"width:{_READABLE * width:.0f}px"
+    return (
+        f'<div class="tile"><svg viewBox="{view_box}" style="{style}" aria-hidden="true" '
+        f'data-drawing="{drawing}"><use href="#{drawing}"/></svg></div>'
+    )

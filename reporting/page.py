@@ -208,6 +208,18 @@ class Page:
         """Add a paragraph that the reader must not overlook."""
         self._add("notice", text=text)
 
+    def add_card(self, text: str) -> None:
+        """Add the one sentence of the page that a reader must know, in large print."""
+        self._add("card", text=text)
+
+    def begin_fold(self, title: str) -> None:
+        """Begin a part that the reader unfolds on demand; `end_fold` ends it."""
+        self._add("fold", title=title)
+
+    def end_fold(self) -> None:
+        """End the part that `begin_fold` has begun."""
+        self._add("end of fold")
+
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
         """Add a row of a few values in large print, each with its meaning."""
         self._add("highlights", items=items)
@@ -233,8 +245,16 @@ class Page:
         from reporting.figures import inline_svg
 
         number = self._next_number("figure")
-        drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
-        self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+        drawing = inline_svg(svg, prefix=f"f{number}", description=title)
+        self._add(
+            "figure",
+            number=number,
+            drawing=Markup(drawing.full),
+            tiles=[Markup(tile) for tile in drawing.tiles],
+            is_wide=drawing.is_wide,
+            title=title,
+            caption=caption,
+        )
         return number
 
     def add_report_figure(self, figure: ReportFigure) -> int:

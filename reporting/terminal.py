@@ -7,17 +7,19 @@ same two.
 
 import functools
 import json
+import logging
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import reporting.progress
+from reporting.log import shown_log
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -310,7 +312,15 @@ def _shown_progress() -> Iterator[None]:
     # The cache makes one progress object for all stages of the command, when the first begins.
     reporting.progress.default_progress = functools.cache(progress)
     try:
-        with interruptible():
+        with interruptible(), _shown_log():
             yield
     finally:
         reporting.progress.default_progress = previous_progress
+
+
+def _shown_log() -> AbstractContextManager[None]:
+    """Return a context in which a command shows warnings, or with --verbose all of the log."""
+    if loudness.quiet:
+        return nullcontext()
+    level = logging.DEBUG if loudness.verbose else logging.WARNING
+    return shown_log(reporting.progress.note, level)

@@ -103,7 +103,7 @@ EXPLAINED = [
 ]
 CALL = re.compile(r"(?<![\w.])([A-Za-z_][\w.]*)\(")
 """A call such as `operators.mass(`, with its name."""
-OF_PYTHON = {"help"}
+OF_PYTHON = {"help", "basicConfig", "open_datatree"}
 
 
 @cache

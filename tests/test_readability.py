@@ -52,16 +52,16 @@ class Counts:
 
 
 CEILINGS = {
-    "reporting": Counts(packed=0, bundles=1.4, walrus=0, columns=0.7, untyped=19.8, vague=0.4),
-    "fe": Counts(packed=0.3, bundles=1.7, walrus=0, columns=1.5, untyped=2.3, vague=0.6),
-    "fmu_asset": Counts(packed=0.3, bundles=1.3, walrus=0, columns=0.3, untyped=2.0, vague=0.8),
-    "calibration": Counts(packed=0, bundles=2.4, walrus=0, columns=3.7, untyped=1.3, vague=0.3),
-    "discrepancy": Counts(packed=0.4, bundles=1.4, walrus=0, columns=1.0, untyped=1.5, vague=0.5),
+    "reporting": Counts(packed=0, bundles=1.1, walrus=0, columns=0.5, untyped=3.4, vague=0.2),
+    "fe": Counts(packed=0.1, bundles=1.3, walrus=0, columns=1.2, untyped=1.8, vague=0.4),
+    "fmu_asset": Counts(packed=0.2, bundles=1.1, walrus=0, columns=0.2, untyped=1.2, vague=0.4),
+    "calibration": Counts(packed=0, bundles=2.2, walrus=0, columns=3.3, untyped=0.3, vague=0.2),
+    "discrepancy": Counts(packed=0.3, bundles=1.3, walrus=0, columns=0.8, untyped=0.9, vague=0.3),
     "scenarios": Counts(packed=0, bundles=0, walrus=0, columns=0, untyped=0, vague=0),
-    "twin_master": Counts(packed=0.2, bundles=1.3, walrus=0, columns=1.0, untyped=4.7, vague=0.5),
-    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=4.4, vague=0.8),
-    "benchmarks": Counts(packed=0, bundles=2.9, walrus=0.3, columns=2.4, untyped=3.6, vague=0.6),
-    "evidence": Counts(packed=8.1, bundles=6.6, walrus=0, columns=32.6, untyped=4.0, vague=5.6),
+    "twin_master": Counts(packed=0.1, bundles=1.2, walrus=0, columns=0.8, untyped=2.4, vague=0.3),
+    "uav_twin": Counts(packed=0, bundles=0.5, walrus=0, columns=0.5, untyped=3.5, vague=0.7),
+    "benchmarks": Counts(packed=0, bundles=2.7, walrus=0.2, columns=2, untyped=3.4, vague=0.5),
+    "evidence": Counts(packed=0, bundles=0.6, walrus=0, columns=0, untyped=0, vague=0.3),
 }
 """The most that each package may have; lower it when a package has become better."""
 

@@ -266,6 +266,7 @@ def new_run_folder(
     *,
     replace: bool,
     watched: bool = False,
+    parts: Mapping[str, str] | None = None,
 ) -> Iterator[LockedRun]:
     """Create and lock the folder of a run or a watch.
 
@@ -284,6 +285,8 @@ def new_run_folder(
         Whether to replace an existing run folder.
     watched : bool
         Whether a real asset is watched.
+    parts : mapping of str to str, optional
+        How the parts of the twin are called that a user has given in the place of the scenario's.
 
     Raises
     ------
@@ -293,6 +296,8 @@ def new_run_folder(
     config: JsonObject = {"kind": KIND, "format": 1}
     if watched:
         config["watched"] = True
+    if parts:
+        config["parts"] = dict(parts)
     config["scenario"] = resolved.portable().to_dict()
     config["scenario_file"] = dict(file)
     config["provenance"] = collect_provenance(resolved.mission.seed).as_dict()

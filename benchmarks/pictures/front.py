@@ -25,9 +25,9 @@ def small_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 def belief_drawing(run: Any, x_label: str, y_label: str) -> Drawing:
     """Draw belief against truth of the first factor of the state, and where the control changes."""
-    mean = 100 * run["filtered"]["mean"].values[:, 0]
-    two_deviations = 200 * run["filtered"]["standard_deviation"].values[:, 0]
-    truth = 100 * run["truth"]["state"].values[:, 0]
+    mean = 100 * run["filtered"]["mean"].isel(region=0).values
+    two_deviations = 200 * run["filtered"]["standard_deviation"].isel(region=0).values
+    truth = 100 * run["truth"]["state"].isel(region=0).values
     control = run["observed"]["control_index"].values
     change = int(np.flatnonzero(np.diff(control))[0]) + 1
     damage = int(np.flatnonzero(truth == truth[change])[0])

@@ -17,11 +17,12 @@ BIN_COUNT = 40
 def draw_exchanger() -> Drawing:
     """Draw belief and truth of the fouling, and the pressure drop with its limit."""
     run = notebook("your_own_fmu", "open_run").names["run"]
-    fouling = 100 * run["filtered"]["mean"].values[:, 0]
-    two_deviations = 200 * run["filtered"]["standard_deviation"].values[:, 0]
-    pressure_drop = run["observed"]["gauges"].values[:, 1] / 1e3
+    fouling = 100 * run["filtered"]["mean"].isel(region=0).values
+    two_deviations = 200 * run["filtered"]["standard_deviation"].isel(region=0).values
+    pressure_drop = run["observed"]["gauges"].isel(sensor=1).values / 1e3
     control = run["observed"]["control_index"].values
     change = int(np.flatnonzero(np.diff(control))[0]) + 1
+    truth = 100 * run["truth"]["state"].isel(region=0).values
     days = np.arange(len(fouling))
     with publication_style():
         figure = new_figure(HEIGHT, WIDTH)
@@ -31,9 +32,7 @@ def draw_exchanger() -> Drawing:
             days, fouling - two_deviations, fouling + two_deviations, color=PAST, alpha=0.2, lw=0
         )
         left.plot(days, fouling, color=PAST, label="belief")
-        left.plot(
-            days, 100 * run["truth"]["state"].values[:, 0], color="k", ls="--", lw=1, label="truth"
-        )
+        left.plot(days, truth, color="k", ls="--", lw=1, label="truth")
         left.set(xlabel="day", ylabel="fouling, %")
         left.legend(loc="upper left")
         right.plot(days, pressure_drop, ".", color=PAST)

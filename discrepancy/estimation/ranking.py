@@ -32,9 +32,9 @@ THINNED_AT_LEAST = 2.0
 """Ratio of the number of samples to that number above which there is a first round."""
 MOST_REFINED_SETS = 2
 """Largest number of sets of each length that are estimated with the motion in the first round."""
-LEADING_RANGE = 30.0
+LEADING_RANGE = 12.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
-samples the difference would be larger by about the factor of the thinning."""
+samples the difference is larger by about the factor of the thinning."""
 MOST_LEADING = 3
 """Largest number of hypotheses with effects that are estimated in all samples."""
 

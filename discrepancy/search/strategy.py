@@ -389,21 +389,22 @@ class Search(FittedCandidates):
                     return
 
     def _is_in_optimum_of_estimate(self, fit: CandidateFit) -> bool:
-        """Return whether a simulation is at least as probable as its law with a missing force.
+        """Return whether a simulation is near the data, at the values estimated with the motion.
 
-        The law was then estimated together with the motion, and followed from a large missing force
-        to a small one. A simulation that is as probable is the limit of that estimate, in which the
-        missing force vanishes.
+        The estimate follows the law from a large missing force to a small one, and so reaches the
+        right optimum. Other optima are much farther away, and leave far more than the noise.
 
         Parameters
         ----------
         fit : CandidateFit
             The simulation.
         """
+        if self._has_large_residuals(fit):
+            return False
         return any(
             hypothesis.candidate.key == fit.candidate.key
             and hypothesis.speed_window is not None
-            and self.score_under_recorded_noise(fit) >= self.score(hypothesis)
+            and np.abs(hypothesis.effect - fit.effect).max() < SEARCH.same_optimum_deviation
             for hypothesis in self.force_hypotheses
         )
 

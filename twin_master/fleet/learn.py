@@ -126,6 +126,12 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> Json
     """
     folder = Path(folder)
     config = fleet_config(folder)
+    own_sensor_model = config["fleet"].get("parts", {}).get("sensor_model")
+    if own_sensor_model is not None:
+        raise FleetError(
+            f"the fleet in {folder} flew with the sensor model {own_sensor_model}, and `fleet "
+            "learn` knows only those of scenarios: fly it without `sensor_model` to learn from it."
+        )
     lessons = _lessons_of_groups(folder, config["fleet"]["groups"], progress or SilentProgress())
     if not lessons:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")

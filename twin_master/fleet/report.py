@@ -121,10 +121,6 @@ def _add_flown_fleet(
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
-    figures = {name: group_figures(group) for name, group in groups.items()}
-    WORDS.add_table(
-        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
-    )
     status = np.concatenate([stored_values(group, "status") for group in groups.values()])
     failures = endings_of(folder).failures
     if failures:
@@ -138,7 +134,6 @@ def _add_flown_fleet(
             f"{ended_early} of {len(status)} assets ended their simulation before the mission "
             "was over; what they have flown counts."
         )
-    _add_lessons(page, folder)
     for record, standing in zip(records, standings, strict=True):
         group = groups[record["name"]]
         page.add_section(f"Group {record['name']}")
@@ -149,6 +144,12 @@ def _add_flown_fleet(
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
         _add_attention_table(page, standing, most_assets)
+    page.add_section("How the twins fared")
+    figures = {name: group_figures(group) for name, group in groups.items()}
+    WORDS.add_table(
+        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
+    )
+    _add_lessons(page, folder)
 
 
 def _leaving_or_explanation(
@@ -348,9 +349,9 @@ def _attention_table(
     """Return the table of the assets with the given indices, in their order."""
     factors = printed_factors(standing.scenario)
     columns = []
-    for state, factor in zip(standing.scenario.state, factors, strict=True):
-        columns.append(number_column(state.name, factor.unit))
-    columns += [PageColumn("control"), number_column("change", "%")]
+    for factor in factors:
+        columns.append(number_column(factor.title, factor.unit))
+    columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
     if has_alarms:
         columns.append(number_column("alarms"))
     percentage = _leaving_percentage(standing)

@@ -556,11 +556,11 @@ MOVING = {"response": 2.0, "release": 0.001}
 
 def test_a_crack_that_takes_all_stiffness_is_refused(patched):
     soft = {"effect.crack.side": 0, "effect.crack.coefficient": -1e9}
-    asset = FmiAsset(patched, WARM, parameters=switch_on("crack") | MOVING | soft)
+    parameters = switch_on("crack") | MOVING | soft
 
     with (
-        asset,
         pytest.raises(FmuCallError, match="takes more stiffness than the structure has"),
+        FmiAsset(patched, WARM, parameters=parameters) as asset,
     ):
         asset.reset()
 
