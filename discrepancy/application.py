@@ -7,7 +7,7 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
-from calibration.result.file import load_calibration, tailoring
+from calibration.result.file import Tailoring, load_calibration, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
@@ -374,10 +374,11 @@ def pack_patched(
         effect_tables.append({"id": stored_effect.identifier, "primitives": primitives})
     content = {"schema": SCHEMA, "effects": effect_tables, "channels": dict(patch.channels)}
     effects = parse_patch(json.dumps(content).encode(), "The patch")
-    options: dict[str, Any] = {"state": DigitalState()}
+    options: Tailoring = {"state": DigitalState()}
     if choice.kind is ModelKind.CALIBRATION and choice.path is not None:
         options = tailoring(load_calibration(choice.path))
-    parameters = {parameter.name: parameter.mean for parameter in patch.parameters}
+    # The names are those of fields of the state.
+    parameters: dict[str, Any] = {parameter.name: parameter.mean for parameter in patch.parameters}
     options["state"] = changed(options["state"], **parameters)
     pack_wing(
         choice.design,

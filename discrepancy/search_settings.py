@@ -159,6 +159,10 @@ class SearchSettings:
     They end with the first that leaves only noise.
     """
 
+    same_optimum_deviation: float = 0.1
+    """Distance of a simulation from the estimate with the motion, in prior deviations of each
+    parameter, up to which both are in one optimum and the fit is not repeated."""
+
     # ---------------------------------------------------------------- weighed with a remainder
     most_weighed_sets: tuple[int, ...] = (8, 4, 2)
     """Most sets of one, two and three effects that are fitted together with a remainder."""

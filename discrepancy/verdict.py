@@ -6,7 +6,8 @@ from enum import StrEnum
 from math import nan
 
 from discrepancy.document import Number, Patch
-from reporting.words import brief
+from reporting.notebook import html_table
+from reporting.words import between, brief, rounded
 
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
@@ -463,3 +464,21 @@ class Verdict:
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]
         return brief(self, kind=self.kind.value, probability=self.probability, effects=effects)
+
+    def _repr_html_(self) -> str:
+        """Return the conclusion with the parameters of its effects, for a notebook."""
+        rows = []
+        for effect in self.effects:
+            for parameter in effect.parameters:
+                half_width = 0.5 * (parameter.high - parameter.low)
+                row = [
+                    effect.name,
+                    effect.place,
+                    parameter.name.replace("_", " "),
+                    rounded(parameter.value, half_width),
+                    between(parameter.low, parameter.high, half_width),
+                    "" if parameter.unit == "1" else parameter.unit,
+                ]
+                rows.append(row)
+        headings = ("effect", "place", "parameter", "value", "90 % interval", "unit")
+        return html_table(self.sentence, headings if rows else (), rows, self.remarks)

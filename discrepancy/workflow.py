@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,6 +43,7 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
 from discrepancy.missing_force.windows import add_window_sizes, gap_windows, windows_of_residuals
 from discrepancy.model_choice import load_model
+from discrepancy.pictures import plot_missing_force
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import OnProgress
 from discrepancy.search.strategy import Search
@@ -58,6 +60,9 @@ from discrepancy.verdict_remarks import (
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
 from reporting.words import brief, is_or_are
+
+if TYPE_CHECKING:  # it takes long to import
+    from matplotlib.axes import Axes
 
 DRAWS = 400
 CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
@@ -111,6 +116,14 @@ class Investigation:
 
     def __repr__(self) -> str:
         return brief(self, campaign=self.campaign.name, model=self.model.name, verdict=self.verdict)
+
+    def _repr_html_(self) -> str:
+        """Return the verdict, for a notebook."""
+        return self.verdict._repr_html_()
+
+    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+        """Draw the force that the model lacks over time, see `plot_missing_force`."""
+        return plot_missing_force(self, axes)
 
 
 def investigate(

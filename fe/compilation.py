@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -29,8 +29,9 @@ except ModuleNotFoundError:
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-NumericalFunction = Callable[..., Any]
+NumericalFunction = Callable[..., object]
 """A function in the subset of Python that numba knows."""
+_Function = TypeVar("_Function", bound=NumericalFunction)
 
 # A division by zero gives infinity, as in NumPy: numba does not vectorise a loop that may raise an
 # error.
@@ -133,11 +134,11 @@ def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
 
 
 def callable_when_compiled(
-    function: NumericalFunction,
+    function: _Function,
     *,
     makes_arrays: bool = True,
     inline: bool = False,
-) -> NumericalFunction:
+) -> _Function:
     """Let compiled functions call a plain one; return the function, which stays plain itself.
 
     Parameters
@@ -197,18 +198,18 @@ def _choose_when_compiled(
     functions : tuple of callable
         The function that it calls for each number from 0 on.
     """
-    namespace: dict[str, Any] = {"Any": Any}
+    namespace: dict[str, object] = {}
     for number, function in enumerate(functions):
         namespace[f"answer_{number}"] = function
     last_number = len(functions) - 1
     # numba asks for the signature of `compiled_choice` below.
-    lines = ["def choice(number: Any, *given: Any) -> Any:"]
+    lines = ["def choice(number: object, *given: object) -> object:"]
     for number in range(last_number):
         lines.append(f"    if number == {number}: return answer_{number}(*given)")
     lines.append(f"    return answer_{last_number}(*given)")
     exec("\n".join(lines), namespace)
 
-    def compiled_choice(number: Any, *given: Any) -> Any:
+    def compiled_choice(number: object, *given: object) -> object:
         return namespace["choice"]
 
     jit_options = {"nogil": True, "_nrt": False, "forceinline": True}

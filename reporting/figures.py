@@ -17,12 +17,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis, Tick
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorizer import ColorizingArtist
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullLocator
@@ -31,6 +34,7 @@ from numpy.typing import ArrayLike
 from reporting.errors import InvalidFigureError
 from reporting.files import atomic_write_bytes
 from reporting.hover import annotated
+from reporting.tiles import NARROW, tiles_of_figure
 
 # Okabe and Ito's palette for colour-blind readers; each colour has one meaning in all figures.
 OBSERVED: Final = "#595959"
@@ -47,14 +51,74 @@ DECISION: Final = "#CC79A7"
 """Controls and policies (purple)."""
 REFERENCE: Final = "#999999"
 """Limits and reference lines (light grey)."""
+
+
+class ColorScale(TypedDict, total=False):
+    """Colours of values: the colour map, and the values at its ends."""
+
+    cmap: str | Colormap
+    vmin: float
+    vmax: float
+
+
+class MarkStyle(TypedDict, total=False):
+    """The look of marks, as arguments of `Axes.plot`."""
+
+    color: str
+    marker: str
+    markersize: float
+    markerfacecolor: str
+    markeredgecolor: str
+    markeredgewidth: float
+
+
+class LineStyle(MarkStyle, total=False):
+    """The look of a line and its marks, as arguments of `Axes.plot`."""
+
+    linewidth: float
+    linestyle: str | tuple[float, Sequence[float]]
+
+
+class IntervalStyle(MarkStyle, total=False):
+    """The look of a mean with its interval, as arguments of `Axes.errorbar`."""
+
+    capsize: float
+    elinewidth: float
+
+
+class SwatchStyle(TypedDict, total=False):
+    """The look of a patch of a legend, as arguments of `Rectangle`."""
+
+    edgecolor: str
+    linewidth: float
+
+
+class GridMargins(TypedDict, total=False):
+    """Margins of a figure, and gaps between its panels, as fractions."""
+
+    left: float
+    right: float
+    wspace: float
+    hspace: float
+
+
+class ColorBarShape(TypedDict, total=False):
+    """The shape of a scale of colours, as arguments of `Figure.colorbar`."""
+
+    pad: float
+    fraction: float
+    aspect: float
+    extend: Literal["neither", "both", "min", "max"]
+
+
 LEVELS: Final = "cividis"
 """Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
 
-RESIDUALS: Final[dict[str, Any]] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
+RESIDUALS: Final[ColorScale] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
 """Colours of a map of residuals, in standard deviations."""
 
 BAND_OPACITY: Final = 0.22
-TRUTH_LINE: Final[dict[str, Any]] = {
+TRUTH_LINE: Final[LineStyle] = {
     "color": TRUTH,
     "linewidth": 1.0,
     "linestyle": (0, (4, 1.5, 1, 1.5)),
@@ -144,7 +208,7 @@ def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
 
 
 def panels(
-    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
+    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Unpack[GridMargins]
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and its panels, row by row.
 
@@ -156,8 +220,8 @@ def panels(
         The height of the figure [in].
     top, bottom : float
         The margins above and below the panels [in].
-    **grid : float
-        Arguments of `Figure.add_gridspec`, as fractions of the figure.
+    **grid : GridMargins
+        Margins left and right, and gaps between the panels, as fractions.
     """
     figure = new_figure(height)
     margins = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
@@ -196,7 +260,17 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) 
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
-def interval(axes: Axes, x: float, mean: float, low: float, high: float, **style: Any) -> None:
+def interval(
+    axes: Axes,
+    x: float,
+    mean: float,
+    low: float,
+    high: float,
+    *,
+    label: str | None = None,
+    zorder: float = 2.0,
+    **style: Unpack[IntervalStyle],
+) -> None:
     """Draw a mean with its interval.
 
     Parameters
@@ -207,22 +281,28 @@ def interval(axes: Axes, x: float, mean: float, low: float, high: float, **style
         The horizontal coordinate.
     mean, low, high : float
         The mean and the ends of its interval. By rounding the mean may lie just outside.
-    **style : object
-        Arguments of `Axes.errorbar`.
+    label : str, optional
+        The text in the legend.
+    zorder : float
+        The order of drawing; what has a higher number covers it.
+    **style : IntervalStyle
+        The look of the mark, as arguments of `Axes.errorbar`.
     """
     lengths = [[max(mean - low, 0.0)], [max(high - mean, 0.0)]]
-    axes.errorbar([x], [mean], yerr=lengths, linestyle="none", **style)
+    axes.errorbar([x], [mean], yerr=lengths, linestyle="none", label=label, zorder=zorder, **style)
 
 
-def swatches(names: Sequence[str], colors: Sequence[str], **style: Any) -> list[Rectangle]:
+def swatches(
+    names: Sequence[str], colors: Sequence[str], **style: Unpack[SwatchStyle]
+) -> list[Rectangle]:
     """Return the patches that a legend shows for named colours.
 
     Parameters
     ----------
     names, colors : sequence of str
         The names and their colours.
-    **style : object
-        Arguments of `Rectangle`.
+    **style : SwatchStyle
+        The look of the patches, as arguments of `Rectangle`.
     """
     return [
         Rectangle((0, 0), 1, 1, facecolor=color, label=name, **style)
@@ -230,7 +310,9 @@ def swatches(names: Sequence[str], colors: Sequence[str], **style: Any) -> list[
     ]
 
 
-def shared_legend(figure: Figure, rows: int = 1, **position: Any) -> None:
+def shared_legend(
+    figure: Figure, rows: int = 1, bbox_to_anchor: tuple[float, float] = (0.53, 1.0)
+) -> None:
     """Draw one legend for all panels above them; equal labels appear once.
 
     Parameters
@@ -239,36 +321,52 @@ def shared_legend(figure: Figure, rows: int = 1, **position: Any) -> None:
         The figure.
     rows : int
         The number of rows of the legend.
-    **position : object
-        Arguments of `Figure.legend`, instead of the usual position.
+    bbox_to_anchor : (float, float)
+        The middle of the legend's upper edge, as fractions of the figure.
     """
     handle_of_label = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handle_of_label[label] = handle
     figure.legend(
-        handle_of_label.values(),
-        handle_of_label.keys(),
+        list(handle_of_label.values()),
+        list(handle_of_label),
         ncols=math.ceil(len(handle_of_label) / rows),
-        **{"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), **position},
+        loc="upper center",
+        bbox_to_anchor=bbox_to_anchor,
     )
 
 
-def color_bar(figure: Figure, artist: Any, label: str, **position: Any) -> Axes:
+def color_bar(
+    figure: Figure,
+    artist: ScalarMappable | ColorizingArtist,
+    label: str,
+    *,
+    ax: Axes | Sequence[Axes] | None = None,
+    cax: Axes | None = None,
+    location: Literal["left", "right", "top", "bottom"] | None = None,
+    **shape: Unpack[ColorBarShape],
+) -> Axes:
     """Draw the scale of the colours of an artist, and return its panel.
 
     Parameters
     ----------
     figure : Figure
         The figure.
-    artist : ScalarMappable
+    artist : ScalarMappable or ColorizingArtist
         The map or the points whose colours stand for values.
     label : str
         The quantity and its unit.
-    **position : object
-        Either `ax`, the panel beside which the scale is drawn, or `cax`, the panel in which.
+    ax : Axes or sequence of Axes, optional
+        The panels beside which the scale is drawn, if it has no panel of its own.
+    cax : Axes, optional
+        The panel in which the scale is drawn.
+    location : str, optional
+        The side of the panels on which the scale is drawn; the right by default.
+    **shape : ColorBarShape
+        Gap, size and ends of the scale.
     """
-    bar = figure.colorbar(artist, **position)
+    bar = figure.colorbar(artist, ax=ax, cax=cax, location=location, **shape)
     bar.set_label(label)
     bar.outline.set_linewidth(0.5)
     return bar.ax
@@ -292,7 +390,8 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
 def to_svg(figure: Figure) -> bytes:
     """Return a figure as SVG, with texts as outlines and with the values that the pointer shows.
 
-    The file has neither a date nor a document type.
+    The file has neither a date nor a document type. Its attribute ``data-tiles`` has the view boxes
+    of the tiles that a narrow page shows below one another.
     """
     buffer = io.BytesIO()
     with publication_style():
@@ -306,6 +405,8 @@ def to_svg(figure: Figure) -> bytes:
                 metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
             )
         text = annotate(buffer.getvalue().decode("utf-8"))
+        view_boxes = ", ".join(tile.view_box for tile in tiles_of_figure(figure))
+    text = text.replace("<svg ", f'<svg data-tiles="{view_boxes}" ', 1)
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)
     return text.encode("utf-8")
 
@@ -369,10 +470,38 @@ def _parse_tick_labels_of_powers(figure: Figure) -> None:
 
 _IDENTIFIER = re.compile(r'\bid="([^"]+)"')
 _REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
+_ATTRIBUTE = re.compile(r'([\w:-]+)="([^"]*)"')
+_ATTRIBUTES_OF_FILES = {"viewBox", "width", "height", "version", "data-tiles"}
+"""Attributes of an SVG that its element in a page does not have or has anew."""
+_READABLE = 1.15
+"""Pixels for each point of a drawing, at which letters of 8 points can be read."""
+_LARGEST = 1.6
+"""The most pixels for each point of a drawing."""
+_DRAWING = "drawing"
+"""Identifier of a whole drawing in a page, after its prefix."""
 
 
-def inline_svg(svg: bytes, prefix: str, description: str) -> str:
-    """Return an SVG as an element of an HTML page, scaled to the width of the page.
+class InlineDrawing(NamedTuple):
+    """A drawing as elements of an HTML page.
+
+    Attributes
+    ----------
+    full : str
+        The drawing as one element, scaled to the width of the page.
+    tiles : tuple of str
+        Elements that show the parts of the drawing on a narrow page, in their order; empty if the
+        drawing has no parts.
+    is_wide : bool
+        Whether a tile, or a drawing without tiles, is wider than a narrow page.
+    """
+
+    full: str
+    tiles: tuple[str, ...]
+    is_wide: bool
+
+
+def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
+    """Return an SVG as elements of an HTML page.
 
     Parameters
     ----------
@@ -396,16 +525,55 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> str:
         raise InvalidFigureError(
             "A figure for a page must be an SVG; the bytes given have no <svg> element."
         )
-    opening = text[start_of_tag:end_of_tag]
-    body = text[end_of_tag:].rstrip()
-    view_box = re.search(r'viewBox="([^"]+)"', opening)
-    if view_box is None:
+    attributes = dict(_ATTRIBUTE.findall(text[start_of_tag:end_of_tag]))
+    content = text[end_of_tag + 1 :].rstrip().removesuffix("</svg>")
+    if "viewBox" not in attributes:
         raise InvalidFigureError(
             "A figure for a page must have a viewBox, or it could not be scaled."
         )
-    body = _IDENTIFIER.sub(rf'id="{prefix}-\1"', body)
-    body = _REFERENCE.sub(rf"\1{prefix}-\2", body)
+    content = _IDENTIFIER.sub(rf'id="{prefix}-\1"', content)
+    content = _REFERENCE.sub(rf"\1{prefix}-\2", content)
     # Inside HTML the parser knows the namespaces, and `href` needs no prefix.
-    body = body.replace("xlink:href=", "href=")
+    content = content.replace("xlink:href=", "href=")
+    # Attributes such as the size of letters hold for all that is drawn.
+    look = ""
+    for name, value in attributes.items():
+        if name not in _ATTRIBUTES_OF_FILES and not name.startswith("xmlns"):
+            look += f' {name}="{value}"'
     label = html.escape(description)
-    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{label}"{body}'
+    view_box = attributes["viewBox"]
+    full = (
+        f'<svg viewBox="{view_box}" role="img" aria-label="{label}">'
+        f'<g id="{prefix}-{_DRAWING}"{look}>{content}</g></svg>'
+    )
+    tiles = []
+    widths = [float(view_box.split()[2])]
+    if attributes.get("data-tiles"):
+        tile_boxes = attributes["data-tiles"].split(", ")
+        widths = [float(tile_box.split()[2]) for tile_box in tile_boxes]
+        for tile_box, width in zip(tile_boxes, widths, strict=True):
+            tiles.append(_tile_element(tile_box, width, f"{prefix}-{_DRAWING}"))
+    return InlineDrawing(full, tuple(tiles), is_wide=max(widths) > NARROW)
+
+
+def _tile_element(view_box: str, width: float, drawing: str) -> str:
+    """Return the element that shows a rectangle of a drawing.
+
+    Parameters
+    ----------
+    view_box : str
+        The rectangle.
+    width : float
+        Its width [pt], in which letters have their usual size.
+    drawing : str
+        The identifier of the drawing.
+    """
+    # A tile that is wider than the screen keeps the size at which its letters can be read, and a
+    # small one is not blown up.
+    style = f"max-width:{_LARGEST * width:.0f}px"
+    if width > NARROW:
+        style = f"width:{_READABLE * width:.0f}px"
+    return (
+        f'<div class="tile"><svg viewBox="{view_box}" style="{style}" aria-hidden="true" '
+        f'data-drawing="{drawing}"><use href="#{drawing}"/></svg></div>'
+    )

@@ -7,7 +7,6 @@ from its table once its files are no longer to be read.
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
 
 from reporting.words import listing
 
@@ -22,11 +21,11 @@ class FormerNameWarning(FutureWarning):
 
 
 def with_present_names(
-    record: Mapping[str, Any],
+    record: Mapping[str, object],
     present_names: Mapping[str, str],
     source: str,
     error: type[Exception],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the content of a file with the present name of each key that had another one.
 
     Parameters

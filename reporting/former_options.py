@@ -9,7 +9,7 @@ import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Annotated, Any, ParamSpec, TextIO, TypeVar, get_args
+from typing import Annotated, ParamSpec, TextIO, TypeVar, get_args
 
 import typer
 from typer.models import OptionInfo
@@ -76,7 +76,7 @@ def _hidden_parameter(parameter: inspect.Parameter, former_flag: str) -> inspect
     )
 
 
-def move_former_options(options: dict[str, Any], former_flags: Mapping[str, str]) -> None:
+def move_former_options(options: dict[str, object], former_flags: Mapping[str, str]) -> None:
     """Move the values of options that were given under their former names to the present names.
 
     Parameters

@@ -92,10 +92,12 @@
     sign.style.top = `${event.clientY > height + 24 ? event.clientY - height - 14 : event.clientY + 20}px`;
   };
 
-  for (const svg of document.querySelectorAll("figure svg:has([data-axes])")) {
+  for (const svg of document.querySelectorAll("figure svg:has([data-axes]), svg[data-drawing]")) {
+    // A tile shows a part of a drawing in the coordinates of the whole.
+    const drawing = document.getElementById(svg.dataset.drawing) ?? svg;
     let panels = null;
     const look = (event) => {
-      panels ??= [...svg.querySelectorAll("[data-axes]")].map(readPanel);
+      panels ??= [...drawing.querySelectorAll("[data-axes]")].map(readPanel);
       show(svg, panels, event);
       event.stopPropagation();
     };

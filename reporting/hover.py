@@ -9,7 +9,7 @@ import html
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -33,7 +33,7 @@ _FEW_COLOURS = 20
 controls, and not for values."""
 _SAME_POSITION = 1e-6  # of two panels, as a fraction of the figure
 
-JsonObject = dict[str, Any]
+JsonObject = dict[str, object]
 
 
 class _LineLook(NamedTuple):
@@ -269,7 +269,9 @@ def _map_records(axes: Axes) -> list[JsonObject]:
     for artist in (*axes.collections, *axes.images):
         if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
             continue
-        values: Any = np.ma.masked_invalid(np.ma.asarray(artist.get_array()))
+        values: np.ma.MaskedArray[tuple[int, int], np.dtype[np.float64]] = np.ma.masked_invalid(
+            np.ma.asarray(artist.get_array())
+        )
         if values.ndim != 2 or values.size > _MOST_CELLS:
             continue
         x, y = _cell_edges(artist, values.shape)

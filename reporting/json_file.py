@@ -10,7 +10,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from math import isfinite
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 
@@ -20,8 +20,15 @@ _SMALLEST_INTEGER = -(2**63)
 _LARGEST_INTEGER = 2**63 - 1
 _LONGEST_INTEGER = len(str(_SMALLEST_INTEGER))
 
+JsonDocument: TypeAlias = Any
+"""Plain data of JSON. Its type is open, because the reader of a file checks what the file holds."""
+JsonRecord: TypeAlias = Mapping[str, JsonDocument]
+"""An object of JSON that is read."""
+JsonObject: TypeAlias = dict[str, JsonDocument]
+"""An object of JSON that is made or changed."""
 
-def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -> Any:
+
+def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -> JsonDocument:
     """Return the content of a JSON file.
 
     Parameters
@@ -44,7 +51,7 @@ def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -
 
 def parse_json(
     content: bytes | str, source: str, error: type[Exception], *, any_number: bool = False
-) -> Any:
+) -> JsonDocument:
     """Return the content of a JSON text.
 
     Parameters
@@ -75,7 +82,7 @@ def parse_json(
     return document
 
 
-def _object_without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object_without_repeated_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
     """Return an object of JSON; Python itself would keep the last of repeated keys."""
     table = dict(pairs)
     if len(table) < len(pairs):
@@ -117,7 +124,7 @@ def _null(_: float) -> None:
     return None
 
 
-def plain(value: Any, not_finite: Callable[[float], Any] = _null) -> Any:
+def plain(value: object, not_finite: Callable[[float], object] = _null) -> JsonDocument:
     """Return a value as plain data of JSON: records by their fields, arrays as lists.
 
     Parameters

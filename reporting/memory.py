@@ -4,7 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
 _Value = TypeVar("_Value")
 
@@ -69,25 +69,26 @@ class ResultCache:
     def __init__(
         self,
         size: int = 256,
-        weight: Callable[[Any], int] = _unit_weight,
-        end: Callable[[Any], object] = _do_nothing,
+        weight: Callable[[object], int] = _unit_weight,
+        end: Callable[[object], object] = _do_nothing,
     ) -> None:
         self._size = size
         self._weight = weight
         self._end = end
-        self._values: dict[Hashable, Any] = {}
+        self._values: dict[Hashable, object] = {}
         self._total_weight = 0
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return vars(self) | {"_values": {}, "_total_weight": 0}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
         """Return the result of a key; if the cache does not hold it, `make` computes it."""
         if key in self._values:
             # Dictionaries keep the order of insertion: the last is the most recently used.
-            cached: _Value = self._values.pop(key)
+            cached = self._values.pop(key)
             self._values[key] = cached
-            return cached
+            # A key always belongs to the same `make`, whose results are of one type.
+            return cast(_Value, cached)
         value = make()
         self._values[key] = value
         self._total_weight += self._weight(value)

@@ -74,7 +74,9 @@ class NetcdfGroup:
         return self.coords[name]
 
 
-def write_groups(path: Path, groups: Mapping[str, NetcdfGroup], attrs: Mapping[str, Any]) -> None:
+def write_groups(
+    path: Path, groups: Mapping[str, NetcdfGroup], attrs: Mapping[str, object]
+) -> None:
     """Write a NetCDF-4 file; equal arguments give equal bytes.
 
     Parameters

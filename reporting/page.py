@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from markupsafe import Markup
 
@@ -123,7 +123,7 @@ class Words:
         texts = self.content[kind][name]
         return {key: fill_template(texts[key], **fields) for key in ("title", "caption")}
 
-    def figure(self, name: str, figure: Any, /, **fields: object) -> ReportFigure:
+    def figure(self, name: str, figure: "Figure", /, **fields: object) -> ReportFigure:
         """Return a figure with its title and caption."""
         return ReportFigure(name, figure, **self.words("figures", name, **fields))
 
@@ -168,7 +168,7 @@ class _PageBlock(NamedTuple):
     """A block of a page, as `page.html` takes it."""
 
     kind: str
-    content: dict[str, Any]
+    content: dict[str, object]
 
 
 class Page:
@@ -188,7 +188,7 @@ class Page:
         self._head = {"title": title, "subtitle": subtitle, "footer": footer}
         self._blocks: list[_PageBlock] = []
 
-    def _add(self, kind: str, **content: Any) -> None:
+    def _add(self, kind: str, **content: object) -> None:
         """Append a block of a kind with its content."""
         self._blocks.append(_PageBlock(kind, content))
 
@@ -207,6 +207,18 @@ class Page:
     def add_notice(self, text: str) -> None:
         """Add a paragraph that the reader must not overlook."""
         self._add("notice", text=text)
+
+    def add_card(self, text: str) -> None:
+        """Add the one sentence of the page that a reader must know, in large print."""
+        self._add("card", text=text)
+
+    def begin_fold(self, title: str) -> None:
+        """Begin a part that the reader unfolds on demand; `end_fold` ends it."""
+        self._add("fold", title=title)
+
+    def end_fold(self) -> None:
+        """End the part that `begin_fold` has begun."""
+        self._add("end of fold")
 
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
         """Add a row of a few values in large print, each with its meaning."""
@@ -233,8 +245,16 @@ class Page:
         from reporting.figures import inline_svg
 
         number = self._next_number("figure")
-        drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
-        self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+        drawing = inline_svg(svg, prefix=f"f{number}", description=title)
+        self._add(
+            "figure",
+            number=number,
+            drawing=Markup(drawing.full),
+            tiles=[Markup(tile) for tile in drawing.tiles],
+            is_wide=drawing.is_wide,
+            title=title,
+            caption=caption,
+        )
         return number
 
     def add_report_figure(self, figure: ReportFigure) -> int:
@@ -252,7 +272,7 @@ class Page:
     def render(self) -> str:
         """Return the page as one string of HTML."""
         has_values_in_figures = any(
-            " data-axes=" in block.content["drawing"]
+            " data-axes=" in str(block.content["drawing"])
             for block in self._blocks
             if block.kind == "figure"
         )

@@ -14,10 +14,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
+from reporting.log import module_logger
+
 if TYPE_CHECKING:  # rich takes long to import, and most code needs only the names of types
     from rich.console import Console
     from rich.progress import Progress as RichBars
     from rich.progress import TaskID
+
+_logger = module_logger(__name__)
 
 SECONDS_BETWEEN_LINES = 10.0
 """Longest time between two lines of a stage on a pipe, while the stage advances [s]."""
@@ -59,7 +63,8 @@ class Progress:
         yield Stage()
 
     def note(self, message: str) -> None:
-        """Show one line, such as where a file was written."""
+        """Show one line, such as where a file was written; this one only writes it to the log."""
+        _logger.info(message)
 
 
 SilentProgress = Progress

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import metadata, util
 from pathlib import Path
-from typing import Any
 
 from reporting.files import hash_tree
 
@@ -66,7 +65,7 @@ class Provenance:
     source_hashes: Mapping[str, str]
     input_hashes: Mapping[str, str] = field(default_factory=dict)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return plain dictionaries, ready for JSON."""
         return asdict(self)
 

@@ -16,10 +16,10 @@ class _ListingFormatter(Formatter):
     With `!s` a collection is written as Python writes it: an index into an array, or a shape.
     """
 
-    def convert_field(self, value: Any, conversion: str | None) -> Any:
+    def convert_field(self, value: object, conversion: str | None) -> object:
         is_record = hasattr(value, "_fields")
-        is_collection = isinstance(value, tuple | list | Set | Mapping) and not is_record
-        if not is_collection or conversion == "s":
+        as_one_value = is_record or conversion == "s"
+        if as_one_value or not isinstance(value, tuple | list | Set | Mapping):
             return super().convert_field(value, conversion)
         texts = []
         for entry in value:

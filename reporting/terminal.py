@@ -7,17 +7,19 @@ same two.
 
 import functools
 import json
+import logging
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import reporting.progress
+from reporting.log import shown_log
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,18 +62,20 @@ def console() -> "Console":
     return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
 
 
-def say(text: str, **style: Any) -> None:
+def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
     """Print a line of the result, unless `--quiet`.
 
     Parameters
     ----------
     text : str
         The line.
-    **style : object
-        The style, such as `bold` or the colour `fg`, as `typer.secho` takes it.
+    fg : str, optional
+        The colour.
+    bold : bool, optional
+        Whether the line is bold.
     """
     if not loudness.quiet:
-        typer.secho(text, **style)
+        typer.secho(text, fg=fg, bold=bold)
 
 
 def show(blocks: "Iterable[str | TextTable]") -> None:
@@ -227,7 +231,7 @@ def interruptible(how_to_go_on: Callable[[], str] = str) -> Iterator[None]:
         raise error_exit("; ".join(parts) + ".", INTERRUPTED) from None
 
 
-def print_json(record: Mapping[str, Any]) -> None:
+def print_json(record: Mapping[str, object]) -> None:
     """Print a record as JSON; a number that is not finite becomes null."""
     from reporting.json_file import plain
 
@@ -244,7 +248,7 @@ def with_common_options(application: typer.Typer) -> Callable[..., None]:
 
     loudness.quiet = False
     loudness.verbose = False
-    command: Any = get_command(application)
+    command: _Command = get_command(application)
     _extend_commands(command, _make_common_options())
     entry_point: Callable[..., None] = command
     return entry_point
@@ -308,7 +312,15 @@ def _shown_progress() -> Iterator[None]:
     # The cache makes one progress object for all stages of the command, when the first begins.
     reporting.progress.default_progress = functools.cache(progress)
     try:
-        with interruptible():
+        with interruptible(), _shown_log():
             yield
     finally:
         reporting.progress.default_progress = previous_progress
+
+
+def _shown_log() -> AbstractContextManager[None]:
+    """Return a context in which a command shows warnings, or with --verbose all of the log."""
+    if loudness.quiet:
+        return nullcontext()
+    level = logging.DEBUG if loudness.verbose else logging.WARNING
+    return shown_log(reporting.progress.note, level)

@@ -8,10 +8,10 @@ Messages name the location in the file, what it holds and what was expected.
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeAlias, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
@@ -30,13 +30,16 @@ _DOTTED_KEY = rf"({_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART})*+)"
 _KEYS = re.compile(f"{_COMMENT}|{_LONG_TEXT}|{_LONG_LITERAL_TEXT}|{_DOTTED_KEY}")
 """Comments and texts of several lines, which are skipped, or a dotted key, which is group 1."""
 
+TomlTable: TypeAlias = dict[str, Any]
+"""A table of TOML. Its type is open, because the reader of a file checks what the file holds."""
+
 LONGEST_ARRAY = 90
 """Largest number of characters in the entries of an array that is written in one line."""
 
 _LONGEST_SHOWN_VALUE = 60  # in a message, in characters
 
 
-def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -> dict[str, Any]:
+def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -> TomlTable:
     """Return the content of a TOML file.
 
     Parameters
@@ -57,7 +60,7 @@ def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -
     return parse_toml(read_text(path, error, what=what), f"The {what} {path}", error)
 
 
-def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dict[str, Any]:
+def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> TomlTable:
     """Return the content of a TOML text.
 
     Parameters
@@ -105,7 +108,7 @@ def _has_too_long_key(text: str) -> bool:
 
 
 def _check_integers(
-    node: dict[str, Any] | list[Any], location: str, source: str, error: type[Exception]
+    node: dict[str, object] | list[object], location: str, source: str, error: type[Exception]
 ) -> None:
     """Refuse integers beyond 64 bits.
 
@@ -124,34 +127,34 @@ def _check_integers(
     """
     entries = list(node.items()) if isinstance(node, dict) else list(enumerate(node, start=1))
     for key, value in entries:
-        is_large = isinstance(value, int) and not -(2**63) <= value < 2**63
-        if not is_large and not isinstance(value, dict | list):
+        if not isinstance(value, int | dict | list):
             continue
         if isinstance(node, dict):
             location_of_value = f"{location}.{key}".lstrip(".")
         else:
             location_of_value = f"{location}[{key}]"
-        if is_large:
+        if not isinstance(value, int):
+            _check_integers(value, location_of_value, source, error)
+        elif not -(2**63) <= value < 2**63:
             raise error(
                 f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, "
                 "and 63 beside the sign are what TOML allows."
             )
-        _check_integers(value, location_of_value, source, error)
 
 
-def toml_text(content: dict[str, Any]) -> str:
+def toml_text(content: Mapping[str, object]) -> str:
     """Return plain data as TOML, from which `parse_toml` returns the same data.
 
     Values None are left out. A table inside a table is written in one line, a long array in
     several.
     """
-    values: dict[str, Any] = {}
-    tables: dict[str, dict[str, Any]] = {}
-    arrays_of_tables: dict[str, list[dict[str, Any]]] = {}
+    values: dict[str, object] = {}
+    tables: dict[str, dict[str, object]] = {}
+    arrays_of_tables: dict[str, list[dict[str, object]]] = {}
     for key, value in content.items():
         if isinstance(value, dict):
             tables[key] = value
-        elif _is_array_of_tables(value):
+        elif isinstance(value, list) and _is_array_of_tables(value):
             arrays_of_tables[key] = value
         else:
             values[key] = value
@@ -164,19 +167,17 @@ def toml_text(content: dict[str, Any]) -> str:
     return "\n".join(section for section in sections if section)
 
 
-def _is_array_of_tables(value: object) -> bool:
-    """Return whether a value is a list of tables with at least one entry."""
-    if not isinstance(value, list) or not value:
-        return False
-    return all(isinstance(row, dict) for row in value)
+def _is_array_of_tables(entries: list[object]) -> bool:
+    """Return whether a list holds tables, and at least one."""
+    return bool(entries) and all(isinstance(entry, dict) for entry in entries)
 
 
-def _key_value_lines(table: dict[str, Any]) -> str:
+def _key_value_lines(table: dict[str, object]) -> str:
     """Return a line "key = value" for each value that is not None."""
     return "".join(f"{pair}\n" for pair in _key_value_pairs(table))
 
 
-def _key_value_pairs(table: dict[str, Any]) -> list[str]:
+def _key_value_pairs(table: dict[str, object]) -> list[str]:
     """Return "key = value" for each value that is not None."""
     return [
         f"{_toml_key(key)} = {toml_value(value)}"
@@ -282,7 +283,9 @@ def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
 
 
 _Model = TypeVar("_Model")
-_validator_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
+
+
+_validator_of: Callable[[type], TypeAdapter[object]] = cache(TypeAdapter)
 """Makes the validator of a model once: pydantic takes long to make one."""
 
 
@@ -319,11 +322,13 @@ def validate(
         is there and what is expected.
     """
     try:
-        record: _Model = _validator_of(model).validate_python(content)
+        record = _validator_of(model).validate_python(content)
     except ValidationError as cause:
         message = _validation_message(cause, model, what, first_index)
-        raise error(f"{source}: {message}.") from None
-    return record
+        full_stop = "" if message.endswith("?") else "."
+        raise error(f"{source}: {message}{full_stop}") from None
+    # The validator of a model returns a record of this model.
+    return cast(_Model, record)
 
 
 def short_repr(value: object) -> str:

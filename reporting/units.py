@@ -108,14 +108,14 @@ _COMMON_UNITS = {
 
 
 @cache
-def _known_units() -> "UnitRegistry[Any]":
+def _known_units() -> "UnitRegistry[float]":
     """Return pint's registry of units, with factors as fractions.
 
     Pi is the fraction that the floating-point number has.
     """
     import pint
 
-    known_units: UnitRegistry[Any] = pint.UnitRegistry(
+    known_units: UnitRegistry[float] = pint.UnitRegistry(
         None, non_int_type=Fraction, on_redefinition="ignore"
     )
     known_units.load_definitions(Path(pint.__file__).with_name("default_en.txt"))

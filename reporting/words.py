@@ -7,6 +7,9 @@ from math import floor, isfinite, log10
 LONGEST_FACT = 60
 """Longest text of a value in `brief`, in characters."""
 
+WHOLE_FROM, POWERS_FROM = 1e3, 1e7
+"""Numbers from which on the whole part is written, and from which on a power of ten."""
+
 MOST_LISTED = 30
 """Largest number of words that `comma_list` writes out."""
 
@@ -106,14 +109,25 @@ def parameter_title(name: str) -> str:
 
 
 def number(value: object) -> str:
-    """Return a table cell: a float to five digits, a text as it is, a dash for None."""
+    """Return a table cell: a float as `significant` writes it, a text as it is, a dash for None."""
     if value is None:
         return "—"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return _with_minus_sign(f"{value:.5g}")
+        return significant(value)
     return str(value)
+
+
+def significant(value: float) -> str:
+    """Return a number with three significant digits, and its whole part from 1,000 on.
+
+    The whole part is kept because large numbers of reports, such as logarithms of evidence, are
+    compared by their difference.
+    """
+    if WHOLE_FROM <= abs(value) < POWERS_FROM:
+        return _with_minus_sign(f"{value:.0f}")
+    return _with_minus_sign(f"{value:.3g}")
 
 
 def rounded(value: float, deviation: float) -> str:

@@ -1,7 +1,9 @@
 """Pages use the terms of the glossary, their links lead somewhere, the picture is what its script draws."""
 
+import ast
 import re
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,7 +26,8 @@ def places(page: Path) -> set[str]:
     for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE):
         plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").strip().lower()
         name = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
-        found.add(next(f"{name}{end}" for end in ("", "-1", "-2", "-3") if f"{name}{end}" not in found))
+        numbered_names = (f"{name}-{number}" for number in count(1))
+        found.add(next(place for place in chain([name], numbered_names) if place not in found))
     return found
 
 
@@ -93,3 +96,29 @@ def test_the_committed_picture_is_what_the_script_draws():
     drawn = whole.draw()
     ElementTree.fromstring(drawn)
     assert (IMAGES / "whole.svg").read_text(encoding="utf-8") == drawn
+
+
+EXPLAINED = [
+    page for folder in ("explanation", "reference") for page in sorted((ROOT / "docs" / folder).glob("*.md"))
+]
+CALL = re.compile(r"(?<![\w.])([A-Za-z_][\w.]*)\(")
+"""A call such as `operators.mass(`, with its name."""
+OF_PYTHON = {"help"}
+
+
+@cache
+def defined_names() -> set[str]:
+    """Return the names of all functions and classes of the project."""
+    names = set()
+    for package in ("calibration", "discrepancy", "fe", "fmu_asset", "reporting", "twin_master", "uav_twin"):
+        for file in (ROOT / package).rglob("*.py"):
+            nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+            names |= {node.name for node in nodes if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    return names
+
+
+@pytest.mark.parametrize("page", EXPLAINED, ids=lambda page: page.stem)
+def test_calls_in_the_text_of_a_page_are_functions_of_the_project(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    called = [name.split(".")[-1] for span in re.findall(r"`([^`\n]+)`", text) for name in CALL.findall(span)]
+    assert {*called} - defined_names() - OF_PYTHON == set()

@@ -18,8 +18,11 @@ from reporting.words import number
 from twin_master.command_options import (
     CalibrationOption,
     ClusterOption,
+    EstimatorOption,
     LibraryOption,
+    PolicyOption,
     SeedOption,
+    SensorModelOption,
     ViewOption,
     WorkersOption,
     complete_scenario,
@@ -29,6 +32,7 @@ from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_b
 
 if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
+    from twin_master.mission.parts import TwinParts
     from twin_master.store.writing import RunOutcome
 
 
@@ -126,13 +130,9 @@ def run(
     ] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
-    policy: Annotated[
-        Path | None,
-        typer.Option(
-            "--policy",
-            help="Fly this policy, a file of `uav-twin plan --out`, without planning.",
-        ),
-    ] = None,
+    policy: PolicyOption = None,
+    sensor_model: SensorModelOption = None,
+    estimator: EstimatorOption = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report.
 
@@ -140,6 +140,7 @@ def run(
     """
     from twin_master.assets.resolution import Overrides
     from twin_master.fleet.plan import ensemble, seed_range
+    from twin_master.mission.parts import TwinParts
 
     scenario, ssp = _scenario_and_ssp(scenario, with_scenario)
     overrides = Overrides(
@@ -153,11 +154,12 @@ def run(
         library=library,
         learnt=learnt,
     )
+    parts = TwinParts(policy, sensor_model, estimator)
     if seeds is not None:
-        has_other_options = resume is not None or seed is not None or policy is not None or view
+        has_other_options = resume is not None or seed is not None or view
         if scenario is None or has_other_options:
             raise _wrong_use_of_seeds()
-        fleet = ensemble(scenario, seed_range(seeds), overrides)
+        fleet = ensemble(scenario, seed_range(seeds), overrides).with_parts(parts)
         engine = choose_engine(workers, cluster)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
@@ -168,17 +170,17 @@ def run(
         )
     has_changes = out is not None or policy is not None or overrides != Overrides()
     if resume is None:
-        folder, fly_mission = _new_mission(scenario, out, overrides, policy, replace=replace)
+        folder, fly_mission = _new_mission(scenario, out, overrides, parts, replace=replace)
     else:
         folder = resume
-        fly_mission = _resumed_mission(scenario, folder, has_changes=replace or has_changes)
+        fly_mission = _resumed_mission(scenario, folder, parts, has_changes=replace or has_changes)
     _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
 
 
 def _wrong_use_of_seeds() -> typer.BadParameter:
     """Return the error that options do not go together with --seeds."""
     return typer.BadParameter(
-        "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor --view.",
+        "many seeds need a scenario, and neither --resume (repeat the command), --seed nor --view.",
         param_hint="--seeds",
     )
 
@@ -187,7 +189,7 @@ def _new_mission(
     scenario_name: str | None,
     out: Path | None,
     overrides: "Overrides",
-    policy: Path | None,
+    parts: "TwinParts",
     *,
     replace: bool,
 ) -> "tuple[Path, Callable[..., RunOutcome]]":
@@ -199,11 +201,11 @@ def _new_mission(
         raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
     loaded = load_scenario(scenario_name)
     folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-    return folder, partial(fly, loaded, folder, overrides, policy=policy, replace=replace)
+    return folder, partial(fly, loaded, folder, overrides, **vars(parts), replace=replace)
 
 
 def _resumed_mission(
-    scenario_name: str | None, folder: Path, *, has_changes: bool
+    scenario_name: str | None, folder: Path, parts: "TwinParts", *, has_changes: bool
 ) -> "Callable[..., RunOutcome]":
     """Return the function that continues an interrupted run."""
     from twin_master.scenario.reading import load_scenario
@@ -215,7 +217,13 @@ def _resumed_mission(
             "a run is continued with what its folder holds: give nothing beside it that would change it.",
             param_hint="--resume",
         )
-    return partial(resume, folder, loaded)
+    return partial(
+        resume,
+        folder,
+        loaded,
+        sensor_model=parts.sensor_model,
+        estimator=parts.estimator,
+    )
 
 
 def _fly_and_print_mission(
@@ -287,15 +295,17 @@ def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
 
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
+    from twin_master.store.printed_figures import printed_figures
+
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    for figure in outcome.figures:
-        reference = printed_value(figure.reference, figure.unit)
+    for figure, printed in zip(outcome.figures, printed_figures(outcome.figures), strict=True):
+        reference = f"{printed.reference} {figure.unit}".strip() if printed.reference else ""
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
-        value = printed_value(figure.value, figure.unit, missing="none")
+        value = "none" if figure.value is None else f"{printed.value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
-    terminal.print_table(["figure", "this run", "reference"], rows + _timing_rows(outcome))
+    terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
     terminal.say(f"The twin {outcome.control}.")
     if outcome.origin.differ:
         terminal.say(

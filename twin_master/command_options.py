@@ -51,6 +51,31 @@ LibraryOption = Annotated[
         help="Believe this observation library, made by `uav-twin library sample`.",
     ),
 ]
+PolicyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--policy",
+        metavar="FILE or NAME",
+        help="Fly this policy without planning: a file of `uav-twin plan --out`, or MODULE:NAME "
+        "or FILE.py:NAME of an array or a function.",
+    ),
+]
+SensorModelOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor-model",
+        metavar="NAME",
+        help="Believe this sensor model, MODULE:NAME or FILE.py:NAME.",
+    ),
+]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        metavar="NAME",
+        help="Believe by this estimator, MODULE:NAME or FILE.py:NAME.",
+    ),
+]
 SeedOption = Annotated[
     int | None,
     typer.Option("--seed", min=0, help="Seed of the run; by default that of the scenario."),

@@ -22,8 +22,11 @@ from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
     ClusterOption,
+    EstimatorOption,
     FleetFolderOption,
     FleetSeedOption,
+    PolicyOption,
+    SensorModelOption,
     ViewOption,
     WorkersOption,
 )
@@ -247,14 +250,19 @@ def run(
     ] = False,
     no_report: NoReportOption = False,
     json: JsonOption = False,
+    policy: PolicyOption = None,
+    sensor_model: SensorModelOption = None,
+    estimator: EstimatorOption = None,
 ) -> None:
     """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped.
 
     Example: `uav-twin fleet run fleet.toml --workers 2`
     """
     from twin_master.fleet.plan import load_fleet
+    from twin_master.mission.parts import TwinParts
 
-    fleet = load_fleet(file, seed)
+    parts = TwinParts(policy, sensor_model, estimator)
+    fleet = load_fleet(file, seed).with_parts(parts)
     engine = choose_engine(workers, cluster)
     fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
 
@@ -446,7 +454,7 @@ def _print_figures(figures: Figures) -> None:
 
     rows = figure_rows(figures)
     if rows:
-        terminal.print_table(["figure (SI)", *figures], rows)
+        terminal.print_table(["result", *figures], rows)
 
 
 _POLLING_INTERVAL = 0.05

@@ -183,13 +183,14 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
         If packages have changed; the sentence names them.
     """
     recorded = config["provenance"]
-    current = collect_provenance(seed).as_dict()
-    for table in ("versions", "source_hashes"):
+    current = collect_provenance(seed)
+    current_tables = {"versions": current.versions, "source_hashes": current.source_hashes}
+    for table, current_values in current_tables.items():
         recorded_values = recorded.get(table)
         if not isinstance(recorded_values, dict):
             recorded_values = {}
         changed = set()
-        for name, value in current[table].items():
+        for name, value in current_values.items():
             if recorded_values.get(name) != value:
                 changed.add(name)
         names = sorted(changed - HARMLESS_PACKAGES)
@@ -265,6 +266,7 @@ def new_run_folder(
     *,
     replace: bool,
     watched: bool = False,
+    parts: Mapping[str, str] | None = None,
 ) -> Iterator[LockedRun]:
     """Create and lock the folder of a run or a watch.
 
@@ -283,6 +285,8 @@ def new_run_folder(
         Whether to replace an existing run folder.
     watched : bool
         Whether a real asset is watched.
+    parts : mapping of str to str, optional
+        How the parts of the twin are called that a user has given in the place of the scenario's.
 
     Raises
     ------
@@ -292,6 +296,8 @@ def new_run_folder(
     config: JsonObject = {"kind": KIND, "format": 1}
     if watched:
         config["watched"] = True
+    if parts:
+        config["parts"] = dict(parts)
     config["scenario"] = resolved.portable().to_dict()
     config["scenario_file"] = dict(file)
     config["provenance"] = collect_provenance(resolved.mission.seed).as_dict()

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
@@ -33,14 +32,13 @@ from twin_master.assets.resolution import (
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
+from twin_master.mission.parts import GivenEstimator, GivenPolicy, GivenSensorModel, TwinParts
 from twin_master.mission.planning import encode_policy, read_policy
 from twin_master.mission.preparation import Knowledge, prepare_knowledge, save_knowledge
 from twin_master.mission.steps import History
-from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.kinds import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import truth_mismatch
 from twin_master.store.writing import (
@@ -64,7 +62,9 @@ def fly(
     folder: Path | str | None = None,
     overrides: Overrides | Mapping[str, Any] | None = None,
     *,
-    policy: ArrayLike | BeliefPolicy | Path | None = None,
+    policy: GivenPolicy | None = None,
+    sensor_model: GivenSensorModel | None = None,
+    estimator: GivenEstimator | None = None,
     replace: bool = False,
     report: bool = True,
     progress: Progress | None = None,
@@ -81,10 +81,18 @@ def fly(
     overrides : Overrides or mapping, optional
         What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu":
         "wing.fmu"}``.
-    policy : (S, U) array, BeliefPolicy or Path, optional
+    policy : (S, U) array, BeliefPolicy, callable, Path or str, optional
         The policy that is flown instead of a plan: p(U | D), row-stochastic, states in the order of
-        `Knowledge.model.states`, controls in that of the scenario; or a policy on the belief, or
-        its file. The run folder keeps it.
+        `Knowledge.model.states`, controls in that of the scenario; or a policy on the belief; or a
+        function that returns a policy for a `GraphicalModel`; or the file or the name of any of
+        these. The run folder keeps the policy.
+    sensor_model : GaussianSensorModel, callable or str, optional
+        The sensor model in the place of the scenario's: an object, a function that makes it of what
+        the twin knows (see `prepare_twin`), or the name of either.
+    estimator : Estimator, callable or str, optional
+        The estimator of the belief in the place of the scenario's: an object, a function that makes
+        it of what the twin knows, or the name of either. A name is ``MODULE:NAME``,
+        ``FILE.py:NAME``, or that of an entry point.
     replace : bool
         Whether to replace an existing run folder.
     report : bool
@@ -111,27 +119,36 @@ def fly(
     resolved = resolve_scenario(loaded, overrides)
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
+    parts = TwinParts(policy, sensor_model, estimator)
+    parts.with_objects()  # so that a wrong name is refused before the folder is made
     policy_files = {}
-    if policy is not None:
-        model = build_graphical_model(resolved)
-        checked_policy = read_policy(policy, model) if isinstance(policy, Path) else policy
-        policy_files[POLICY_NAME] = encode_policy(checked_policy, model)
+    model = build_graphical_model(resolved)
+    policy_on_states = parts.policy_for(model)
+    if policy_on_states is not None:
+        policy_files[POLICY_NAME] = encode_policy(policy_on_states, model)
     if loaded.remark:
         progress.note(loaded.remark)
     run_folder.restore(folder, progress)
     source = asset_source(resolved)
     source.check()  # before the folder is made, so that missing input leaves none behind
     new_folder = run_folder.new_run_folder(
-        resolved, loaded.file, folder, source.files() | policy_files, replace=replace
+        resolved,
+        loaded.file,
+        folder,
+        source.files() | policy_files,
+        replace=replace,
+        parts=parts.record(),
     )
     with new_folder as locked:
-        return _run(folder, locked, progress, begun, report=report)
+        return _run(folder, locked, parts, progress, begun, report=report)
 
 
 def resume(
     folder: Path | str,
     loaded: LoadedScenario | None = None,
     *,
+    sensor_model: GivenSensorModel | None = None,
+    estimator: GivenEstimator | None = None,
     report: bool = True,
     progress: Progress | None = None,
     begun: Begun | None = None,
@@ -144,6 +161,8 @@ def resume(
         The run folder.
     loaded : LoadedScenario, optional
         The scenario that the user expects to be flown; it is compared with that of the folder.
+    sensor_model, estimator : optional
+        The same as for `fly`, if the run was begun with any.
     report : bool
         Whether to write the report.
     progress : Progress, optional
@@ -154,9 +173,10 @@ def resume(
     Raises
     ------
     NotResumableError
-        If the folder holds no run, or one of another scenario or another version.
+        If the folder holds no run, or one of another scenario, other parts or another version.
     """
     folder = Path(folder)
+    parts = TwinParts(None, sensor_model, estimator)
     progress = progress or SilentProgress()
     run_folder.restore(folder, progress)
     with run_folder.hold_run_folder(folder, loaded) as locked:
@@ -165,12 +185,14 @@ def resume(
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
         run_folder.check_versions(folder, locked.config, locked.scenario.mission.seed)
-        return _run(folder, locked, progress, begun, report=report)
+        parts.check_same(locked.config.get("parts", {}), folder)
+        return _run(folder, locked, parts, progress, begun, report=report)
 
 
 def _run(
     folder: Path,
     locked: run_folder.LockedRun,
+    parts: TwinParts,
     progress: Progress,
     begun: Begun | None,
     *,
@@ -201,7 +223,10 @@ def _run(
             policy = read_policy(policy_path, build_graphical_model(scenario))
     config = run_folder.record_inputs(folder, locked.config, hashes)
     with timed("calibration"), progress.stage("Calibrating and planning"):
-        knowledge = _prepare_knowledge(folder, config, scenario, source, policy, progress)
+        knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy, parts)
+        _note_mismatches(config, knowledge, source, progress)
+        save_knowledge(folder, knowledge)
+        _compile_twin(knowledge)
     with timed("mission"):
         result = _fly(folder, config, knowledge, source, progress)
     with timed("store"), progress.stage("Storing"):
@@ -226,16 +251,11 @@ def _run(
     return read_outcome(folder)
 
 
-def _prepare_knowledge(
-    folder: Path,
-    config: run_folder.JsonObject,
-    scenario: Scenario,
-    source: AssetSource,
-    policy: Float | BeliefPolicy | None,
-    progress: Progress,
-) -> Knowledge:
-    """Return what the twin knows before its flight, once it is saved in the run folder."""
-    knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
+def _note_mismatches(
+    config: run_folder.JsonObject, knowledge: Knowledge, source: AssetSource, progress: Progress
+) -> None:
+    """Tell the user if the flown asset or the model is not the one that was calibrated."""
+    scenario = knowledge.scenario
     draws = knowledge.draws
     truth = scenario.asset.true_parameters.get(draws.name)
     # The scenario may give the flown asset another parameter than the calibrated one has.
@@ -251,9 +271,6 @@ def _prepare_knowledge(
     )
     if calibrated is not None:
         progress.note(calibrated)
-    save_knowledge(folder, knowledge)
-    _compile_twin(knowledge)
-    return knowledge
 
 
 def _compile_twin(knowledge: Knowledge) -> None:

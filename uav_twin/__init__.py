@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from discrepancy.campaign.reading import read_campaign as read_campaign
     from discrepancy.files.verdict import read_verdict as read_verdict
     from discrepancy.model_choice import load_model as load_model
+    from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
+    from discrepancy.pictures import plot_missing_force as plot_missing_force
     from discrepancy.workflow import investigate as investigate
     from fe.reduction.model_cache import reduced_model as reduced_model
     from fe.structure.affine import natural_frequencies as natural_frequencies
@@ -33,6 +35,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
     from twin_master.fleet.flight import fly_fleet as fly_fleet
     from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
+    from twin_master.fleet.plan import ensemble as ensemble
     from twin_master.fleet.reading import open_fleet as open_fleet
     from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin as prepare_twin
@@ -44,6 +47,8 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.network.planner import value_iteration as value_iteration
     from twin_master.network.sensor_model import GaussianSensorModel as GaussianSensorModel
     from twin_master.network.twin import Twin as Twin
+    from twin_master.pictures import plot_belief as plot_belief
+    from twin_master.pictures import plot_residuals as plot_residuals
     from twin_master.report.page import report_figures as report_figures
     from twin_master.report.page import write_report as write_report
     from twin_master.scenario.reading import load_scenario as load_scenario
@@ -60,6 +65,8 @@ _HOMES = {
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict",
     "load_model": "discrepancy.model_choice",
+    "calibrate_parameters": "discrepancy.parameters.calibration",
+    "plot_missing_force": "discrepancy.pictures",
     "investigate": "discrepancy.workflow",
     "reduced_model": "fe.reduction.model_cache",
     "natural_frequencies": "fe.structure.affine",
@@ -75,6 +82,7 @@ _HOMES = {
     "ScenarioEnvironment": "twin_master.environment",
     "fly_fleet": "twin_master.fleet.flight",
     "learn_from_fleet": "twin_master.fleet.learn",
+    "ensemble": "twin_master.fleet.plan",
     "open_fleet": "twin_master.fleet.reading",
     "WatchfulEstimator": "twin_master.learning.monitor",
     "prepare_twin": "twin_master.mission.preparation",
@@ -86,6 +94,8 @@ _HOMES = {
     "value_iteration": "twin_master.network.planner",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "Twin": "twin_master.network.twin",
+    "plot_belief": "twin_master.pictures",
+    "plot_residuals": "twin_master.pictures",
     "report_figures": "twin_master.report.page",
     "write_report": "twin_master.report.page",
     "load_scenario": "twin_master.scenario.reading",
@@ -100,7 +110,8 @@ __all__ = list(_HOMES)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    """Return the public names, so that completion in a notebook offers nothing else."""
+    return sorted(__all__)
 
 
 if not TYPE_CHECKING:  # so that type checkers report names that do not exist

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from discrepancy.errors import CampaignFileError, CatalogueError
+from discrepancy.errors import CatalogueError
 from reporting import terminal
 from reporting.command_options import LARGEST_SEED
 from reporting.files import refuse_filled
 from reporting.words import comma_list, counted, in_one_line
 from uav_twin.completion import complete_effect, complete_model
+from uav_twin.import_dialogue import ImportCommand, ImportDialogue
 from uav_twin.options import EffectFilesOption, ModelOption
 
 if TYPE_CHECKING:
@@ -157,8 +158,8 @@ def import_files(
         list[str] | None,
         typer.Option(
             "--held-out",
-            metavar="FILE",
-            help="A file that is kept for proof. May be given several times.",
+            metavar="FILE[=no]",
+            help="A file that is kept for proof, or with =no is not. May be given several times.",
         ),
     ] = None,
     reference_temperature: Annotated[
@@ -175,6 +176,13 @@ def import_files(
             help="As of `discrepancy run`: columns may be called like its outputs.",
         ),
     ] = None,
+    ask_nothing: Annotated[
+        bool,
+        typer.Option(
+            "--ask-nothing",
+            help="Take the defaults, and ask nothing, as where there is no terminal.",
+        ),
+    ] = False,
 ) -> None:
     """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say.
 
@@ -198,7 +206,7 @@ def import_files(
         "decimal": decimal,
         "interval": interval,
         "begins": begins,
-        "held-out": [f"{name}=yes" for name in held_out or ()],
+        "held-out": [_held_out_answer(text) for text in held_out or ()],
     }
     # The options are answers to questions about columns and files
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
@@ -206,14 +214,11 @@ def import_files(
         answers["reference-temperature"] = {"": reference_temperature}
     understanding = _understand_files(files, answers, model)
     _print_understanding(understanding)
-    # Without a terminal, a question that is still open is an error of `campaign` below
-    is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
+    # Without a terminal, a question that is still open is an error of `campaign`
+    is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive:
-        understanding = _ask_all_questions(understanding)
+        understanding = _ask_and_confirm(ImportCommand(files, out, model), understanding, folder)
     campaign = understanding.campaign(folder.resolve().name)
-    if is_interactive and not typer.confirm(f"Write {folder}?", default=True):
-        terminal.say("Nothing was written.")
-        raise typer.Exit(1)
     write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
     terminal.say(f"Wrote {folder}: {_campaign_size(campaign)}.")
     if understanding.assumed:
@@ -224,10 +229,40 @@ def import_files(
     terminal.say(f"Next: uav-twin discrepancy check {_shell_arguments(folder, model)}")
 
 
+def _ask_and_confirm(
+    command: ImportCommand, understanding: "LaboratoryImport", folder: Path
+) -> "LaboratoryImport":
+    """Ask what is open, and whether to write the folder; return the import with the answers.
+
+    Raises
+    ------
+    CampaignFileError, CampaignDataError
+        If no campaign can be made with the answers.
+    typer.Exit
+        If the user stops the dialogue, or wants nothing to be written.
+    """
+    dialogue = ImportDialogue(command, understanding)
+    has_asked = dialogue.ask_all()
+    if has_asked:
+        _print_understanding(dialogue.understanding)
+    dialogue.understanding.campaign(folder.resolve().name)  # wrong files are told before
+    if has_asked:
+        dialogue.print_repetition()
+    if not dialogue.confirm(f"Write {folder}?"):
+        terminal.say("Nothing was written.")
+        raise typer.Exit(1)
+    return dialogue.understanding
+
+
 def _campaign_size(campaign: "Campaign") -> str:
     """Return how many trials and channels a campaign has, as a text."""
     trials = counted(len(campaign.trials), "trial")
     return f"{trials}, {counted(len(campaign.channels), 'channel')}"
+
+
+def _held_out_answer(text: str) -> str:
+    """Return FILE=yes or FILE=no for the text of `--held-out`, which may be FILE alone."""
+    return text if text.endswith(("=yes", "=no")) else f"{text}=yes"
 
 
 def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
@@ -273,46 +308,6 @@ def _understand_files(
         return understanding
     quantity_of_output = choose_model(model).model.output_quantity
     return LaboratoryImport(understanding.sheets, answers, quantity_of_output)
-
-
-def _ask_all_questions(understanding: "LaboratoryImport") -> "LaboratoryImport":
-    """Ask the user all open questions about the files; return the import with the answers.
-
-    Assumptions are defaults that the user may change; they are asked, too. If anything was asked,
-    the result is printed again.
-    """
-    if not understanding.questions and not understanding.assumptions:
-        return understanding
-    while understanding.questions or understanding.assumptions:
-        understanding = _ask_one_question(understanding)
-    _print_understanding(understanding)
-    return understanding
-
-
-def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
-    """Ask the user the next question about the files, and return the import with the answer.
-
-    Questions without a default come first. The questions with a default are the assumptions of the
-    import; an empty line accepts the default. If an answer is invalid, an error is printed, and
-    the import is returned unchanged.
-    """
-    # Questions and assumptions have the key (option, form of its value)
-    if understanding.questions:
-        option, expected = next(iter(understanding.questions))
-        subject = understanding.questions[option, expected][0]
-        default = None
-    else:
-        option, expected = next(iter(understanding.assumptions))
-        subject, default = next(iter(understanding.assumptions[option, expected].items()))
-    question = f"{option} ({expected})"
-    if subject:
-        question = f"{subject}, {question}"
-    answer: str = typer.prompt(question, default=default)
-    try:
-        return understanding.with_answer(option, subject, answer.strip())
-    except CampaignFileError as error:
-        typer.secho(str(error), fg="red", err=True)
-        return understanding
 
 
 _DECIMAL_MARKS = {".": "points", ",": "commas"}

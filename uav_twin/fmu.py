@@ -276,7 +276,7 @@ def _build_wing(
     The parameters are the options of `fmu build`. All options are checked before the reduced model
     of the wing is computed, which can take minutes.
     """
-    from calibration.result.file import load_calibration, tailoring
+    from calibration.result.file import Tailoring, load_calibration, tailoring
     from fe.wing.design import load_design
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
@@ -291,7 +291,7 @@ def _build_wing(
         platforms.append("win64")
     effects = None if patch is None else load_patch(patch)
     check_form(kind, version, interface, patched=effects is not None, platforms=platforms)
-    tailored: dict[str, Any] = {}
+    tailored: Tailoring = {}
     if calibration is None:
         wing_design = load_design(design)
     else:

@@ -63,7 +63,7 @@ def draw_structure() -> Drawing:
 
 def draw_effect() -> Drawing:
     """Draw the residual of the held-out release, before and after friction is named."""
-    investigation = notebook("name_an_effect", "investigate(").names["found"]
+    investigation = notebook("name_an_effect", "investigate(").names["investigation"]
     curves = (
         (investigation.before, REFERENCE, "model as it was"),
         (investigation.after, PAST, "with friction"),
@@ -94,7 +94,7 @@ def draw_effect() -> Drawing:
 
 def draw_missing_force() -> Drawing:
     """Draw the missing force of the same releases, with the law through it."""
-    investigation = notebook("name_an_effect", "investigate(").names["found"]
+    investigation = notebook("name_an_effect", "investigate(").names["investigation"]
     force = np.concatenate(
         [force_of_trial.force for force_of_trial in investigation.missing.courses]
     )

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypedDict, get_type_hints
 
 import numpy as np
 import xarray as xr
@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from calibration.errors import CalibrationError, CalibrationRecordError
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, STATE, Calibration
+from fe.runtime.state import DigitalState
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_bytes
@@ -246,7 +247,15 @@ RESOURCE_NAME = "calibration.json"
 _GRID_POINTS = 401
 
 
-def tailoring(calibration: Calibration) -> dict[str, Any]:
+class Tailoring(TypedDict, total=False):
+    """Arguments of `pack_wing` (`fmu_asset`) for the FMU of a calibrated wing."""
+
+    state: DigitalState
+    note: str
+    resources: Mapping[str, bytes]
+
+
+def tailoring(calibration: Calibration) -> Tailoring:
     """Return the arguments of `pack_wing` (`fmu_asset`) for the FMU of a calibrated wing.
 
     The FMU starts at the posterior means of e, masses and damping. Its description contains the
@@ -277,7 +286,7 @@ def description(calibration: Calibration) -> str:
     return f"Calibrated for the wing '{calibration.asset}' (mean +- standard deviation): {figures}."
 
 
-def plain_record(calibration: Calibration) -> dict[str, Any]:
+def plain_record(calibration: Calibration) -> dict[str, object]:
     """Return a calibration as plain data: its figures with intervals, and the correlations."""
     figures = {
         figure.name: {
@@ -308,7 +317,7 @@ def plain_record(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
+def run_record(calibration: Calibration, parameter: str) -> dict[str, object]:
     """Return the content of `calibration.json` of a run folder.
 
     Parameters
@@ -328,7 +337,7 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
     }
 
 
-def _prior_record(calibration: Calibration, name: str) -> dict[str, Any]:
+def _prior_record(calibration: Calibration, name: str) -> dict[str, object]:
     """Return the stated prior of a parameter, or the moments of a quantity in the prior samples."""
     for prior in calibration.priors:
         if prior.name == name:

@@ -144,9 +144,6 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         page.add_notice(sentence)
     if not result.findings:
         page.add_paragraph("Noise and priors allow what is left, and every parameter is told.")
-    add_titled_table(page, parameters_table(result))
-    for line in correlation_lines(result):
-        page.add_paragraph(f"{line}.")
     parameter_columns, titles = drawn_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
@@ -167,8 +164,10 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         caption="The same with samples of the prior; the histograms have scales of their own.",
     )
     add_figure(page, prior_and_posterior, folder)
+    add_titled_table(page, parameters_table(result))
+    for line in correlation_lines(result):
+        page.add_paragraph(f"{line}.")
     page.add_section("What is left of the readings")
-    add_titled_table(page, readings_table(result))
     if result.readings:
         readings = ReportFigure(
             "readings",
@@ -180,11 +179,14 @@ def begun_page(result: Calibration, folder: Path) -> Page:
             ),
         )
         add_figure(page, readings, folder)
+    add_titled_table(page, readings_table(result))
     add_titled_table(page, channels_table(result))
     return page
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
     """Add the last section, the origin of the calibration, to its page, and write the page."""
+    page.begin_fold("Where the calibration comes from")
     add_titled_table(page, origin_table(result))
+    page.end_fold()
     atomic_write_text(folder / REPORT_NAME, page.render())

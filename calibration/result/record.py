@@ -4,9 +4,9 @@ A wing's calibration from the folder of its laboratory and any model's from a ca
 class.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import xarray as xr
@@ -18,7 +18,12 @@ from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
+from reporting.notebook import html_table, new_panels
 from reporting.words import brief, comma_list, plus_minus
+
+if TYPE_CHECKING:  # it takes long to import
+    from matplotlib.axes import Axes
 
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
 """The method of the samples: quadrature of one parameter and the others given it, the Gaussian at
@@ -194,7 +199,7 @@ class Calibration:
     channels: tuple[ChannelFit, ...]
     source: str
     seed: int
-    provenance: Mapping[str, Any]
+    provenance: JsonRecord
     design_hash: str = ""
     quantities: tuple[CalibratedFigure, ...] = ()
     readings: tuple[FigureReading, ...] = ()
@@ -209,6 +214,43 @@ class Calibration:
             parameters=[prior.name for prior in self.priors],
             samples=len(self.samples),
         )
+
+    def _repr_html_(self) -> str:
+        """Return prior and posterior of each parameter, for a notebook."""
+        rows = []
+        for prior in self.priors:
+            name = prior.name
+            posterior = plus_minus(self.mean(name), self.standard_deviation(name))
+            stated = plus_minus(*self.prior_moments(name))
+            rows.append([prior.figure.title, stated, posterior, prior.figure.shown_unit])
+        title = f"Calibration of {self.asset}: parameters of {self.model}"
+        return html_table(title, ("parameter", "prior", "posterior", "unit"), rows, self.findings)
+
+    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+        """Draw the prior and the posterior of each parameter as densities of their samples.
+
+        Parameters
+        ----------
+        axes : Axes or sequence of Axes, optional
+            A panel for each parameter; new ones of pyplot by default.
+
+        Returns
+        -------
+        list of Axes
+            The panels.
+        """
+        from reporting import figures as style
+
+        panels = new_panels(len(self.priors), axes)
+        for panel, prior in zip(panels, self.priors, strict=True):
+            for is_prior, color in ((True, style.REFERENCE), (False, style.PAST)):
+                samples = self.draws_of(prior.name, prior=is_prior)
+                label = "prior" if is_prior else "posterior"
+                panel.hist(samples, bins="auto", density=True, color=color, alpha=0.6, label=label)
+            panel.set_xlabel(prior.figure.axis_title)
+            panel.set_ylabel("density")
+        panels[0].legend(frameon=False)
+        return panels
 
     def __post_init__(self) -> None:
         check_name(self.asset)

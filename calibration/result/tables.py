@@ -38,17 +38,17 @@ def parameters_table(result: Calibration) -> TitledTable:
         return f"{percent:.{decimals}f} %"
 
     columns: list[RecordColumn[ParameterPrior]] = [
-        text_cells("parameter", lambda prior: prior.name),
+        text_cells("parameter", lambda prior: prior.figure.title),
         text_cells("unit", lambda prior: prior.figure.shown_unit),
         number_cells("prior", lambda prior: _prior_text(result, prior.name)),
         number_cells("posterior", posterior),
         number_cells("90 % interval", interval),
-        number_cells("prior left", prior_left),
+        number_cells("left of the prior", prior_left),
     ]
     caption = (
         f"Mean ± standard deviation. The posterior is {PROCEDURES[result.procedure]}; "
-        f"calibration.nc has {len(result.samples)} samples of it. Prior left: standard deviation "
-        "of the posterior over that of the prior."
+        f"calibration.nc has {len(result.samples)} samples of it. Left of the prior: the standard "
+        "deviation of the posterior as a fraction of that of the prior."
     )
     if result.information is not None:
         caption += f" Information gained: {result.information:.2f} nat."
@@ -76,15 +76,18 @@ def readings_table(result: Calibration) -> TitledTable:
                 result.mean(reading.name), result.standard_deviation(reading.name)
             ),
         ),
-        number_cells("in deviations", lambda reading: f"{result.score(reading):+.1f}"),
+        number_cells(
+            "model less reading, in standard deviations",
+            lambda reading: f"{result.score(reading):+.1f}",
+        ),
     ]
     return TitledTable(
         table_of_records(columns, result.readings),
         title="Measured and modelled",
         caption=(
             "Mean ± standard deviation: measured, and of the model before and after the "
-            "calibration. In deviations: the model less the reading, over the standard deviations "
-            "of both."
+            "calibration. The last column is the difference of model and reading over the "
+            "standard deviation of both together."
         ),
     )
 

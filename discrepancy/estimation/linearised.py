@@ -339,6 +339,8 @@ class LinearisedTrial:
         structure = self.structure
         step_count = len(trial.fine_time) - 1
         drift = np.zeros((step_count, len(by_input_at_begin[0]), self.weight_count))
+        by_input_at_begin = by_input_at_begin[:, :, structure]
+        by_input_at_end = by_input_at_end[:, :, structure]
         interval_of_substep = interval_of_sample[np.arange(step_count) // trial.substeps + 1]
         for unknown, derivative in enumerate(trial.system_derivatives):
             if derivative is None:
@@ -348,16 +350,11 @@ class LinearisedTrial:
             for port, force in self.trajectory.forces.items():
                 rate_change = rate_change - np.outer(force, derivative.actions[port])
             rate_change = rate_change / self.force_filter.state_units
-            # over each substep j: matrix (a, b) of the scaled states times rate (b,)
-            state_change = np.einsum(
-                "jab,jb->ja",
-                by_input_at_begin[interval_of_substep, :, structure],
-                rate_change[:-1],
+            state_change = _change_over_substeps(
+                by_input_at_begin, interval_of_substep, rate_change[:-1]
             )
-            state_change += np.einsum(
-                "jab,jb->ja",
-                by_input_at_end[interval_of_substep, :, structure],
-                rate_change[1:],
+            state_change += _change_over_substeps(
+                by_input_at_end, interval_of_substep, rate_change[1:]
             )
             # linear about u0 = `linearisation_point`: the change is proportional to u - u0
             drift[:, :, 1 + unknown] += state_change
@@ -617,6 +614,25 @@ class SmoothedTrial:
     law_forces: Mapping[int, FloatArray]
     missing_force_deviations: Mapping[int, FloatArray]
     state_deviation: FloatArray
+
+
+def _change_over_substeps(
+    by_input: FloatArray, interval_of_substep: IntArray, rates: FloatArray
+) -> FloatArray:
+    """Return the change (J, n) of the state over each of J substeps by an input to its rate.
+
+    Parameters
+    ----------
+    by_input : (K, n, s) array
+        The change for a unit of the input to each of s states, for K lengths of substeps.
+    interval_of_substep : (J,) array of int
+        The index of the length of each substep.
+    rates : (J, s) array
+        The input in each substep.
+    """
+    if len(by_input) == 1:  # nearly all records: no matrix needs to be copied for each substep
+        return np.asarray(rates @ by_input[0].T)
+    return np.asarray(np.einsum("jab,jb->ja", by_input[interval_of_substep], rates))
 
 
 def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -18,7 +18,8 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
 
 from .effects import HALF_DIFFERENCE, EffectLaws
-from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
+from .estimator import COARSE_FACTORS, SPEED_WINDOWS, MotionEstimator
+from .gauss_newton import EstimatorStart, MotionEstimate
 from .linearised import SmoothedTrial, Trajectory
 
 MOST_REFINED = 4
@@ -102,7 +103,46 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     trials, estimate = _linearise_about_estimate(
         search, hypothesis.candidate, hypothesis.linear_trials, first
     )
-    return _hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
+    return hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
+
+
+def estimate_extended_hypothesis(
+    search: ForceSearch, hypothesis: ForceHypothesis, base: ForceHypothesis
+) -> ForceHypothesis | None:
+    """Return a hypothesis that adds an effect to an estimated one, estimated with the motion.
+
+    The estimate begins with the motion and the small missing forces of the base.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypothesis : ForceHypothesis
+        The hypothesis with one more effect, as the search has fitted it.
+    base : ForceHypothesis
+        The hypothesis without that effect, estimated with the motion.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if its laws are not possible along the motion.
+    """
+    laws, estimator = laws_and_estimator(search, hypothesis.candidate, base.linear_trials)
+    start = EstimatorStart(
+        hypothesis.effect, hypothesis.shared, _trajectories(base), base.processes
+    )
+    estimate = estimator.polish(laws, start, base.speed_window or SPEED_WINDOWS[-1])
+    if estimate is None:
+        return None
+    return hypothesis_of_estimate(search, hypothesis.candidate, base.linear_trials, estimate)
+
+
+def _trajectories(hypothesis: ForceHypothesis) -> tuple[Trajectory, ...]:
+    """Return the motion of each trial of a hypothesis as a trajectory of the estimator."""
+    return tuple(
+        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
+        for motion in hypothesis.motions
+    )
 
 
 def _estimate_about_point_of_search(
@@ -128,11 +168,8 @@ def _estimate_about_point_of_search(
         The more probable estimate; None if the laws are not possible along the motion.
     """
     trials = hypothesis.linear_trials
-    laws, estimator = _laws_and_estimator(search, hypothesis.candidate, trials)
-    trajectories = tuple(
-        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
-        for motion in hypothesis.motions
-    )
+    laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
+    trajectories = _trajectories(hypothesis)
     processes = {
         port: replace(
             process,
@@ -156,10 +193,13 @@ def _estimate_about_point_of_search(
     estimates = []
     for beginning in beginnings:
         start = EstimatorStart(hypothesis.effect, hypothesis.shared, trajectories, beginning)
-        estimate = estimator.estimate(laws, start)
+        estimate = estimator.follow_to_small_forces(laws, start)
         if estimate is not None:
             estimates.append(estimate)
-    return max(estimates, key=lambda estimate: estimate.log_evidence, default=None)
+    if not estimates:
+        return None
+    best = max(estimates, key=lambda estimate: estimate.log_evidence)
+    return estimator.tune_processes(laws, best, COARSE_FACTORS)
 
 
 def _linearise_about_estimate(
@@ -189,15 +229,19 @@ def _linearise_about_estimate(
     estimate : MotionEstimate
         The estimate in these trials; the given one if none can be made in them.
     """
-    for _ in range(MOST_LINEARISATIONS):
+    for number in range(MOST_LINEARISATIONS):
         point = search.point_of_unknowns(estimate.shared, estimate.local)
         point_of_trials = trials.trials[0].linearisation_point[: len(point.shared)]
-        if np.all(np.abs(point.shared - point_of_trials) < SAME_POINT):
+        is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))
+        if is_same_point and number > 0:
             break
-        next_trials = search.column_builder.trials_about(point)
-        laws, estimator = _laws_and_estimator(search, candidate, next_trials)
+        next_trials = trials if is_same_point else search.column_builder.trials_about(point)
+        laws, estimator = laws_and_estimator(search, candidate, next_trials)
         start = start_in_other_trials(estimate, trials.trials, next_trials.trials)
-        next_estimate = estimator.estimate_nearby(laws, start)
+        if number == 0:
+            next_estimate = estimator.estimate_nearby(laws, start)
+        else:
+            next_estimate = estimator.polish(laws, start, estimate.speed_window)
         if next_estimate is None:
             break
         trials, estimate = next_trials, next_estimate
@@ -235,10 +279,20 @@ def start_in_other_trials(
     return EstimatorStart(estimate.effect, estimate.shared, tuple(trajectories), estimate.processes)
 
 
-def _laws_and_estimator(
+def laws_and_estimator(
     search: ForceSearch, candidate: Candidate, trials: LinearTrials
 ) -> tuple[EffectLaws, MotionEstimator]:
-    """Return the laws of a hypothesis in some trials, and the estimator of these trials."""
+    """Return the laws of a hypothesis in some trials, and the estimator of these trials.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    candidate : Candidate
+        The effects of the hypothesis.
+    trials : LinearTrials
+        The trials.
+    """
     laws = EffectLaws(
         search.column_builder,
         tuple(trials.trials),
@@ -264,7 +318,7 @@ def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
     )
 
 
-def _hypothesis_of_estimate(
+def hypothesis_of_estimate(
     search: ForceSearch, candidate: Candidate, trials: LinearTrials, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, to which further effects may be added.
@@ -302,6 +356,7 @@ def _hypothesis_of_estimate(
         solution=Solution(estimate.log_evidence, mean, estimate.covariance),
         local=estimate.local,
         motions=motions,
+        speed_window=estimate.speed_window,
     )
 
 

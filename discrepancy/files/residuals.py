@@ -29,6 +29,7 @@ from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
+from reporting.json_file import JsonRecord
 from reporting.netcdf import read_groups
 from reporting.words import one_line
 
@@ -49,7 +50,7 @@ _DAMAGED = (
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
 """Fields of a channel that are written unchanged."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
-_ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
+_ARRAYS: dict[str, dict[str, dict[str, object]]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
 )
 """Dimensions and attributes of the arrays of a trial and of its fit, by name."""
@@ -134,7 +135,7 @@ def _residual_set(tree: xr.DataTree) -> ResidualSet:
     return ResidualSet(channels, tuple(_fitted_trial(tree[name].to_dataset()) for name in names))
 
 
-def _channel_row(channel: Channel) -> dict[str, Any]:
+def _channel_row(channel: Channel) -> dict[str, object]:
     """Return a channel as a row of the attribute `channels`, without its samples at rest.
 
     The row may hold infinities, which Python's JSON writes and reads.
@@ -152,7 +153,7 @@ def _channel_row(channel: Channel) -> dict[str, Any]:
     return {"quantity": channel.quantity, **plain_keys, "noise": noise_row}
 
 
-def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
+def _channel(row: JsonRecord, samples: FloatArray | None) -> Channel:
     """Read a channel from its row of the attribute `channels`; inverse of `_channel_row`.
 
     Parameters
@@ -188,7 +189,7 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
     """
     trial = fitted_trial.trial
     by_row_and_channel = ("row", "channel")
-    variables: dict[str, Any] = {
+    variables: dict[str, object] = {
         "measured": (
             by_row_and_channel,
             trial.values,
@@ -207,7 +208,7 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
             if values is not None:
                 attributes = {key: text for key, text in description.items() if key != "dimensions"}
                 variables[name] = (description["dimensions"], values, attributes)
-    attributes_of_trial: dict[str, Any] = {
+    attributes_of_trial: dict[str, object] = {
         "name": trial.name,
         "kind": trial.kind.value,
         "run": trial.run,

@@ -69,6 +69,10 @@ class StoredVerdict:
             self, verdict=self.verdict, model=self.origin.model, campaign=self.origin.campaign
         )
 
+    def _repr_html_(self) -> str:
+        """Return the verdict, for a notebook."""
+        return self.verdict._repr_html_()
+
 
 @dataclass(frozen=True, repr=False)
 class VerdictFolder(StoredVerdict):

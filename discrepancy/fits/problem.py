@@ -39,6 +39,10 @@ from .trial_data import TrialData, shared_unknowns, stand_in_deviation
 
 MOST_CACHED_RESPONSES = 2000
 """Number of responses that a problem keeps in memory."""
+LARGEST_CACHE = 48e6
+"""Largest memory of these responses; of long records fewer are kept [B]."""
+FEWEST_CACHED_RESPONSES = 40
+"""Number of responses that are kept in any case: those of the derivatives of one fit."""
 LEAST_VARIANCE = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
 
@@ -141,7 +145,11 @@ class Problem:
             for trial in trials
         )
         self.sample_counts = self._sample_counts()
-        self._responses = ResultCache(MOST_CACHED_RESPONSES)
+        # a response has values and rates
+        largest_response = max(2 * data.trial.values.nbytes for data in self.trials)
+        count = int(LARGEST_CACHE / largest_response)
+        count = min(max(count, FEWEST_CACHED_RESPONSES), MOST_CACHED_RESPONSES)
+        self._responses = ResultCache(count)
 
     def _sample_counts(self) -> FloatArray:
         """Return the number of samples (channels,) of each channel in the trials."""
@@ -232,7 +240,7 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the response of a patched model in a trial, without gains and zeros of channels.
 
-        The last `MOST_CACHED_RESPONSES` responses are kept in memory.
+        The last responses are kept in memory, at most `MOST_CACHED_RESPONSES`.
 
         Parameters
         ----------

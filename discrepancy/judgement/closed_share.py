@@ -207,8 +207,7 @@ def rms_errors_text(
     for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
         change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
-        if unit != NOMINAL_UNIT:
-            change = f"{change} {unit}"
+        change = f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
         channel_texts.append(f"{name} {change}")
     remaining = len(names) - CHANNELS_MENTIONED
     if remaining > 0:

@@ -33,6 +33,8 @@ class MissingForces:
     ----------
     problem : Problem
         A problem with trials in motion, whose model has ports.
+    sample_limit : int, optional
+        The number of samples of all trials together to which trials are thinned, if they can be.
 
     Attributes
     ----------
@@ -43,6 +45,8 @@ class MissingForces:
         about their first estimates.
     ports : tuple of str
         The names of the ports.
+    problem_with_laws : Problem
+        The problem as it was given; `problem` has the same trials, and a model without laws.
     model_laws : ModelPatch
         The model's own laws at its ports, which its linear system does not contain.
     point : Point
@@ -52,7 +56,8 @@ class MissingForces:
         The object that linearises the trials, and computes the columns of effects in them.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, sample_limit: int | None = None) -> None:
+        self.problem_with_laws = problem
         linear_model, self.model_laws = problem.model.without_laws()
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
@@ -60,7 +65,9 @@ class MissingForces:
         self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
         self.hypothesis_by_port: dict[str, ForceHypothesis] = {}
-        self.column_builder = ColumnBuilder(self.problem, self.trial_indices, self.model_laws)
+        self.column_builder = ColumnBuilder(
+            self.problem, self.trial_indices, self.model_laws, sample_limit
+        )
         # first estimate, along the motion of the model at the prior means
         self.point = self.problem.prior_mean_point(NO_EFFECTS)
         linear_trials = self.column_builder.trials_about(self.point)

@@ -44,6 +44,9 @@ class ForceHypothesis:
         The unknowns of each trial alone.
     motions : sequence of TrialMotion
         The motion of each trial.
+    speed_window : float or None
+        The half width of the window of speeds over which laws of the speed are averaged, divided by
+        the rms speed, if effects and motion were estimated together; else None.
     """
 
     candidate: Candidate
@@ -54,6 +57,7 @@ class ForceHypothesis:
     solution: Solution
     local: Sequence[FloatArray]
     motions: Sequence[TrialMotion]
+    speed_window: float | None = None
 
     @property
     def effect_covariance(self) -> FloatArray:

@@ -34,7 +34,7 @@ from fe.runtime.sensors import clock_of
 
 from .filtered import Process
 from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
-from .ported_trial import ported_trial
+from .ported_trial import ported_trial, thin_trial
 from .process_search import Processes
 from .trial import PortedTrial, TrialColumn
 
@@ -236,18 +236,29 @@ class ColumnBuilder:
         The indices, in the problem, of the trials in motion.
     model_laws : ModelPatch
         The model's own laws.
+    sample_limit : int, optional
+        The number of samples of all trials together to which trials are thinned, if they can be.
     """
 
     def __init__(
-        self, problem: Problem, trial_indices: Sequence[int], model_laws: ModelPatch
+        self,
+        problem: Problem,
+        trial_indices: Sequence[int],
+        model_laws: ModelPatch,
+        sample_limit: int | None = None,
     ) -> None:
         self.problem = problem
         self.trial_indices = trial_indices
         self.model_laws = model_laws
+        sample_count = sum(len(problem.trials[number].trial.time) for number in trial_indices)
+        self._wanted_stride = 1.0 if sample_limit is None else sample_count / sample_limit
 
     def trials_about(self, point: Point) -> LinearTrials:
         """Return the trials without any effect, linear about values of the unknowns."""
-        trials = [ported_trial(self.problem, number, point) for number in self.trial_indices]
+        trials = []
+        for number in self.trial_indices:
+            trial = ported_trial(self.problem, number, point)
+            trials.append(thin_trial(trial, self._wanted_stride))
         return LinearTrials(trials, self.problem.shared.precision)
 
     def trials_along_motions(
@@ -455,7 +466,7 @@ class ColumnBuilder:
         gains = 1.0 + self.problem.shared.gains(
             shared, self.problem.trials[trial_index].trial.channels
         )
-        return trial.divide_by_noise((patched - response) * gains)
+        return trial.divide_by_noise(((patched - response) * gains)[:: trial.stride])
 
     def _readings_of_sensor_errors(
         self, trial: PortedTrial, motion: TrialMotion, trial_index: int, sensors: ModelPatch
@@ -479,9 +490,14 @@ class ColumnBuilder:
         """
         problem = self.problem
         data = problem.trials[trial_index]
+        # a thinned trial has some of the samples of the record
+        samples = slice(None, None, trial.stride)
+        recorded_trial = data.trial if trial.stride == 1 else data.trial.rows(samples)
         shared, local = self._linearisation_point(trial)
         # the true values at the sensors, and their rates
         response, rates = problem.response(trial_index, shared, local, ModelPatch())
+        response = response[samples]
+        rates = None if rates is None else rates[samples]
         gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
         # readings are divided by the noise and contain the gains: undo both
         explained_readings = trial.readings_of_state(motion.explained_state, motion.law_forces)
@@ -492,7 +508,7 @@ class ColumnBuilder:
         # the readings of the sensors with their errors
         conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
         observed = observe_response(
-            problem.campaign, data.trial, sensors, conditions, Response(true_values, true_rates)
+            problem.campaign, recorded_trial, sensors, conditions, Response(true_values, true_rates)
         )
         change = observed.values - true_values
         # an error of the clock shifts the readings in time: to first order by their rates

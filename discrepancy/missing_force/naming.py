@@ -110,6 +110,7 @@ class ForceSearch(MissingForces):
         self,
         effects: Sequence[Effect],
         on_progress: Callable[[str], None] = lambda message: None,
+        largest_set: int | None = None,
     ) -> list[ForceHypothesis]:
         """Return hypotheses on the missing force, the most probable first, by a beam search.
 
@@ -122,11 +123,13 @@ class ForceSearch(MissingForces):
             The effects.
         on_progress : callable
             The function that takes a line on what is compared, and how much remains.
+        largest_set : int, optional
+            The largest number of effects in a set; by default that of `FOLLOWED_COUNTS`.
         """
         effect_count = len(effects)
         hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.hypothesis_of_all_ports}
         beam = [self.hypothesis_of_all_ports]
-        for followed_count in FOLLOWED_COUNTS:
+        for followed_count in FOLLOWED_COUNTS[:largest_set]:
             best = self._sort_by_score(hypotheses, effect_count)[0]
             extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
@@ -139,6 +142,30 @@ class ForceSearch(MissingForces):
                 break
             beam = ranked[:BEAM_WIDTH]
         return self._sort_by_score(hypotheses, effect_count)
+
+    def extend_hypothesis(
+        self,
+        base: ForceHypothesis,
+        effects: Sequence[Effect],
+        followed_count: int,
+        on_progress: Callable[[str], None] = lambda message: None,
+    ) -> list[ForceHypothesis]:
+        """Return a hypothesis with each promising effect added, the most probable first.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis to which an effect is added.
+        effects : sequence of Effect
+            The effects.
+        followed_count : int
+            The number of effects that are fitted.
+        on_progress : callable
+            The function that takes a line on what is compared.
+        """
+        extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
+        self._fit_promising_effects(base, effects, followed_count, extended_hypotheses, on_progress)
+        return self._sort_by_score(extended_hypotheses, len(effects))
 
     def _fit_promising_effects(
         self,

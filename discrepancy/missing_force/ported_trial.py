@@ -21,11 +21,16 @@ from .trial import ColouredNoise, GainUnknown, PortedTrial
 
 MOST_SUBSTEPS, FEWEST_SUBSTEPS = 16, 4
 """Largest and smallest number of substeps in an interval between two samples."""
+LONG_RECORD, FEWEST_SUBSTEPS_OF_LONG_RECORD = 5000, 2
+"""Number of samples from which on a trial is long, and the smallest number of substeps then. A long
+record is sampled densely, or has slow modes; substeps are what costs time and memory."""
 LARGEST_SUBSTEP_PHASE = 0.15
 """Largest phase of the fastest mode in a substep [rad]."""
 LONGEST_CORRELATION, LEAST_WHITE_SHARE = 2000, 1e-3
 """Largest number of samples over which the correlation of a noise is computed. Least share of its
 variance that is taken as white, so that the filter does not divide by zero."""
+FEWEST_SAMPLES = 200
+"""Number of samples that thinning leaves of a trial at least."""
 HALF_DIFFERENCE = 1e-3
 """Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
 
@@ -119,6 +124,48 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     )
 
 
+def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
+    """Return the largest stride up to a wanted one with which a trial may be thinned.
+
+    The phase of the fastest mode, and that of the motion of each port, changes by at most
+    `LARGEST_SUBSTEP_PHASE` in a substep of the thinned trial. A trial with uneven intervals is not
+    thinned.
+
+    Parameters
+    ----------
+    trial : PortedTrial
+        The trial with all samples.
+    wanted_stride : float
+        The stride with which it would have the wanted number of samples.
+    """
+    lengths, _ = trial.intervals
+    if len(lengths) > 1:
+        return 1
+    interval = float(lengths[0])
+    phase_of_modes = interval * float(
+        np.max(np.abs(np.linalg.eigvals(trial.system.generator)), initial=0.0)
+    )
+    # for a sine, the rms rate of the speed over the rms speed is its angular frequency
+    rms_change = np.sqrt(np.mean(np.diff(trial.port_speeds, axis=0) ** 2, axis=0)) * trial.substeps
+    rms_speed = np.sqrt(np.mean(trial.port_speeds**2, axis=0))
+    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, 1e-300), initial=0.0))
+    # a thinned trial has at least `FEWEST_SUBSTEPS`
+    largest_phase = LARGEST_SUBSTEP_PHASE * max(trial.substeps, FEWEST_SUBSTEPS)
+    longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, 1e-300)
+    stride = int(min(wanted_stride, longest_stride, len(trial.time) / FEWEST_SAMPLES))
+    # the substeps of a thinned trial end at fine stamps of the trial
+    multiple = FEWEST_SUBSTEPS // trial.substeps if trial.substeps < FEWEST_SUBSTEPS else 1
+    return max(1, stride - stride % multiple)
+
+
+def thin_trial(trial: PortedTrial, wanted_stride: float) -> PortedTrial:
+    """Return a trial with fewer samples, if it can be thinned; see `thinning_stride`."""
+    stride = thinning_stride(trial, wanted_stride)
+    if stride == 1:
+        return trial
+    return trial.thinned(stride, max(trial.substeps, FEWEST_SUBSTEPS))
+
+
 def _residual_and_derivatives(
     problem: Problem, trial_index: int, point: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -192,14 +239,17 @@ def _substep_count(system: PortedSystem, time: FloatArray) -> int:
     """Return the number of substeps in an interval between two samples.
 
     The phase of the fastest mode changes by at most `LARGEST_SUBSTEP_PHASE` in a substep, if that
-    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`.
+    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`, in long records
+    fewer.
     """
     interval = float(np.median(np.diff(time)))
     fastest_angular_frequency = float(
         np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
     )
     needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
-    return int(np.clip(needed, FEWEST_SUBSTEPS, MOST_SUBSTEPS))
+    is_long = len(time) > LONG_RECORD
+    fewest = FEWEST_SUBSTEPS_OF_LONG_RECORD if is_long else FEWEST_SUBSTEPS
+    return int(np.clip(needed, fewest, MOST_SUBSTEPS))
 
 
 def _port_motion(

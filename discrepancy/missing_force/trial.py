@@ -12,7 +12,7 @@ column is the change of the readings (N, C) for a unit of one unknown.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -176,6 +176,9 @@ class PortedTrial:
     port_motion_derivatives : mapping of int to (2, F, P) ndarray
         The derivatives of `port_positions` and `port_speeds`, by the number of the unknown in
         `linearisation_point`.
+    stride : int
+        The number of samples of the record from one of the N samples to the next; more than one if
+        the trial is thinned.
     """
 
     name: str
@@ -196,6 +199,46 @@ class PortedTrial:
     linearisation_point: FloatArray = field(default_factory=lambda: np.zeros(0))
     gain_unknowns: Sequence[GainUnknown] = ()
     port_motion_derivatives: Mapping[int, FloatArray] = field(default_factory=dict)
+    stride: int = 1
+
+    def thinned(self, stride: int, substeps: int) -> "PortedTrial":
+        """Return the trial with every `stride`-th sample, at equal intervals.
+
+        The samples that are left out are not averaged: the likelihood of the others stays exact.
+
+        Parameters
+        ----------
+        stride : int
+            The number of samples from one that remains to the next.
+        substeps : int
+            The number of substeps in an interval of the thinned trial. It divides `stride` times
+            the number of substeps of this trial, as the fine stamps are some of this trial's.
+        """
+        time = self.time[::stride]
+        stamp_count = (len(time) - 1) * substeps + 1
+        stamp_stride = stride * self.substeps // substeps
+        assert stamp_stride * substeps == stride * self.substeps
+
+        def at_fine_stamps(series: FloatArray) -> FloatArray:
+            # the stamps are the last axis but one
+            return series[..., ::stamp_stride, :][..., :stamp_count, :].copy()
+
+        return replace(
+            self,
+            time=time,
+            substeps=substeps,
+            residual=self.residual[::stride].copy(),
+            used=self.used[::stride].copy(),
+            shared_derivatives=self.shared_derivatives[:, ::stride].copy(),
+            local_derivatives=self.local_derivatives[:, ::stride].copy(),
+            port_positions=at_fine_stamps(self.port_positions),
+            port_speeds=at_fine_stamps(self.port_speeds),
+            port_motion_derivatives={
+                unknown: at_fine_stamps(derivative)
+                for unknown, derivative in self.port_motion_derivatives.items()
+            },
+            stride=self.stride * stride,
+        )
 
     @cached_property
     def intervals(self) -> SampleIntervals:

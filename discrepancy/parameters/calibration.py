@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,13 +17,14 @@ from calibration.result.record import (
     correlation,
     prior_samples,
 )
+from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LARGEST_DEVIATION_RATIO
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
-from discrepancy.model_choice import ModelChoice
+from discrepancy.model_choice import ModelChoice, choose_model
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
 from discrepancy.search.wide_noise import estimate_residual_process
 from discrepancy.verdict import Gate
@@ -36,8 +38,8 @@ SAMPLES = 1000
 
 
 def calibrate_parameters(
-    campaign: Campaign,
-    choice: ModelChoice,
+    campaign: Campaign | str | Path,
+    model: ModelChoice | str | Path,
     *,
     asset: str | None = None,
     samples: int = SAMPLES,
@@ -50,10 +52,10 @@ def calibrate_parameters(
 
     Parameters
     ----------
-    campaign : Campaign
-        The campaign; its `parameters` replace priors of the model.
-    choice : ModelChoice
-        The model, with its file or source.
+    campaign : Campaign, str or Path
+        The campaign, or its folder; its `parameters` replace priors of the model.
+    model : ModelChoice, str or Path
+        The name or the file of a model, as `load_model` takes it, or the record of a chosen model.
     asset : str, optional
         The name of what was measured; that of the campaign by default.
     samples : int
@@ -73,15 +75,17 @@ def calibrate_parameters(
         If the name of the asset cannot be printed.
     """
     progress = reporter(progress)
-    model = choice.model
+    if not isinstance(campaign, Campaign):
+        campaign = read_campaign(campaign)
+    choice = model if isinstance(model, ModelChoice) else choose_model(model, progress)
     # before the model is evaluated: it may fail for values outside its range
     priors = stated_priors(campaign, choice)
     with progress.stage("Checking the data"):
-        campaign, faults = check_and_prepare(campaign, model, hold_out=False)
+        campaign, faults = check_and_prepare(campaign, choice.model, hold_out=False)
     for fault in faults:
         if fault.fatal:
             raise CampaignDataError(fault.sentence)
-    problem = problem_without_wrong_ends(campaign, model)
+    problem = problem_without_wrong_ends(campaign, choice.model)
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
@@ -92,7 +96,7 @@ def calibrate_parameters(
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
         asset=campaign.name if asset is None else asset,
-        model=model.name,
+        model=choice.model.name,
         model_hash=choice.source_hash,
         procedure=posterior.procedure,
         priors=priors,

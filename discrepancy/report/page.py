@@ -13,7 +13,16 @@ from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.sizes import size_sentence
-from discrepancy.report.text import NAMING, WORDS, added_label, formula, number
+from discrepancy.report.text import (
+    NAMING,
+    WORDS,
+    added_label,
+    estimate_text,
+    formula,
+    number,
+    parameter_text,
+    unit_text,
+)
 from discrepancy.report.verdict_sentences import (
     error_sentence,
     group_members,
@@ -25,7 +34,7 @@ from discrepancy.report.verdict_sentences import (
     remainders_sentence,
     tested_trials,
 )
-from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
+from discrepancy.verdict import Estimate, Gate, NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.record_table import add_titled_table
@@ -130,20 +139,27 @@ def render_report(
             _add_decidability(book, content)
     _add_data(book, investigation)
     page.add_section("Where it comes from")
+    page.begin_fold("Campaign, model, command and versions")
     add_titled_table(page, tables.origin_table(origin))
+    page.end_fold()
     return page.render()
 
 
 def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
-    """Add the first section: the verdict in cards, in sentences, as a picture and as a table."""
+    """Add the first section: the verdict in one line, as a picture, in sentences and as a table.
+
+    The sentences are unfolded on demand.
+    """
     investigation = content.investigation
     verdict = investigation.verdict
     page = book.page
     page.add_section("Verdict")
+    page.add_card(verdict_card(verdict))
+    book.add("missing_force")
+    page.begin_fold("How this was concluded")
     page.add_highlights(_cards(investigation))
     page.add_notice(headline(verdict))
     book.add_paragraph(f"{sizes_sentence(content)} {error_sentence(investigation)}")
-    book.add("missing_force")
     book.add_paragraph(_meaning(verdict))
     book.add_paragraph(remainders_sentence(verdict))
     catalogue: dict[str, Effect] = {}
@@ -160,7 +176,31 @@ def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
     for effect in effects.values():
         if effect.identifier in catalogue:
             book.add_paragraph(_effect_paragraph(effect, catalogue[effect.identifier]))
+    page.end_fold()
     add_titled_table(page, verdict_tables.effects_table(content))
+
+
+def verdict_card(verdict: Verdict) -> str:
+    """Return the verdict in one line: what is missing, where, how large, and how sure that is.
+
+    The size is the missing force at its port or, if there is no such force, the first parameter of
+    a named effect with its 90 % interval.
+    """
+    clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
+    parameters: list[Estimate] = []
+    if verdict.kind in NAMING:
+        for effect in verdict.effects:
+            parameters += effect.parameters
+    if verdict.force is not None:
+        force = verdict.force
+        clauses.append(f"{number(force.rms)} {force.unit} (rms) at {force.port}")
+    elif parameters:
+        value, interval = estimate_text(parameters[0])
+        size = f"{parameter_text(parameters[0])} {value} {unit_text(parameters[0].unit)}".rstrip()
+        clauses.append(f"{size} ({interval})")
+    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        clauses.append(f"probability {probability_text(verdict.probability)}")
+    return f"{'; '.join(clauses)}."
 
 
 def _cards(investigation: Investigation) -> list[tuple[str, str]]:
@@ -275,12 +315,12 @@ def _add_location(book: _PictureBook, investigation: Investigation) -> None:
     has_no_gap = investigation.verdict.kind in KINDS_WITHOUT_GAP
     book.page.add_section("What the model leaves" if has_no_gap else "Where the gap is")
     book.add_paragraph(_location_sentence(location, has_no_gap=has_no_gap))
+    book.add("residual_map", "residual_table", "time_line")
     if location is not None:
         shown = [found for found in location.disagreements if found.share >= LEAST_SHOWN_SHARE]
         for disagreement in shown[:MOST_SHOWN_DISAGREEMENTS]:
             book.add_paragraph(f"• {disagreement.sentence}")
         add_titled_table(book.page, tables.global_tests_table(location))
-    book.add("residual_map", "residual_table", "time_line")
 
 
 def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
@@ -326,8 +366,8 @@ def _add_proof(book: _PictureBook, investigation: Investigation) -> None:
             "named: the figures say how well it does, not that it is there."
         )
     book.add_paragraph(proof.remaining)
-    add_titled_table(book.page, tables.proof_table(investigation, proof))
     book.add("pit")
+    add_titled_table(book.page, tables.proof_table(investigation, proof))
 
 
 def _add_decidability(book: _PictureBook, content: ReportInput) -> None:
@@ -337,11 +377,12 @@ def _add_decidability(book: _PictureBook, content: ReportInput) -> None:
     if content.separability is not None:
         for line in group_lines(content.separability):
             book.add_paragraph(line)
-        add_titled_table(page, tables.detectable_sizes_table(content.separability))
     book.add("separability")
+    if content.separability is not None:
+        add_titled_table(page, tables.detectable_sizes_table(content.separability))
+    book.add("self_calibration")
     if content.self_calibration is not None:
         add_titled_table(page, tables.self_calibration_table(content.self_calibration))
-    book.add("self_calibration")
 
 
 def remarks_beside_faults(investigation: Investigation) -> list[str]:

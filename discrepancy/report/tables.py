@@ -5,7 +5,7 @@ from math import isnan, nan
 from discrepancy.campaign.records import Campaign, Trial
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import Origin
-from discrepancy.judgement.closed_share import percent_with_interval
+from discrepancy.judgement.closed_share import NOMINAL_UNIT, percent_with_interval
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.separability import Detectability, Separability
 from discrepancy.location.locate import Location
@@ -44,7 +44,7 @@ def global_tests_table(location: Location) -> TitledTable:
     """Return the table of the tests for any disagreement of model and data."""
     columns: list[RecordColumn[OmnibusTest]] = [
         text_cells("test", lambda test: test.name),
-        number_cells("statistic", lambda test: number(test.statistic, 4)),
+        number_cells("statistic", lambda test: number(test.statistic)),
         number_cells("p", lambda test: p_value_text(test.p_value)),
         text_cells(
             "disagrees",
@@ -121,17 +121,17 @@ def parameters_table(investigation: Investigation) -> TitledTable:
 def _score_cells(scores: Scores) -> dict[str, str]:
     """Return the scores of trials as texts, by the title of their row."""
     return {
-        "χ² per sample (1 is noise)": number(scores.chi_square_per_sample, 4),
-        "of a right model, as much as is fitted and left open": number(
-            scores.chi_square_expected, 4
+        "χ² per sample (1 is noise)": number(scores.chi_square_per_sample),
+        "χ² per sample, expected of a right model": number(scores.chi_square_expected),
+        "χ² per sample, standard deviation of a right model": number(
+            scores.chi_square_deviation, 2
         ),
-        "its deviation then": number(scores.chi_square_deviation, 2),
-        "mean log score, nat per sample (best −1.42)": number(scores.log_score, 4),
+        "mean log score, nat per sample (best −1.42)": number(scores.log_score),
         "coverage of 50 % intervals, %": f"{100.0 * scores.coverage_50:.1f}",
         "coverage of 90 % intervals, %": f"{100.0 * scores.coverage_90:.1f}",
-        "whiteness, p": p_value_text(scores.whiteness),
-        "flat histogram of transforms, p": p_value_text(scores.pit_p_value),
-        "samples": str(scores.sample_count),
+        "p-value that residuals are white": p_value_text(scores.whiteness),
+        "p-value that the transforms are uniform": p_value_text(scores.pit_p_value),
+        "number of samples": str(scores.sample_count),
     }
 
 
@@ -149,13 +149,12 @@ def proof_table(investigation: Investigation, proof: Proof) -> TitledTable:
     scored = {title: scores for title, scores in scores_by_title.items() if scores is not None}
     cells_of_scores = [_score_cells(scores) for scores in scored.values()]
     rows = [[title, *(cells[title] for cells in cells_of_scores)] for title in cells_of_scores[0]]
-    channels = {} if investigation.before is None else investigation.before.channels
+    channels = investigation.campaign.channels
     for name in dict.fromkeys(name for scores in scored.values() for name in scores.rms):
-        factor, unit = 1.0, ""
-        if name in channels:
-            factor, unit = UNITS[channels[name].quantity].drawn
+        factor, unit = UNITS[channels[name].quantity].drawn
         cells = [number(factor * scores.rms.get(name, nan)) for scores in scored.values()]
-        rows.append([f"rms of {name}, {unit}", *cells])
+        shown_unit = "in its own unit" if unit == NOMINAL_UNIT else unit
+        rows.append([f"rms residual of {name.replace('_', ' ')} ({shown_unit})", *cells])
     columns = [PageColumn("score"), *(number_column(title) for title in scored)]
     return TitledTable(
         Table(columns, rows),
@@ -170,7 +169,7 @@ def _proof_caption(investigation: Investigation, proof: Proof) -> str:
     if proof.held_out_after is None:
         sentences.append("Nothing is held out, so that nothing is proved.")
     else:
-        gain = f"{number(proof.log_score_gain, 4)} ± {number(proof.log_score_gain_error, 2)}"
+        gain = f"{number(proof.log_score_gain)} ± {number(proof.log_score_gain_error, 2)}"
         sentences.append(f"Gain in log score on held-out trials {gain} nat per sample.")
     if proof.closed is None:
         sentences.append(proof.closed_reason)

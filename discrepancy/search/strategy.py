@@ -15,7 +15,7 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
-from discrepancy.estimation.refinement import refine_hypotheses
+from discrepancy.estimation.ranking import rank_by_missing_force
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
 from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, time_step_error
@@ -327,10 +327,7 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        ranked_hypotheses = force_search.rank_hypotheses(self.effects, self.on_progress)
-        self.force_hypotheses = refine_hypotheses(
-            force_search, ranked_hypotheses, len(self.effects), self.on_progress
-        )
+        self.force_hypotheses = rank_by_missing_force(force_search, self.effects, self.on_progress)
         # fit the most probable sets to the readings, each from its estimate by the missing force
         eligible = []
         for hypothesis in self.force_hypotheses:
@@ -375,7 +372,10 @@ class Search(FittedCandidates):
         singles = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
         if not singles:
             return
-        (leading,) = max(singles, key=self.score).candidate.terms
+        leading_fit = max(singles, key=self.score)
+        if self._is_in_optimum_of_estimate(leading_fit):
+            return
+        (leading,) = leading_fit.candidate.terms
         for hypothesis in canonical_relatives(leading, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
@@ -387,6 +387,26 @@ class Search(FittedCandidates):
                 self.record_fit(fit, exact=True)
                 if check_absolute_fit(self.problem, fit).passed:
                     return
+
+    def _is_in_optimum_of_estimate(self, fit: CandidateFit) -> bool:
+        """Return whether a simulation is near the data, at the values estimated with the motion.
+
+        The estimate follows the law from a large missing force to a small one, and so reaches the
+        right optimum. Other optima are much farther away, and leave far more than the noise.
+
+        Parameters
+        ----------
+        fit : CandidateFit
+            The simulation.
+        """
+        if self._has_large_residuals(fit):
+            return False
+        return any(
+            hypothesis.candidate.key == fit.candidate.key
+            and hypothesis.speed_window is not None
+            and np.abs(hypothesis.effect - fit.effect).max() < SEARCH.same_optimum_deviation
+            for hypothesis in self.force_hypotheses
+        )
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises."""

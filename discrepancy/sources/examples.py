@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -349,7 +349,7 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
 
 
 def _planned_static_trial(
-    name: str, plan: ExamplePlan, forces: FloatArray, start: float, **fields: Any
+    name: str, plan: ExamplePlan, forces: FloatArray, start: float, **fields: object
 ) -> Trial:
     """Return a static trial without readings, with a row for each force [N]."""
     return Trial.plain(
@@ -365,7 +365,7 @@ def _planned_static_trial(
 
 
 def _planned_flight(
-    name: str, plan: ExamplePlan, load_factors: FloatArray, start: float, **fields: Any
+    name: str, plan: ExamplePlan, load_factors: FloatArray, start: float, **fields: object
 ) -> Trial:
     """Return a flight without readings, with a row for each load factor [1]."""
     return Trial.plain(

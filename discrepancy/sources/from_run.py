@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from itertools import product
 from math import inf
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +23,7 @@ from fmu_asset.packing.patch_file import load_patch
 from reporting.errors import DamagedFileError
 from reporting.files import hash_file
 from reporting.folders import restore_folder
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, read_json
 from reporting.netcdf import read_groups
 from reporting.words import counted
 
@@ -105,7 +104,7 @@ def run_campaign(
         ) from cause
 
 
-def _check_scenario(folder: Path, scenario: dict[str, Any]) -> None:
+def _check_scenario(folder: Path, scenario: JsonObject) -> None:
     """Refuse the run of another asset than the wing, or one with a steady force at the tip."""
     states = {state["name"] for state in scenario["state"]}
     is_of_wing = scenario["observation"].get("role") == STRAIN
@@ -136,7 +135,7 @@ def _steps_with_last_patch(
 def _build_campaign(
     folder: Path,
     run: xr.DataTree,
-    scenario: dict[str, Any],
+    scenario: JsonObject,
     steps: slice,
     held_out_share: float,
 ) -> records.Campaign:
@@ -344,7 +343,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
 # ---------------------------------------------------------------- files of the run folder
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
+def _read_config(folder: Path) -> JsonObject:
     """Return the content of `config.json`, which has a scenario."""
     with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is no run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
@@ -405,7 +404,7 @@ def _temperature_rises(run: xr.DataTree, steps: slice) -> records.FloatArray | N
     return None
 
 
-def _strain_noise(scenario: dict[str, Any]) -> tuple[float, str]:
+def _strain_noise(scenario: JsonObject) -> tuple[float, str]:
     """Return the standard deviation of a strain reading [1], and its source as a phrase."""
     truth = scenario.get("truth") or {}
     deviation = (truth.get("noise") or {}).get("standard_deviation")

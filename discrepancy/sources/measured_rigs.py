@@ -5,7 +5,6 @@ The data are not part of the package; `docs/explanation/measured_rigs.md` says w
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -41,7 +40,7 @@ SHIPPED = Path(__file__).with_name("rigs")
 Deviations of noise are those of the sixth differences of its records."""
 
 
-def write_rig_campaign(rig: str, data: Path, folder: Path, **options: Any) -> Path:
+def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) -> Path:
     """Write a campaign, and the `model.toml` of a rig, from a folder of published measurements.
 
     Parameters

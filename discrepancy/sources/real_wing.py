@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import helmert
@@ -103,7 +103,7 @@ def real_wing(
     tables = {
         "noise.csv": table_text({"time": interval * np.arange(float(len(noise))), SIGNAL: noise})
     }
-    keys: dict[str, Any] = {
+    keys: dict[str, object] = {
         "remarks": (
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
             f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
@@ -112,7 +112,7 @@ def real_wing(
             f"and the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         )
     }
-    trials: list[dict[str, Any]] = []
+    trials: list[dict[str, object]] = []
     if measurements is not None:
         loading = _loading_runs(measurements)
         tables |= loading.tables

@@ -1,6 +1,8 @@
 """Files of a campaign that are made from published measurements."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from reporting.toml_file import TomlTable
 
 
 class RigFiles(NamedTuple):
@@ -15,4 +17,4 @@ class RigFiles(NamedTuple):
     """
 
     tables: dict[str, str]
-    campaign_keys: dict[str, Any]
+    campaign_keys: TomlTable

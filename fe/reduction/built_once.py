@@ -1,6 +1,5 @@
 """Results that are built once and kept in files: one process builds, the others wait for it."""
 
-import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -9,8 +8,9 @@ from typing import TypeVar
 
 from fe.runtime.errors import ReducedModelFileError
 from reporting.errors import FileNotWrittenError
+from reporting.log import module_logger
 
-_logger = logging.getLogger(__name__)
+_logger = module_logger(__name__)
 
 Result = TypeVar("Result")
 

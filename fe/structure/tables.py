@@ -157,7 +157,7 @@ class Region(Named):
     """A region that may lose stiffness, up to `largest_loss`; its loss has its name."""
 
     largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
-    """Largest loss of stiffness for which the reduced model is valid, as a fraction [1]."""
+    """Largest stiffness loss for which the reduced model is valid, as a fraction [1]."""
 
     @property
     def range(self) -> tuple[float, float]:

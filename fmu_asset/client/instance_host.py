@@ -1,6 +1,5 @@
 """The life of an FMU's instance: the extracted files, the worker process, and starts anew."""
 
-import logging
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,12 +19,13 @@ from fmu_asset.instances.python_modules import forget_modules
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 from reporting.arrays import Float
+from reporting.log import module_logger
 from reporting.toml_file import validate
 
 from .binding import Binding
 from .reset_trial import FirstStep, InstanceStart, ResetTrial, RestartMethod
 
-_logger = logging.getLogger(__name__)
+_logger = module_logger(__name__)
 _logged_warnings: set[str] = set()
 
 

@@ -6,7 +6,6 @@ is made again and its outputs are compared: after a difference a slower method i
 first another instance in the same process and then another process.
 """
 
-import logging
 from array import array
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -15,8 +14,9 @@ import numpy as np
 
 from fmu_asset.instances.plan import InitialValues, Instance
 from reporting.arrays import Float
+from reporting.log import module_logger
 
-_logger = logging.getLogger(__name__)
+_logger = module_logger(__name__)
 _logged: set[tuple[str, "RestartMethod"]] = set()
 """FMUs and methods that a warning was given about."""
 

@@ -30,6 +30,12 @@ SETTLE_CHUNK = 200
 NO_OFFSETS: Mapping[str, float] = MappingProxyType({})
 
 
+def _close_asset(asset: object) -> None:
+    """Close an asset that the cache drops."""
+    if isinstance(asset, FmiAsset):
+        asset.close()
+
+
 class OperatingPoint(NamedTuple):
     """Parameters and constant inputs of a run, as sorted pairs of a binding's name and a value."""
 
@@ -93,7 +99,7 @@ class FmuRuns:
         self._isolated = isolated
         self._limit = limit
         self._tolerance = tolerance
-        self._assets = ResultCache(MOST_INSTANCES, end=FmiAsset.close)
+        self._assets = ResultCache(MOST_INSTANCES, end=_close_asset)
         self._results = ResultCache(CACHE_BYTES, attrgetter("nbytes"))
 
     def refusal_context(self) -> AbstractContextManager[None]:

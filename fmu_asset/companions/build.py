@@ -6,14 +6,13 @@ is packed like that of a wing, with the same slave.
 
 import json
 import tomllib
-from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.resources import files
-from typing import Any
 
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.packing.contents import python_members, sealed
 from fmu_asset.slaves.variables import VariableTable
+from reporting.toml_file import TomlTable
 
 _IMPORTS = """import json
 
@@ -57,7 +56,7 @@ def companion_bytes(name: str) -> bytes:
     return sealed(members).content
 
 
-def companion_declaration(name: str, description: Mapping[str, Any]) -> Declaration:
+def companion_declaration(name: str, description: TomlTable) -> Declaration:
     """Return the model name, variables and dependencies of a companion from its TOML file.
 
     Parameters
@@ -82,7 +81,7 @@ def companion_declaration(name: str, description: Mapping[str, Any]) -> Declarat
 
 
 def _add_variable(
-    table: VariableTable, dependencies: dict[str, list[str]], row: Mapping[str, Any], number: int
+    table: VariableTable, dependencies: dict[str, list[str]], row: TomlTable, number: int
 ) -> None:
     """Add a variable to the table, and if it is an output, its direct dependency.
 
@@ -98,7 +97,7 @@ def _add_variable(
     number : int
         The number that replaces `{n}` in the texts of the variable.
     """
-    attributes: dict[str, Any] = {}
+    attributes: TomlTable = {}
     for key, value in row.items():
         attributes[key] = value.format(n=number) if isinstance(value, str) else value
     input_name = attributes.pop("of", None)

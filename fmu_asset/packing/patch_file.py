@@ -20,7 +20,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -70,6 +70,13 @@ class PatchFileEffect(NamedTuple):
     patch: ModelPatch
 
 
+class EffectRecord(TypedDict):
+    """An effect as `fmu_asset.slaves.effects` takes it."""
+
+    id: str
+    primitives: list[dict[str, object]]
+
+
 @dataclass(frozen=True)
 class PatchFile:
     """The effects and channels that an FMU takes from a patch file.
@@ -101,7 +108,7 @@ class PatchFile:
         return PatchFile(tuple(effects), self.channels)
 
     @property
-    def plain(self) -> list[dict[str, Any]]:
+    def plain(self) -> list[EffectRecord]:
         """`id` and `primitives` of each effect, as `fmu_asset.slaves.effects` takes them."""
         return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
@@ -230,7 +237,7 @@ def _patch_of_record(record: object, file_label: str) -> PatchFile:
 
 
 def _read_effects(
-    rows: Sequence[Mapping[str, Any]], file_label: str
+    rows: Sequence[Mapping[str, object]], file_label: str
 ) -> tuple[PatchFileEffect, ...]:
     """Return the effects of a patch file, with unique ids: a repeated id gets `_2`, `_3`, ..."""
     effects: list[PatchFileEffect] = []
@@ -247,7 +254,7 @@ def _read_effects(
     return tuple(effects)
 
 
-def _read_effect(row: Mapping[str, Any], number: int, file_label: str) -> PatchFileEffect:
+def _read_effect(row: Mapping[str, object], number: int, file_label: str) -> PatchFileEffect:
     """Return an effect of a patch file, with the id that the file states.
 
     Parameters

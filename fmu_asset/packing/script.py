@@ -17,7 +17,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from runpy import run_path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fmu_asset.description import PLACEHOLDER, rendered
@@ -39,6 +39,12 @@ from .contents import (
 
 if TYPE_CHECKING:
     from pythonfmu import Fmi2Slave
+
+UnitTable: TypeAlias = Mapping[str, Mapping[str, Any]]
+"""The `unit_table` of a script: exponents, factor, offset and displays of each unit, unchecked."""
+_Limit: TypeAlias = str | float | None
+_VariableEntry: TypeAlias = tuple[object, str | None, _Limit, _Limit, object, object]
+"""An entry of a `variable_table`; its unit and its range stand after the first value."""
 
 
 def build_script_fmu(
@@ -143,7 +149,7 @@ def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: 
     # units, which the standard requires after the interface
     interface = _required_child(root, "CoSimulation")
     interface.set("modelIdentifier", identifier)
-    units: Mapping[str, Mapping[str, Any]] = getattr(model_class, "unit_table", {})
+    units: UnitTable = getattr(model_class, "unit_table", {})
     if units:
         after_interface = list(root).index(interface) + 1
         root.insert(after_interface, _unit_definitions(file, units))
@@ -166,7 +172,7 @@ def _required_child(root: Element, name: str) -> Element:
     return child
 
 
-def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:
+def _unit_definitions(file: Path, units: UnitTable) -> Element:
     """Return the XML element `UnitDefinitions` with the units of a script's `unit_table`."""
     known_keys = {*BASE_UNITS, "factor", "offset", "displays"}
     definitions = Element("UnitDefinitions")
@@ -191,8 +197,8 @@ def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Ele
 def _set_units_and_ranges(
     file: Path,
     variables: Element,
-    table: Mapping[str, tuple[Any, ...]],
-    units: Mapping[str, Mapping[str, Any]],
+    table: Mapping[str, _VariableEntry],
+    units: UnitTable,
 ) -> None:
     """Add units and ranges from a script's `variable_table` to its model description, in place.
 

@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as dataclass_copy
-from typing import Any, Literal, TypedDict, Unpack, get_args
+from typing import Literal, TypedDict, Unpack, get_args
 
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
@@ -47,7 +47,7 @@ from reporting.choices import require_one_of
 from reporting.files import hash_members
 from reporting.progress import Progress
 
-from .patch_file import PatchFile
+from .patch_file import EffectRecord, PatchFile
 
 FmuKind = Literal["python", "compiled", "source"]
 """The evaluation of the model: by Python, by compiled C, or by C sources that are yet to be
@@ -229,7 +229,7 @@ def _add_resources(template: dict[str, bytes], resources: Mapping[str, bytes]) -
 
 
 def _patched_members(
-    model: ReducedModel, effects: Sequence[dict[str, Any]], arrays: PatchArrays | None
+    model: ReducedModel, effects: Sequence[EffectRecord], arrays: PatchArrays | None
 ) -> dict[str, bytes]:
     """Return the further files of an FMU that carries effects, by their names in the archive.
 
@@ -250,7 +250,7 @@ def _patched_members(
     # Keys are not sorted: their order in the file sets the order of the FMU's variables.
     text = json.dumps(effects, indent=1, allow_nan=False)
     members = {"resources/effects.json": f"{text}\n".encode()}
-    primitives = []
+    primitives: list[dict[str, object]] = []
     for effect in effects:
         primitives += effect["primitives"]
     patch = ModelPatch.from_list(primitives)

@@ -14,7 +14,7 @@ from tests.fmu_asset.ours import OurFmus, wing_model
 
 @pytest.fixture
 def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the folder in which this test alone makes its temporary folders, here and in subprocesses."""
+    """The folder in which this test alone, with its subprocesses, makes temporary folders."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -24,7 +24,7 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(params=[True, False], ids=["worker", "in process"])
 def isolated(request: pytest.FixtureRequest) -> bool:
-    """Whether FMUs run in a process of their own: each test that asks for it is run in both ways."""
+    """Whether FMUs run in a process of their own: tests with this fixture run in both ways."""
     return bool(request.param)
 
 

@@ -1,4 +1,4 @@
-"""What these tests make things with: archives, changed FMUs, bindings, systems, others' FMUs, processes."""
+"""Makers of archives, changed FMUs, bindings, systems, FMUs of others, and processes."""
 
 import re
 import shutil
@@ -78,7 +78,7 @@ Ends = Mapping[str, tuple[Any, Any]]
 
 
 def bound(step_size: float, observation: Ends, **roles: Any) -> Binding:
-    """Return a binding: of each name in each role its variable and unit, and its range where there are more.
+    """Return a binding, given variable, unit and perhaps range of each name in each role.
 
     `header` has further keys; `port` is a table as in the file.
     """
@@ -135,7 +135,7 @@ HEADERS = Path(fmpy.__file__).parent / "c-code"
 
 
 class Workshop:
-    """Builds small FMUs of FMI 1, 2 and 3 from C sources, as others' tools export them; each model once.
+    """Builds small FMUs of FMI 1, 2 and 3 from C, as tools of others export them, each model once.
 
     Parameters
     ----------
@@ -168,12 +168,24 @@ class Workshop:
         library = path.with_suffix(".so")
         subprocess.run(
             [
-                compiler, "-shared", "-fPIC", "-O1", "-w", f"-I{HEADERS}", f"-I{FOREIGN}", *exchange,
-                f"-DIDENTIFIER={model}", *(f"-D{define}" for define in defines),
-                str(FOREIGN / f"{model}.c"), str(FOREIGN / f"frame{version[1]}.c"), "-o", str(library), "-lm",
+                compiler,
+                "-shared",
+                "-fPIC",
+                "-O1",
+                "-w",
+                f"-I{HEADERS}",
+                f"-I{FOREIGN}",
+                *exchange,
+                f"-DIDENTIFIER={model}",
+                *(f"-D{define}" for define in defines),
+                str(FOREIGN / f"{model}.c"),
+                str(FOREIGN / f"frame{version[1]}.c"),
+                "-o",
+                str(library),
+                "-lm",
             ],
             check=True,
-        )  # fmt: skip
+        )
         platform = fmpy.platform_tuple if version[1] == "3" else fmpy.platform
         binary = f"binaries/{platform}/{model}.so"
         archive_of(path, {DESCRIPTION: description, binary: library.read_bytes()})

@@ -58,7 +58,7 @@ def wing_arrays() -> PatchArrays:
 
 
 class OurFmus:
-    """Packs each FMU once into a folder; what took a compiler or another program is kept between runs."""
+    """Packs each FMU once into a folder; compiled and exported ones are kept between runs."""
 
     def __init__(self, folder: Path, fixture: Callable[[str], Any]) -> None:
         self._folder = folder

@@ -1,4 +1,4 @@
-"""Another asset than the wing, exported by pythonfmu as it comes: a mass on a spring that can misbehave.
+"""A mass on a spring that can misbehave, exported by pythonfmu as it comes.
 
 Copied to a folder of its own and built there; it is never imported by the tests.
 """
@@ -58,10 +58,14 @@ DEEDS = (
 
 
 VARIABLES = {
-    "force": (Real, "input", 0.0), "stiffness": (Real, "input", 4.0),
-    "locked": (Boolean, "input", False), "misbehaviour": (Integer, "input", 0),
-    "position": (Real, "output", 0.0), "velocity": (Real, "output", 0.0), "steps": (Integer, "output", 0),
-}  # fmt: skip
+    "force": (Real, "input", 0.0),
+    "stiffness": (Real, "input", 4.0),
+    "locked": (Boolean, "input", False),
+    "misbehaviour": (Integer, "input", 0),
+    "position": (Real, "output", 0.0),
+    "velocity": (Real, "output", 0.0),
+    "steps": (Integer, "output", 0),
+}
 
 
 class SpringMass(Fmi2Slave):

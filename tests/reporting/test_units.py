@@ -42,8 +42,8 @@ def test_any_text_is_a_unit_or_is_refused(text, gravity):
         exponents, factor, offset = exact_meaning(text, gravity=gravity)
     except ValueError:
         return
-    assert len(exponents) == len(BASE_UNITS)
-    assert all(isinstance(exponent, int) for exponent in exponents)
+
+    assert [type(exponent) for exponent in exponents] == [int] * len(BASE_UNITS)
     assert float(factor) != 0.0
     assert abs(float(offset)) < float("inf")
 
@@ -59,6 +59,7 @@ def test_any_text_is_a_unit_or_is_refused(text, gravity):
 def test_a_name_with_a_number_is_no_unit(text):
     with pytest.raises(ValueError, match="is no unit"):
         exact_meaning(text)
+
     assert meaning_of(text) is None
 
 
@@ -87,4 +88,10 @@ def test_a_unit_with_a_half_power_of_length_is_none_of_si():
 def test_a_unit_beyond_all_numbers_is_refused():
     with pytest.raises(ValueError, match="beyond the numbers"):
         exact_meaning("Qm9.Qm9.m-9.m-8")
-    assert exact_meaning("Qm2")[1] == Fraction(10) ** 60
+
+
+def test_a_large_factor_is_exact():
+    """A quettametre is 10^30 m."""
+    _, factor, _ = exact_meaning("Qm2")
+
+    assert factor == Fraction(10) ** 60

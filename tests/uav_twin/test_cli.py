@@ -59,7 +59,7 @@ def test_run_prints_figures_and_report(tmp_path, library_file):
     out = tmp_path / "run"
     words = ("run", "level_turns", "--out", out, "--strain-library", library_file)
     text = said(*words, "--seed", "3")
-    assert re.search(r"first control from z1 +60 % +60 % \(1\)", text)
+    assert re.search(r"policy changes from 3g to 2g +60 % +60 % \(1\)", " ".join(text.split()))
     assert all(part in text for part in ("(1) Kapteyn et al. 2021\n", f"Report: {out / 'report.html'}"))
     assert "holds a run already" in refused(*words)
     done = command(*words, "--replace", "--quiet")
@@ -71,7 +71,7 @@ def test_run_prints_figures_and_report(tmp_path, library_file):
     assert {figure["key"] for figure in record["figures"]} >= {"fallback_delay", "policy_switch_damage"}
     assert not (out / "report.html").exists()
     text = said("run", "growing_damage", "--out", tmp_path / "other", "--strain-library", library_file)
-    assert "filtered rms error of z1" in text
+    assert "rms error of the estimated stiffness loss of region 1" in " ".join(text.split())
     assert "reference" not in text  # the scenario has none, and no column for them
 
 
@@ -267,8 +267,8 @@ def test_every_name_is_there_under_its_own_name_and_documented():
         assert alias.asname == alias.name  # which type checkers take as handed on
         told[alias.name] = line.module
     assert told == _HOMES
-    assert 15 <= len(uav_twin.__all__) <= 45
-    assert set(uav_twin.__all__) <= set(dir(uav_twin))
+    assert 15 <= len(uav_twin.__all__) <= 55
+    assert set(uav_twin.__all__) == set(dir(uav_twin))  # what completion in a notebook offers
     # The import of a module of the command line would take the place of a name like it.
     assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
     page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")

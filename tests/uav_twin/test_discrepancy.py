@@ -2,10 +2,13 @@
 
 import itertools
 import json
+import os
+import pty
 import re
+import select
 import shlex
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from decimal import Decimal
 from pathlib import Path
 
@@ -197,6 +200,96 @@ def test_a_terminal_is_asked(tmp_path):
     assert "--zero of 'Weg' must be a standard deviation such as 0.1mm or 1%" in screen
     assert read.channels["Weg"].offset_deviation == pytest.approx(0.0005, rel=1e-12)
     assert read.channels["Weg"].gain_deviation == 0.02
+
+
+class PseudoTerminal:
+    """The import as a process at a pseudo-terminal, as a user has it."""
+
+    def __init__(self, *words: object) -> None:
+        self.screen = ""
+        self._read_until = 0  # the position in the screen up to which the test has read
+        command_words = [sys.executable, "-m", "uav_twin", *IMPORT, *map(str, words)]
+        self._process, self._terminal = pty.fork()
+        if self._process == 0:
+            os.execve(sys.executable, command_words, {**os.environ, "COLUMNS": "1000", "TERM": "dumb"})
+
+    def wait_for(self, text: str) -> str:
+        """Wait until the screen shows a text after what was read before; return what stands before it."""
+        while (place := self.screen.find(text, self._read_until)) < 0:
+            ready, _, _ = select.select([self._terminal], [], [], 240.0)
+            assert ready, self.screen
+            self.screen += os.read(self._terminal, 4096).decode()
+        before = self.screen[self._read_until : place]
+        self._read_until = place + len(text)
+        return before
+
+    def type(self, text: str) -> None:
+        os.write(self._terminal, text.encode())
+
+    def end(self) -> int:
+        """Read until the process ends, and return its exit code."""
+        with suppress(OSError):  # raised at the end of the process
+            while part := os.read(self._terminal, 4096):
+                self.screen += part.decode()
+        os.close(self._terminal)
+        return os.waitstatus_to_exitcode(os.waitpid(self._process, 0)[1])
+
+
+def printed_command(screen: str, beginning: str) -> list[str]:
+    """Return the words of a command that the screen shows after a beginning, without the program."""
+    plain_text = re.sub(r"\x1b\[[0-9;]*m", "", screen)  # without colours
+    line = next(row for row in plain_text.splitlines() if row.startswith(beginning))
+    return shlex.split(line.removeprefix(beginning))[3:]
+
+
+def test_an_interrupted_dialogue_goes_on_with_its_answers_and_its_command_repeats_it_without_questions():
+    Path("swing.csv").write_bytes(TWO["swing.csv"])
+    terminal = PseudoTerminal("swing.csv", "--out", "lab")
+    terminal.wait_for("questions to answer")
+    terminal.wait_for("swing.csv: kind")
+    terminal.type("ringdown\n")
+    terminal.wait_for("swing.csv: decimal")
+    terminal.type(",\n")
+    terminal.wait_for("Weg: column")
+    terminal.type("tip of the wing\n")
+    terminal.wait_for("Weg: unit")
+    terminal.type("\x03")  # Ctrl-C
+    assert terminal.end() == 130
+    assert not Path("lab").exists()
+    words = printed_command(terminal.screen, "Nothing was written. To go on with these answers: ")
+    assert words[:3] == ["swing.csv", "--out", "lab"]
+
+    terminal = PseudoTerminal(*words)
+    assert "kind," not in terminal.wait_for("Weg: unit")  # what was answered is not asked again
+    terminal.type("mm\n")
+    terminal.wait_for("swing.csv: release")
+    terminal.type("12 mm\n")
+    terminal.wait_for("Weg: zero")
+    terminal.wait_for("[1%]")
+    terminal.type("0.5mm\n")
+    terminal.wait_for("Weg: gain")
+    terminal.type("\n")
+    terminal.wait_for("Write lab?")
+    terminal.type("y\n")
+    assert terminal.end() == 0
+    read = read_campaign("lab")
+    assert [channel.output for channel in read.channels.values()] == ["tip of the wing"]
+    assert read.channels["Weg"].offset_deviation == pytest.approx(0.0005, rel=1e-12)
+
+    words = printed_command(terminal.screen, "To repeat it without questions: ")
+    words[words.index("lab")] = "again"
+    code, screen = in_a_terminal([], *words)  # a terminal without a user
+    assert code == 0, screen
+    assert Path("again/campaign.toml").read_bytes() == Path("lab/campaign.toml").read_bytes().replace(
+        b'"lab"', b'"again"'
+    )
+
+
+def test_a_file_that_is_not_held_out_is_an_answer_too():
+    swings("a.csv", "b.csv")
+    words = ("--kind", "driven", *PLAIN, "--held-out", "b.csv", "--held-out", "a.csv=no")
+    said(*IMPORT, "a.csv", "b.csv", *words)
+    assert [trial.held_out for trial in read_campaign("a").trials] == [False, True]
 
 
 SWINGS = ("t [ms],x [um],U [V]", *(f"{10 * k},{k % 5 - 2}0,{0.5 * k}" for k in range(16)))

@@ -6,7 +6,7 @@ A wing is a structure whose mesh follows from its design, and it can carry effec
 from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from twin_master.scenario.mission import CALIBRATION_COPY
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
+    from calibration.result.file import Tailoring
     from calibration.result.record import Calibration
     from fe.runtime.patch import Primitive
     from fe.runtime.patch_arrays import PatchArrays
@@ -360,7 +361,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         """Pack the wing as the FMU in the run folder, at its calibrated values if it has any."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
-        options: dict[str, Any] = {}
+        options: Tailoring = {}
         if self.calibration is not None:
             from calibration.result.file import tailoring  # takes a second to load
 

@@ -1,13 +1,13 @@
 """The folder of a fleet and its configuration, which one process uses at a time."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from reporting.folders import closing_lock
 from reporting.former_names import with_present_names
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.provenance import collect_provenance
 from twin_master import run_folder
 from twin_master.errors import RunFolderError
@@ -38,11 +38,11 @@ def _nothing_to_check() -> None:
 def locked_fleet_folder(
     folder: Path,
     kind: str,
-    record: Mapping[str, Any],
+    record: JsonRecord,
     *,
     replace_old: bool = False,
     check: Callable[[], None] = _nothing_to_check,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[JsonObject]:
     """Return a context in which this process alone uses the folder of a fleet.
 
     The folder is made, or a folder that holds the same fleet is used again.
@@ -94,7 +94,7 @@ def locked_fleet_folder(
         yield config
 
 
-def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
+def fleet_config(folder: Path, *kinds: str) -> JsonObject:
     """Return the configuration in the folder of a fleet.
 
     Parameters

@@ -66,7 +66,13 @@ def _evidence_at_points(
             result[twin, point] = 0.0
             for t in range(steps):
                 if t > 0:
-                    apply_blocks(point_lists, control[twin, t - 1], belief, belief, work)
+                    apply_blocks(
+                        point_lists,  # type: ignore[arg-type]  # numba takes a plain tuple, too
+                        control[twin, t - 1],
+                        belief,
+                        belief,
+                        work,
+                    )
                 predictive_probability = 0.0
                 for state in range(state_count):
                     belief[state] *= likelihood[twin, t, state]

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from reporting.files import (
     atomic_write_text,
@@ -19,7 +19,9 @@ from reporting.files import (
     write_members,
 )
 from reporting.json_file import read_json
+from reporting.notebook import html_table
 from reporting.progress import Progress, SilentProgress
+from reporting.words import listing
 from twin_master import run_folder
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
@@ -28,16 +30,27 @@ from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_fol
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.evidence import reason_transitions_are_fixed
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
+from twin_master.fleet.reading import figure_rows, group_figures, open_fleet
 from twin_master.fleet.shard import ShardResult, result_of_unflown
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.parts import (
+    NO_PARTS,
+    GivenEstimator,
+    GivenPolicy,
+    GivenSensorModel,
+    TwinParts,
+)
 from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
+from twin_master.network.twin import build_graphical_model
+from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:
     import zarr
+    from matplotlib.axes import Axes
 
 RESULT_NAME = "fleet.json"
 """The file in the folder of a fleet that says how its flight ended."""
@@ -74,12 +87,37 @@ class FleetOutcome:
     shards_flown: int
     shards_kept: int
 
+    def _repr_html_(self) -> str:
+        """Return how the twins of each group fared, for a notebook."""
+        groups = open_fleet(self.folder).children
+        figures = {name: group_figures(group) for name, group in groups.items()}
+        title = f"Fleet of {self.twins} twins in {self.folder}"
+        return html_table(title, ("result", *figures), figure_rows(figures))
+
+    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+        """Draw the believed states of all twins over the steps, with the median of the truth.
+
+        Parameters
+        ----------
+        axes : Axes or sequence of Axes, optional
+            A panel for each factor of the state of each group; new ones of pyplot by default.
+
+        Returns
+        -------
+        list of Axes
+            The panels.
+        """
+        return plot_courses(open_fleet(self.folder), axes)
+
 
 def fly_fleet(
     fleet: Fleet | str | Path,
     folder: Path | str,
     engine: Engine | None = None,
     *,
+    policy: GivenPolicy | None = None,
+    sensor_model: GivenSensorModel | None = None,
+    estimator: GivenEstimator | None = None,
     replace_old: bool = False,
     progress: Progress | None = None,
 ) -> FleetOutcome:
@@ -94,6 +132,9 @@ def fly_fleet(
         continued.
     engine : Engine, optional
         The processes that fly; by default this one.
+    policy, sensor_model, estimator : optional
+        The parts of all twins in the place of those of the scenarios, see `fly`. Other processes
+        than this one must be able to import the modules of objects.
     replace_old : bool
         Whether another fleet in the folder is removed.
     progress : Progress, optional
@@ -121,6 +162,9 @@ def fly_fleet(
     start = time.perf_counter()
     fleet = fleet if isinstance(fleet, Fleet) else load_fleet(fleet)
     folder = Path(folder)
+    given_parts = TwinParts(policy, sensor_model, estimator)
+    if given_parts.is_any_given:
+        fleet = fleet.with_parts(given_parts)
     progress = progress or SilentProgress()
     engine = engine or Engine()
     check_installed("zarr", *(["distributed"] if engine.needs_dask else []))
@@ -192,7 +236,9 @@ def endings_of(folder: Path) -> Endings:
     return Endings(dict(sorted(failures.items())), dict(sorted(ended.items())))
 
 
-def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> bytes:
+def prepare_kit(
+    scenario: Scenario, folder: Path, *, is_real: bool = False, parts: TwinParts = NO_PARTS
+) -> bytes:
     """Prepare the twins' knowledge of a scenario in a folder, and pack all that a flight needs.
 
     Knowledge that the folder holds already is not computed again.
@@ -205,24 +251,44 @@ def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> b
         The folder of the prepared knowledge; files are written to it.
     is_real : bool
         Whether the assets are real, so that no asset is simulated.
+    parts : TwinParts
+        The parts of the twins that a user gives in the place of those of the scenario.
 
     Returns
     -------
     bytes
-        The pickled content of a `Kit`: the scenario, the files of the folder, and the reduced
-        model if it simulates the asset, else None.
+        The pickled content of a `Kit`: the scenario, the files of the folder, the reduced model if
+        it simulates the asset, else None, and the given sensor model and estimator.
+
+    Raises
+    ------
+    FleetError
+        If a given part cannot be sent to other processes.
     """
     located = scenario.portable().with_paths_from(folder)
     write_members(folder, source_of(scenario, is_real=is_real).files())
     source = source_of(located, is_real=is_real)
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
-        save_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
+        policy = parts.policy_for(build_graphical_model(located))
+        knowledge = prepare_knowledge(located, source, scenario.mission.seed, policy, parts)
+        save_knowledge(folder, knowledge)
     model = None
     if flies_model(scenario) and not is_real and isinstance(source, ReducedModelSource):
         model = source.prepared_model
-    parts = (scenario.portable().to_dict(), read_members(folder), model)
-    return pickle.dumps(parts, pickle.HIGHEST_PROTOCOL)
+    # The policy is among the files of the folder.
+    given_parts = replace(parts, policy=None)
+    content = (scenario.portable().to_dict(), read_members(folder), model, given_parts)
+    try:
+        return pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        if not parts.replace_filter:
+            raise
+        raise FleetError(
+            f"the given {listing(given_parts.record().values())} cannot be sent to the processes "
+            f"that fly ({error}): define the class or function at the top of a module, or give "
+            "its name FILE.py:NAME."
+        ) from error
 
 
 class Shard(NamedTuple):
@@ -333,6 +399,7 @@ class _FleetFlight:
             group.scenarios[scenario_number],
             group_folder(self._folder, group, scenario_number),
             is_real=bool(group.observations),
+            parts=self._fleet.parts,
         )
 
     def _store(self, group_number: int, members: Sequence[Member], result: ShardResult) -> None:
@@ -353,7 +420,7 @@ class _FleetFlight:
             }
         )
 
-    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[Any]]":
+    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[object]]":
         """Return the arrays of a group in the store, by their paths."""
         import zarr
 

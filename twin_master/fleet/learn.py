@@ -6,12 +6,13 @@ The results are a record for the report, and `learnt.toml`, which replaces value
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text, hash_record
+from reporting.json_file import JsonObject
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
@@ -68,7 +69,7 @@ _MOST_SHARED = 2
 
 def learn_from_fleet(
     folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Learn from all twins of a fleet, and write what was learnt to a file.
 
     Learnt are the probabilities that damage grows, the noise of the sensors, and the distribution
@@ -104,7 +105,7 @@ def learn_from_fleet(
     return record
 
 
-def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
+def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> JsonObject:
     """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
 
     The prior of each probability is uniform; if there are several groups, it is a Beta
@@ -125,6 +126,12 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     """
     folder = Path(folder)
     config = fleet_config(folder)
+    own_sensor_model = config["fleet"].get("parts", {}).get("sensor_model")
+    if own_sensor_model is not None:
+        raise FleetError(
+            f"the fleet in {folder} flew with the sensor model {own_sensor_model}, and `fleet "
+            "learn` knows only those of scenarios: fly it without `sensor_model` to learn from it."
+        )
     lessons = _lessons_of_groups(folder, config["fleet"]["groups"], progress or SilentProgress())
     if not lessons:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
@@ -158,7 +165,7 @@ class _GroupLessons:
     family: TransitionFamily
     grid: LikelihoodGrid | None
     flown_controls: set[str]
-    record: dict[str, Any]
+    record: JsonObject
 
     @property
     def marginals(self) -> tuple[Distribution, ...]:
@@ -167,7 +174,7 @@ class _GroupLessons:
 
     def with_probabilities(
         self, posteriors: Sequence[Distribution], flown_controls: set[str]
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return the record of the group with its probabilities to worsen.
 
         Parameters
@@ -191,7 +198,7 @@ class _GroupLessons:
 
 
 def _lessons_of_groups(
-    folder: Path, records: Sequence[dict[str, Any]], progress: Progress
+    folder: Path, records: Sequence[JsonObject], progress: Progress
 ) -> dict[str, _GroupLessons]:
     """Learn from each group by itself; groups without a flown twin are left out."""
     lessons = {}
@@ -205,7 +212,7 @@ def _lessons_of_groups(
     return lessons
 
 
-def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
+def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution of probabilities that they share.
 
     They share one if several groups have learnt the same one or two probabilities to worsen.
@@ -223,7 +230,7 @@ def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
 
 def _records_with_shared_distribution(
     lessons: dict[str, _GroupLessons], grids: Sequence[LikelihoodGrid], names: Sequence[str]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the records of groups whose probabilities share a distribution.
 
     A control that was flown in any group counts as flown in all, because the shared distribution
@@ -270,7 +277,7 @@ class _WeighedSteps(NamedTuple):
 
 
 def _learn_group(
-    record: dict[str, Any], group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
+    record: JsonObject, group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
@@ -304,7 +311,7 @@ def _learn_group(
         )
     grid = _probability_grid(family, steps) if family.names else None
     rows = np.concatenate([twins.rows for twins in flown])
-    lessons: dict[str, Any] = {
+    lessons: JsonObject = {
         "twins": twin_count,
         "left_out": len(rows) - twin_count,
         "alarmed": int(np.sum(notice_counts(group, "alarm")[rows] > 0)),
@@ -512,7 +519,7 @@ def _population(
     grid: LikelihoodGrid | None,
     nodes: _ParameterNodes,
     noise_factor: float,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the record of the population of the calibrated parameter in a group.
 
     Parameters

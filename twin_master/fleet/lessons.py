@@ -1,12 +1,13 @@
 """What was learnt from a fleet, as the file `learnt.toml` for scenarios and as rows of a table."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.toml_file import toml_text
 from reporting.words import counted
 from twin_master.fleet.configuration import fleet_config
@@ -18,7 +19,7 @@ HEADING = """\
 # `learnt = "THIS_FILE"` in a group of a fleet.
 """
 
-Record = Mapping[str, Any]
+Record = JsonRecord
 """A part of the record that `learn_from_fleet` returns."""
 
 
@@ -49,7 +50,7 @@ def write_learnt(path: Path, folder: Path, record: Record) -> Path:
         scenarios[group["name"]] = group["scenarios"][0]
     largest = max(groups, key=lambda name: groups[name]["twins"])
     shared_means = record.get("shared", groups[largest]["probability"])
-    content: dict[str, Any] = {
+    content: JsonObject = {
         "format": 1,
         "source": record["source"],
         **_scenario_tables(groups[largest], shared_means, scenarios[largest]),
@@ -62,7 +63,7 @@ def write_learnt(path: Path, folder: Path, record: Record) -> Path:
     return atomic_write_text(path, HEADING + toml_text(content))
 
 
-def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str, Any]:
+def _scenario_tables(group: Record, means: Record, scenario: Record) -> JsonObject:
     """Return the tables that replace those of a scenario, from what was learnt of a group.
 
     Parameters
@@ -74,7 +75,7 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str
     scenario : mapping
         The scenario of the group, with the assumed noise.
     """
-    tables: dict[str, Any] = {}
+    tables: JsonObject = {}
     probability = _mean_probabilities(group, means)
     if probability:
         tables["transition"] = {"probability": probability}
@@ -91,12 +92,12 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str
     return tables
 
 
-def _mean_probabilities(group: Record, means: Record) -> dict[str, Any]:
+def _mean_probabilities(group: Record, means: Record) -> JsonObject:
     """Return the mean probabilities to worsen by control, or by control and factor.
 
     For a control that was never flown nothing was learnt: its assumed probability is returned.
     """
-    probabilities: dict[str, Any] = {}
+    probabilities: JsonObject = {}
     for name, learnt in group["probability"].items():
         mean = means[name]["mean"] if learnt["flown"] else learnt["assumed"]
         control, _, factor = name.partition(", ")

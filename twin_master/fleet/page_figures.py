@@ -1,7 +1,5 @@
 """Figures of a group of assets: a map of their health, and their health over time."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -39,20 +37,22 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
     rows = -(-count // columns)  # rounded up
     order = np.argsort(-severity(scenario, mean), kind="stable")
     is_asset = np.where(np.arange(rows * columns) < count, 1.0, np.nan).reshape(rows, columns)
-    look: dict[str, Any] = {"aspect": "auto", "interpolation": "nearest"}
     figure, panels = style.panels(
         len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
     )
     for number, (factor, (axes,)) in enumerate(zip(factors, panels, strict=True)):
         cells = np.full(rows * columns, np.nan)
         cells[: len(mean)] = factor.scale * mean[order, number]
-        axes.imshow(is_asset, cmap="Greys", vmin=0.0, vmax=2.0, **look)  # the grey background
+        axes.imshow(
+            is_asset, cmap="Greys", vmin=0.0, vmax=2.0, aspect="auto", interpolation="nearest"
+        )  # the grey background
         image = axes.imshow(
             np.ma.masked_invalid(cells.reshape(rows, columns)),
             cmap=style.LEVELS,
             vmin=factor.levels[0],
             vmax=factor.levels[-1],
-            **look,
+            aspect="auto",
+            interpolation="nearest",
         )
         axes.set_xticks([])
         axes.set_yticks([])

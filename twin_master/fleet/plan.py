@@ -3,18 +3,22 @@
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from reporting.files import hash_file
+from reporting.files import hash_file, hash_record
 from reporting.former_names import with_present_names
 from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.parts import NO_PARTS, TwinParts
+from twin_master.mission.planning import encode_policy
+from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import (
@@ -225,10 +229,13 @@ class Fleet:
         Name, title, seed and size of shards.
     groups : tuple of Group
         The groups.
+    parts : TwinParts
+        The parts of all twins that a user gives in the place of those of the scenarios.
     """
 
     head: FleetSection
     groups: tuple[Group, ...]
+    parts: TwinParts = NO_PARTS
 
     @property
     def size(self) -> int:
@@ -237,7 +244,31 @@ class Fleet:
 
     def record(self) -> dict[str, Any]:
         """Return the record of the fleet for `config.json`."""
-        return self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
+        record = self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
+        parts = self.parts.record()
+        if self.parts.policy is not None:
+            parts["policy"] = hash_record([self._policy_hash(group) for group in self.groups])
+        if parts:
+            record["parts"] = parts
+        return record
+
+    def with_parts(self, parts: TwinParts) -> "Fleet":
+        """Return the fleet with the parts that a user gives.
+
+        Raises
+        ------
+        MissionInputError
+            If the name of a part is not that of an object.
+        """
+        parts.with_objects()  # refuses a wrong name before anything is written
+        return replace(self, parts=parts)
+
+    def _policy_hash(self, group: Group) -> str:
+        """Return the hash of the given policy for the states and controls of a group."""
+        model = build_graphical_model(group.scenarios[0])
+        policy = self.parts.policy_for(model)
+        assert policy is not None
+        return sha256(encode_policy(policy, model)).hexdigest()
 
 
 def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
@@ -298,20 +329,26 @@ def _check_shared_inspections(group: Group, head: FleetSection) -> None:
 
 
 def ensemble(
-    scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD
+    scenario: LoadedScenario | str | Path,
+    seeds: range,
+    overrides: Overrides | Mapping[str, Any] | None = None,
+    *,
+    shard: int = SHARD,
 ) -> Fleet:
     """Return a fleet of one group in which one scenario is flown under many seeds.
+
+    `fly_fleet` flies it.
 
     The draws of the calibration are the same for all seeds; their seed is that of the scenario or
     of the overrides.
 
     Parameters
     ----------
-    scenario : str
-        The name of a shipped scenario, or a file.
+    scenario : LoadedScenario, str or Path
+        The scenario, its shipped name, or its file.
     seeds : range
         The seeds.
-    overrides : Overrides, optional
+    overrides : Overrides or mapping, optional
         Values that replace those of the scenario.
     shard : int
         The number of twins that are flown in one piece.

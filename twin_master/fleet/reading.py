@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonRecord
+from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.store import (
     ENDED,
@@ -274,7 +276,7 @@ class TwinsOfScenario(NamedTuple):
 
 
 def flown_twins(
-    folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Iterator[TwinsOfScenario]:
     """Yield the twins of a group that have flown, scenario by scenario.
 
@@ -303,7 +305,7 @@ def flown_twins(
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
-def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.DataTree") -> Float:
+def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree") -> Float:
     """Return the probability that each of B twins changes its control within `prediction_steps`.
 
     Parameters
@@ -392,23 +394,69 @@ def _counts_of_twins(group: "xr.DataTree") -> dict[str, Estimated | int]:
     return figures
 
 
+class _PrintedFigure(NamedTuple):
+    """How a figure of a group is printed.
+
+    Attributes
+    ----------
+    title : str
+        What it is called; the field `{of}` is the rest of its key.
+    scale : float
+        The factor from the stored to the printed values.
+    unit : str
+        The printed unit; empty for a plain number.
+    """
+
+    title: str
+    scale: float = 1.0
+    unit: str = ""
+
+
+_PRINTED_FIGURES = {
+    f"fallback within {WITHIN} ": _PrintedFigure(
+        f"assets whose control changed within {WITHIN} steps of the damage that called for it",
+        100.0,
+        "%",
+    ),
+    "early fallback": _PrintedFigure(
+        "assets whose control changed before the damage called for it", 100.0, "%"
+    ),
+    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of} (SI)"),
+    "bias of ": _PrintedFigure("mean error of the estimated {of} (SI)"),
+    "log evidence of a step": _PrintedFigure("log evidence of a step", unit="nat"),
+    "true state in the 90 % set": _PrintedFigure(
+        "steps in which the set of states with a probability of 90 % has the true one", 100.0, "%"
+    ),
+}
+"""How figures are printed, by the beginning of their keys; others are counts of assets."""
+
+
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
     """Return the figures of groups as rows of a table: a title, and a cell for each group."""
-    titles: dict[str, None] = {}  # used as an ordered set
+    keys: dict[str, None] = {}  # used as an ordered set
     for figures in groups.values():
-        titles |= dict.fromkeys(figures)
+        keys |= dict.fromkeys(figures)
     rows = []
-    for title in titles:
-        rows.append([title, *[_figure_text(figures.get(title)) for figures in groups.values()]])
+    for key in keys:
+        printed = _PrintedFigure(key)
+        for beginning, description in _PRINTED_FIGURES.items():
+            if key.startswith(beginning):
+                printed = description._replace(
+                    title=description.title.format(of=key.removeprefix(beginning))
+                )
+        cells = [_figure_text(figures.get(key), printed) for figures in groups.values()]
+        rows.append([printed.title, *cells])
     return rows
 
 
-def _figure_text(figure: Estimated | int | None) -> str:
-    """Return a figure with its standard error as text; empty if there is none."""
+def _figure_text(figure: Estimated | int | None, printed: _PrintedFigure) -> str:
+    """Return a figure with its standard error and unit as text; empty if there is none."""
     if figure is None:
         return ""
     if isinstance(figure, int):
         return str(figure)
-    if not np.isfinite(figure.error):  # one twin has no standard error
-        return f"{figure.value:.4g}"
-    return f"{figure.value:.4g} ± {figure.error:.2g}"
+    value = printed.scale * figure.value
+    error = printed.scale * figure.error
+    # One twin has no standard error.
+    text = plus_minus(value, error) if np.isfinite(error) else significant(value)
+    return f"{text} {printed.unit}".rstrip()

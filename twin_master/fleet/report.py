@@ -9,12 +9,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError, TwinMasterError
@@ -104,7 +105,7 @@ def fleet_page(folder: Path, most_assets: int) -> str:
     return page.render()
 
 
-def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
+def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
     """Return the size of a fleet, its seed, and whether it is watched or flown."""
     group_count = counted(len(fleet["groups"]), "group")
     if is_watched:  # the configuration of a watched fleet has no list of assets
@@ -114,16 +115,12 @@ def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
 
 
 def _add_flown_fleet(
-    page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, records: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
     page.add_paragraph(_opening(standings, list(groups.values())))
-    figures = {name: group_figures(group) for name, group in groups.items()}
-    WORDS.add_table(
-        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
-    )
     status = np.concatenate([stored_values(group, "status") for group in groups.values()])
     failures = endings_of(folder).failures
     if failures:
@@ -137,7 +134,6 @@ def _add_flown_fleet(
             f"{ended_early} of {len(status)} assets ended their simulation before the mission "
             "was over; what they have flown counts."
         )
-    _add_lessons(page, folder)
     for record, standing in zip(records, standings, strict=True):
         group = groups[record["name"]]
         page.add_section(f"Group {record['name']}")
@@ -148,10 +144,16 @@ def _add_flown_fleet(
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
         _add_attention_table(page, standing, most_assets)
+    page.add_section("How the twins fared")
+    figures = {name: group_figures(group) for name, group in groups.items()}
+    WORDS.add_table(
+        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
+    )
+    _add_lessons(page, folder)
 
 
 def _leaving_or_explanation(
-    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.DataTree"
+    page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Float | None:
     """Return the probability that each flown twin of a group changes its control.
 
@@ -222,7 +224,7 @@ def _damage_sentence(standings: Sequence[Standing]) -> str:
 
 
 def _add_watched_fleet(
-    page: Page, folder: Path, groups: Sequence[dict[str, Any]], most_assets: int
+    page: Page, folder: Path, groups: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a fleet that is watched, given the records of its groups."""
     standing = read_standing(folder)
@@ -347,9 +349,9 @@ def _attention_table(
     """Return the table of the assets with the given indices, in their order."""
     factors = printed_factors(standing.scenario)
     columns = []
-    for state, factor in zip(standing.scenario.state, factors, strict=True):
-        columns.append(number_column(state.name, factor.unit))
-    columns += [PageColumn("control"), number_column("change", "%")]
+    for factor in factors:
+        columns.append(number_column(factor.title, factor.unit))
+    columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
     if has_alarms:
         columns.append(number_column("alarms"))
     percentage = _leaving_percentage(standing)

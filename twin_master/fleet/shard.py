@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import finalize
 
 import numpy as np
@@ -117,7 +117,7 @@ class ShardResult(NamedTuple):
         The reasons of assets that ended their simulations early, by the name of the twin.
     """
 
-    variables: Mapping[str, NDArray[Any]]
+    variables: Mapping[str, NDArray[np.generic]]
     failures: dict[str, str]
     ended: dict[str, str]
 
@@ -135,17 +135,18 @@ class Kit:
     ----------
     packed : bytes
         Pickled: the portable scenario, the files of the prepared folder by their paths (what the
-        twins know, and the FMU), and the model that is flown without an FMU, or None.
+        twins know, and the FMU), the model that is flown without an FMU, or None, and the sensor
+        model and estimator that a user has given.
     """
 
     def __init__(self, packed: bytes) -> None:
-        scenario, files, self.wing = pickle.loads(packed)
+        scenario, files, self.wing, parts = pickle.loads(packed)
         folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)
         self._folder = folder
         self.scenario = Scenario.model_validate(scenario).with_paths_from(folder)
-        self.knowledge: Knowledge = load_knowledge(folder, self.scenario)
+        self.knowledge: Knowledge = load_knowledge(folder, self.scenario, parts=parts)
 
     def without_folder(self, sentence: str) -> str:
         """Return a sentence in which paths do not begin with the temporary folder of the kit."""
@@ -215,13 +216,17 @@ def _sentences_by_name(
 def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
     """Simulate the assets of some twins, and return the flights.
 
-    Assets without memory are flown side by side in array operations, unless the twins learn or give
-    notices; other assets are flown one after the other.
+    Assets without memory are flown side by side in array operations, unless the twins learn, give
+    notices, or have a filter that a user has given; other assets are flown one after the other.
     """
     knowledge = kit.knowledge
+    scenario = kit.scenario
+    has_plain_filter = (
+        scenario.learning is None and scenario.notice is None and not knowledge.parts.replace_filter
+    )
     truths = [knowledge.truth(member.seed) for member in members]
     with _AssetPool(kit, members) as pool:
-        if kit.scenario.learning is None and kit.scenario.notice is None:
+        if has_plain_filter:
             # An error is suppressed here: it comes again below and is recorded for each twin.
             with suppress(*FLIGHT_ERRORS):
                 assets = pool.open_stateless_assets()

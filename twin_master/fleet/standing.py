@@ -3,13 +3,13 @@
 They are read from the store of a flown fleet, or from the records of a watched one.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
 from twin_master.fleet.store import flown_rows
 from twin_master.fleet.store_layout import stored_values
@@ -68,7 +68,7 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standing:
+def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
     """Return state, control and alarms of the flown twins of a group after their last steps.
 
     The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
@@ -101,7 +101,7 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.DataTree") -> Standi
     )
 
 
-def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) -> Standing:
+def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
     """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
@@ -131,7 +131,7 @@ def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) ->
     )
 
 
-def _moments_of_states(scenario: Scenario, healths: list[dict[str, Any]], moment: str) -> Float:
+def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
     """Return a moment of each of F factors of the state of B assets, a (B, F) array.
 
     It is NaN where the record has None.

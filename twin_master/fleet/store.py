@@ -86,7 +86,7 @@ def stored_variables(
     variance = np.matmul(flights.filtered, coordinates**2) - mean**2
     fallbacks = fallbacks_of(knowledge, flights)
     notices = _notices(flights)
-    values: dict[str, Any] = {
+    values: dict[str, object] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
         **_observed_variables(knowledge.scenario, flights.observation_rows),

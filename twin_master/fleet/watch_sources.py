@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Group, asset_name, recording_files
@@ -257,7 +257,7 @@ class TopicSource:
         """Process all messages in the queue of an asset's topic; return the number of steps."""
         return self._watcher.advance(self._group, name, lambda: self._topics[name])
 
-    def _heartbeat(self) -> dict[str, Any]:
+    def _heartbeat(self) -> dict[str, object]:
         """Return the status of the watch, which the session publishes at regular intervals."""
         watches = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         return {

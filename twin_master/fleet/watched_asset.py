@@ -1,13 +1,12 @@
 """One asset of a fleet under watch, and the file with the last decisions of all assets."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from reporting.former_names import with_present_names
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import FleetError
 from twin_master.fleet.reading import probability_of_leaving, severity
 from twin_master.watch.feed import Feed
@@ -20,7 +19,7 @@ _KEPT_OF_DECISION = ("step", "control", "next_control", "probability", "health")
 """The entries of an asset's last decision that are kept."""
 
 
-def read_standing(folder: Path) -> dict[str, Any]:
+def read_standing(folder: Path) -> JsonObject:
     """Read the last decisions and alarms of the assets of a watched fleet.
 
     Parameters
@@ -50,7 +49,7 @@ def read_standing(folder: Path) -> dict[str, Any]:
     return with_present_names(standing, {"assets.*.last.turn": "step"}, str(path), FleetError)
 
 
-def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
+def counts_of(standing: JsonRecord) -> dict[str, int]:
     """Return the numbers of assets, steps, alarms, refused messages and failures.
 
     Parameters
@@ -103,7 +102,7 @@ class WatchedAsset:
         name: str,
         watch: Watch,
         feed: Feed,
-        previous_record: Mapping[str, Any] | None,
+        previous_record: JsonRecord | None,
     ) -> None:
         self.name = name
         self.watch = watch
@@ -125,9 +124,9 @@ class WatchedAsset:
             last_carried = watch.twin.carried[-1:]
             watch.filtered = watch.twin.estimator.smoothed(last_carried)[0]
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Return the last decision and the alarms of the asset; see `read_standing`."""
-        record: dict[str, Any] = {
+        record: JsonObject = {
             "last": None,
             "alarms": self._previous_alarms + len(self.alarms),
             "refused": self.watch.intake.counts.rejected,

@@ -3,15 +3,15 @@
 import json
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, explained_write_errors
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
@@ -113,7 +113,7 @@ class FleetWatch:
         self,
         fleet: Fleet,
         folder: Path,
-        tell: Callable[[WatchedAsset, Mapping[str, Any]], None],
+        tell: Callable[[WatchedAsset, JsonRecord], None],
         note: Callable[[str], None],
         *,
         follow: bool = False,
@@ -300,7 +300,7 @@ class FleetWatch:
             asset.close = closing.pop_all().close
         return asset
 
-    def _hand_on(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
+    def _hand_on(self, asset: WatchedAsset, decision: JsonObject) -> None:
         """Send a decision to the operator and to the feed of the asset, and record its alarms.
 
         A notice before the first step has no control, and is not kept as the last decision.
@@ -375,7 +375,7 @@ def _check_observed(fleet: Fleet) -> None:
         )
 
 
-def _record(fleet: Fleet) -> dict[str, Any]:
+def _record(fleet: Fleet) -> JsonObject:
     """Return the record of a watched fleet for `config.json`.
 
     It has no members, because assets are added and lost during the watch.

@@ -25,6 +25,7 @@ from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
+from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.steps import Plant, Truth
 from twin_master.network.decision_problem import DecisionProblem
@@ -69,6 +70,8 @@ class Knowledge:
     true_values : (E, S, U, G) array or None
         The values of the structure itself at the sensors, SI, which limits and rewards refer to;
         None if the sensors show them.
+    parts : TwinParts
+        The sensor model and the estimator that a user gives in the place of the scenario's.
 
     Raises
     ------
@@ -82,6 +85,7 @@ class Knowledge:
     predicted: Float
     policy: Float | BeliefPolicy | None = None
     true_values: Float | None = None
+    parts: TwinParts = NO_PARTS
 
     def __repr__(self) -> str:
         return brief(
@@ -95,9 +99,12 @@ class Knowledge:
     def sensor_model(self) -> GaussianSensorModel:
         """The sensors: their predicted values in each state, and the assumed noise.
 
-        The class is that for identified modes, whose observations contain a covariance; that for
-        inspections, if an action of the twin reads the state; or plain Gaussian sensors.
+        If the user has given a sensor model, it is that one. Otherwise the class is that for
+        identified modes, whose observations contain a covariance; that for inspections, if an
+        action of the twin reads the state; or plain Gaussian sensors.
         """
+        if self.parts.sensor_model is not None:
+            return self.parts.make_sensor_model(replace(self, parts=NO_PARTS))
         section = self.scenario.observation
         sensor_model_class: Callable[..., GaussianSensorModel] = GaussianSensorModel
         if section.modes is not None:
@@ -223,15 +230,19 @@ class Knowledge:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The estimator of the belief: the exact filter, or the learning filter.
+        """The estimator of the belief: the given one, the exact filter, or the learning filter.
 
-        If the scenario asks for notices, the estimator also watches for gauge faults.
+        If no estimator is given and the scenario asks for notices, the estimator also watches for
+        gauge faults.
 
         Raises
         ------
         InvalidModelError
             If there are too many states to give notices, or for the reasons of `learning`.
         """
+        if self.parts.estimator is not None:
+            without_estimator = replace(self, parts=replace(self.parts, estimator=None))
+            return self.parts.make_estimator(without_estimator)
         scenario = self.scenario
         filter_of_belief: Estimator = self.learning or ExactFilter(
             self.model, self.sensor_model, scenario.mission.name
@@ -375,6 +386,7 @@ def prepare_knowledge(
     source: AssetSource,
     seed: int,
     policy: Float | BeliefPolicy | None = None,
+    parts: TwinParts = NO_PARTS,
 ) -> Knowledge:
     """Return what a twin knows: calibrated draws, and predictions for every state and control.
 
@@ -390,9 +402,13 @@ def prepare_knowledge(
         The seed of the run.
     policy : (S, U) array or BeliefPolicy, optional
         The policy that is flown instead of a plan; p(U | D), row-stochastic.
+    parts : TwinParts
+        The sensor model and the estimator that a user gives in the place of the scenario's.
 
     Raises
     ------
+    MissionInputError
+        If a given part does not fit the scenario.
     InvalidModelError
         If the tables do not fit in memory, or the noise of a sensor exceeds all that it can show.
     """
@@ -406,7 +422,10 @@ def prepare_knowledge(
     }
     for key, deviation in noise_settings.items():
         check_noise(key, deviation, predicted, scenario.observation.sensor_units)
-    return Knowledge(scenario, model, draws, predicted, policy, true_values)
+    knowledge = Knowledge(scenario, model, draws, predicted, policy, true_values, parts)
+    if parts.replace_filter:
+        _ = knowledge.estimator  # made now, so that a part that does not fit is refused here
+    return knowledge
 
 
 def prepare_twin(
@@ -515,7 +534,9 @@ def link_knowledge(folder: Path, other_folder: Path) -> None:
         atomic_write_bytes(other_folder / KNOWLEDGE_NAME, content)
 
 
-def load_knowledge(folder: Path, scenario: Scenario, number: int | None = None) -> Knowledge:
+def load_knowledge(
+    folder: Path, scenario: Scenario, number: int | None = None, parts: TwinParts = NO_PARTS
+) -> Knowledge:
     """Return what the twin of a run knew before its flight.
 
     Parameters
@@ -526,6 +547,8 @@ def load_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
         The scenario in its `config.json`.
     number : int, optional
         The number of an earlier model of a watch, from 0; the last model if there is no such file.
+    parts : TwinParts
+        The sensor model and the estimator that a user gives in the place of the scenario's.
 
     Raises
     ------
@@ -554,7 +577,7 @@ def load_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
             calibration.source,
         )
         model = build_graphical_model(scenario)
-        knowledge = Knowledge(scenario, model, parameter, predicted, policy, true_values)
+        knowledge = Knowledge(scenario, model, parameter, predicted, policy, true_values, parts)
         _ = knowledge.plan  # planned now, so that arrays of another shape are refused here
         return knowledge
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:

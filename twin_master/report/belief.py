@@ -3,7 +3,7 @@
 The belief is a probability distribution over the joint states, the combinations of factor levels.
 """
 
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +20,7 @@ from reporting.words import capital
 from twin_master.report.reading import Run, short_number
 
 _SHADES = ["#ffffff", "#d3ece4", "#7fcbb2", style.PRESENT, "#003d2d"]
-_PROBABILITY_COLORS: dict[str, Any] = {
+_PROBABILITY_COLORS: style.ColorScale = {
     "cmap": LinearSegmentedColormap.from_list("probability", _SHADES),
     "vmin": 0.0,
     "vmax": 1.0,
@@ -28,13 +28,13 @@ _PROBABILITY_COLORS: dict[str, Any] = {
 _CONTROL_COLORS = ("#e9ddf0", "#b48ac9", "#7b4f96", "#4a2a63")
 _BELIEF_PANELS = 8
 """Largest number of steps for which the joint belief is drawn."""
-_MEAN_MARK: dict[str, Any] = {
+_MEAN_MARK: style.MarkStyle = {
     "marker": "D",
     "markersize": 4.0,
     "color": "white",
     "markeredgecolor": style.PRESENT,
 }
-_TRUTH_RING: dict[str, Any] = {
+_TRUTH_RING: style.LineStyle = {
     "marker": "o",
     "markersize": 9.0,
     "markerfacecolor": "none",
@@ -109,7 +109,15 @@ def _draw_joint_belief(axes: Axes, run: Run, step: int) -> QuadMesh:
     return image
 
 
-def draw_step_map(axes: Axes, run: Run, values: Float, first_number: int, **look: Any) -> QuadMesh:
+def draw_step_map(
+    axes: Axes,
+    run: Run,
+    values: Float,
+    first_number: int,
+    *,
+    rasterized: bool = False,
+    **look: Unpack[style.ColorScale],
+) -> QuadMesh:
     """Draw n values over T steps as a map of coloured cells, and return the map.
 
     Parameters
@@ -122,12 +130,14 @@ def draw_step_map(axes: Axes, run: Run, values: Float, first_number: int, **look
         The values; those of one step form a column of the map.
     first_number : int
         The vertical coordinate of the first of the n values.
-    **look : object
-        Arguments of `Axes.pcolormesh`.
+    rasterized : bool
+        Whether the cells are drawn as an image, which a file of many cells needs.
+    **look : ColorScale
+        Colours of the values, as arguments of `Axes.pcolormesh`.
     """
     step_edges = np.arange(run.step_count + 1) + run.first_step - 0.5
     value_edges = np.arange(values.shape[1] + 1) + first_number - 0.5
-    return axes.pcolormesh(step_edges, value_edges, values.T, **look)
+    return axes.pcolormesh(step_edges, value_edges, values.T, rasterized=rasterized, **look)
 
 
 def _marginal_figure(run: Run) -> Figure:
@@ -169,7 +179,9 @@ def _cell_edges(levels: Float) -> Float:
     return np.concatenate([[first_edge], middles, [last_edge]])
 
 
-def _draw_state_map(axes: Axes, run: Run, values: NDArray[Any], **look: Any) -> QuadMesh:
+def _draw_state_map(
+    axes: Axes, run: Run, values: NDArray[np.generic], **look: Unpack[style.ColorScale]
+) -> QuadMesh:
     """Draw a value for each joint state of two factors as a map, and return it.
 
     Parameters
@@ -180,8 +192,8 @@ def _draw_state_map(axes: Axes, run: Run, values: NDArray[Any], **look: Any) -> 
         The run of a state with two factors.
     values : (S,) array
         The values; the first factor is drawn along the x axis.
-    **look : object
-        Arguments of `Axes.pcolormesh`.
+    **look : ColorScale
+        Colours of the values, as arguments of `Axes.pcolormesh`.
     """
     x_levels, y_levels = (np.array(factor.levels) for factor in run.factors)
     image = axes.pcolormesh(
@@ -234,7 +246,7 @@ def _draw_policy(axes: Axes, run: Run) -> None:
     if run.true_state is not None:
         x, y = (run.factor_scales * run.true_state).T
         axes.plot(x, y, **style.TRUTH_LINE, label="truth")
-    start_mark = {**_MEAN_MARK, "marker": "o", "markersize": 6.0}
+    start_mark: style.MarkStyle = {**_MEAN_MARK, "marker": "o", "markersize": 6.0}
     x, y = estimate[0]
     axes.plot(x, y, **start_mark, label="estimate at the start")
     axes.set_xlabel(run.factors[0].label)

@@ -1,7 +1,6 @@
 """The figure of the calibration of the twin's model: measurements and uncertain parameter."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +9,7 @@ from scipy.stats import truncnorm
 
 from reporting import figures as style
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
 from reporting.words import parameter_title
 from twin_master.report.reading import Run
 
@@ -172,7 +172,7 @@ def _draw_draws(axes: Axes, draws: Float) -> None:
     )
 
 
-def _prior_range(record: Mapping[str, Any]) -> tuple[float, float]:
+def _prior_range(record: JsonRecord) -> tuple[float, float]:
     """Return the bounds of the prior in a calibration's record; infinite if it has none."""
     prior = record.get("prior", {})
     if not prior.get("standard_deviation") or "range" not in prior:
@@ -181,7 +181,7 @@ def _prior_range(record: Mapping[str, Any]) -> tuple[float, float]:
     return lowest, highest
 
 
-def _draw_prior(axes: Axes, record: Mapping[str, Any], low: float, high: float) -> None:
+def _draw_prior(axes: Axes, record: JsonRecord, low: float, high: float) -> None:
     """Plot the density of the prior, a truncated normal distribution, between two values.
 
     Nothing is plotted if the record has no prior.
@@ -200,7 +200,7 @@ def _draw_prior(axes: Axes, record: Mapping[str, Any], low: float, high: float) 
     axes.plot(x, density, color=style.PAST, linewidth=1.2, label="prior")
 
 
-def _draw_posterior(axes: Axes, record: Mapping[str, Any], low: float, high: float) -> None:
+def _draw_posterior(axes: Axes, record: JsonRecord, low: float, high: float) -> None:
     """Plot the posterior density between two values, if the record has a posterior."""
     posterior = record.get("posterior")
     if not posterior:

@@ -273,4 +273,9 @@ def caption_network(run: Run) -> ReportFigure:
         deciding_belief = "the belief predicted from its observation"
     else:
         deciding_belief = "the belief that its observation updated"
-    return WORDS.figure(NETWORK, None, step=run.step_word, deciding_belief=deciding_belief)
+    return WORDS.figure(
+        NETWORK,
+        None,  # type: ignore[arg-type]  # its drawing is a file
+        step=run.step_word,
+        deciding_belief=deciding_belief,
+    )

@@ -1,7 +1,6 @@
 """The quantities that a twin learnt during a mission, as figures and as rows of a table."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +14,7 @@ from twin_master.report.reading import Moments, Run, moments_of
 from twin_master.store.mission_result import LearntQuantity
 
 _ROW_HEIGHT = 1.55  # in inches
-_PRIOR_MARK: dict[str, Any] = {
+_PRIOR_MARK: style.IntervalStyle = {
     "color": style.PAST,
     "marker": "s",
     "markersize": 3.2,

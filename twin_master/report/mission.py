@@ -5,7 +5,7 @@ Source: Kapteyn, Pretorius and Willcox (2021), Fig. 6.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,15 +27,15 @@ _MANY_STEPS = 120  # more have no room for gaps between bars
 _MANY_DOTS = 1000  # as outlines they would make the page too large
 _BAR_HEIGHT = 0.82  # of the row of a control
 _DASHES = (0, (3, 1.2))
-_DOT: dict[str, Any] = {
+_DOT: style.LineStyle = {
     "color": style.OBSERVED,
     "linestyle": "none",
     "marker": "o",
     "markersize": 2.3,
     "markeredgewidth": 0.6,
 }
-_PREDICTED_LINE: dict[str, Any] = {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}
-_PRESENT_MARK: dict[str, Any] = {
+_PREDICTED_LINE: style.LineStyle = {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}
+_PRESENT_MARK: style.IntervalStyle = {
     "color": style.PRESENT,
     "marker": "D",
     "markersize": 4.2,
@@ -223,7 +223,7 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
         slice(now + 1, None),
         color=style.PREDICTION,
         label="prediction",
-        **_PREDICTED_LINE,
+        line=_PREDICTED_LINE,
     )
     mean = float(course.mean[now])
     lower = float(course.lower[now])
@@ -238,7 +238,13 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
 
 
 def _draw_part(
-    axes: Axes, steps: Index, course: Course, part: slice, color: str, label: str, **line: Any
+    axes: Axes,
+    steps: Index,
+    course: Course,
+    part: slice,
+    color: str,
+    label: str,
+    line: style.LineStyle | None = None,
 ) -> None:
     """Draw part of a course as a line with a band, in the steps where it has values."""
     has_value = np.isfinite(course.mean[part])
@@ -248,7 +254,7 @@ def _draw_part(
     style.band(
         axes, part_steps, course.lower[part][has_value], course.upper[part][has_value], color
     )
-    axes.plot(part_steps, course.mean[part][has_value], color=color, label=label, **line)
+    axes.plot(part_steps, course.mean[part][has_value], color=color, label=label, **(line or {}))
 
 
 def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
@@ -359,8 +365,10 @@ def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
     axes.plot(steps[later], readings[later], **_DOT, markerfacecolor="none", label="observed later")
     lost_steps = steps[until_now & np.isnan(readings)]
     if len(lost_steps):
-        cross = {**_DOT, "marker": "x", "transform": axes.get_xaxis_transform()}
-        axes.plot(lost_steps, np.full(len(lost_steps), 0.04), **cross, label="lost")
+        cross: style.LineStyle = {**_DOT, "marker": "x"}
+        near_bottom = np.full(len(lost_steps), 0.04)
+        transform = axes.get_xaxis_transform()
+        axes.plot(lost_steps, near_bottom, **cross, transform=transform, label="lost")
 
 
 def _draw_control(axes: Axes, run: Run, now: int) -> str:

@@ -29,6 +29,8 @@ from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
 """The folder of the figures in a run folder."""
+_MISSION_PICTURES = (MISSION_NOW, MISSION_WHOLE)
+"""The pictures of the mission at one step, and as a whole."""
 
 
 def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
@@ -183,8 +185,11 @@ def render_page(
     )
     pictures = _Pictures(page, drawings, figures)
     _add_outcome(page, run)
+    pictures_of_outcome = ["structure" if "structure" in figures else MISSION_NOW]
+    pictures.add(*pictures_of_outcome)
+    tables.add_figures_table(page, run)
     page.add_section("The mission")
-    pictures.add("structure", MISSION_NOW, MISSION_WHOLE)
+    pictures.add(*(name for name in _MISSION_PICTURES if name not in pictures_of_outcome))
     page.add_section("What the twin believes")
     pictures.add("belief")
     if run.learnt_quantities:
@@ -203,10 +208,12 @@ def render_page(
     pictures.add(NETWORK)
     page.add_section("The run")
     tables.add_run_table(page, run, seed)
+    page.begin_fold("Versions of the software and hashes of the inputs")
     page.add_paragraph(
         "Wall-clock times stand in timing.json, so that equal runs give equal reports."
     )
     tables.add_provenance_table(page, run)
+    page.end_fold()
     return page.render()
 
 
@@ -239,7 +246,7 @@ class _Pictures:
 
 
 def _add_outcome(page: Page, run: Run) -> None:
-    """Add the section "Outcome": opening sentences, notices, and the table of figures."""
+    """Begin the section "Outcome" with the opening sentences and the notices."""
     page.add_section("Outcome")
     page.add_paragraph(in_one_line(" ".join(opening_sentences(run))))
     if run.summary.get("asset_and_model_differ"):
@@ -267,7 +274,6 @@ def _add_outcome(page: Page, run: Run) -> None:
             f"No {run.sensors.word} reported at {steps}: "
             "there the belief followed the dynamics alone.",
         )
-    tables.add_figures_table(page, run)
 
 
 def _add_notice(page: Page, sentence: str) -> None:

@@ -1,16 +1,15 @@
 """Reading a run folder for a report: stored arrays, and printed names and units."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import RunFolderError, TwinMasterError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
@@ -199,9 +198,9 @@ class Run:
 
     tree: "xr.DataTree"
     scenario: Scenario
-    config: Mapping[str, Any]
-    summary: Mapping[str, Any]
-    calibration: Mapping[str, Any]
+    config: JsonRecord
+    summary: JsonRecord
+    calibration: JsonRecord
 
     def __getitem__(self, path: str) -> Float:
         """Return the variable at a path such as "filtered/mean"."""
@@ -369,7 +368,7 @@ def read_run(folder: Path) -> Run:
     return run
 
 
-def _read_object(path: Path) -> dict[str, Any]:
+def _read_object(path: Path) -> JsonObject:
     """Return the object in a JSON file; empty if the file is missing.
 
     Raises

@@ -1,7 +1,7 @@
 """Pictures of the structure after the last step: a wing seen from above, or a mesh's surface."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ from twin_master.scenario.schema import Scenario
 
 LOSS_COLORS = "YlOrRd"
 """Colour map of the stiffness that regions have lost."""
-_COLOR_BAR: dict[str, Any] = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
+_COLOR_BAR: style.ColorBarShape = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
 _DRAWN_DISPLACEMENT = 0.08
 """Length of the largest displacement in the picture, as a fraction of the structure's diagonal."""
 
@@ -182,7 +182,7 @@ def _draw_wing(
     *,
     values: Float,
     value_label: str,
-    look: dict[str, Any],
+    look: style.ColorScale,
 ) -> None:
     """Draw a wing from above: its regions coloured by expected loss, its gauges by values (G,)."""
     x, y = planform.outline.T
@@ -213,7 +213,7 @@ def _draw_gauges(
     positions: Float,
     values: Float,
     value_label: str,
-    look: dict[str, Any],
+    look: style.ColorScale,
 ) -> None:
     """Draw gauges at positions (G, 2) as dots coloured by values (G,).
 

@@ -1,11 +1,12 @@
 """The tables of a report: columns, cells, and the fields of titles and captions in `words.toml`."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.json_file import JsonRecord
 from reporting.page import Page, PageColumn, Table, number_column
 from reporting.words import between, in_one_line, listing, number
 from twin_master.report.captions import WORDS
@@ -17,6 +18,8 @@ from twin_master.report.learnt import (
 )
 from twin_master.report.reading import Run, moments_of
 from twin_master.store.mission_result import LearntQuantity
+from twin_master.store.printed_figures import printed_figures
+from twin_master.store.summary import Figure
 
 _HASH_DIGITS = 12
 _MICROSTRAIN = 1.0e6
@@ -53,23 +56,19 @@ def _add_table(
 
 def add_figures_table(page: Page, run: Run) -> None:
     """Add the table of the summary's figures, with reference values if the scenario has any."""
-    figures = run.summary.get("figures", [])
-    has_references = any(figure["reference"] is not None for figure in figures)
-    columns = [PageColumn("figure"), number_column("this run"), PageColumn("unit")]
+    figures = [Figure(**record) for record in run.summary.get("figures", [])]
+    has_references = any(figure.reference is not None for figure in figures)
+    columns = [PageColumn("result"), number_column("this run"), PageColumn("unit")]
     if has_references:
         columns += [number_column("reference"), PageColumn("source of the reference")]
     rows = []
-    for figure in figures:
-        row = [figure["title"], number(figure["value"]), figure["unit"]]
+    for figure, printed in zip(figures, printed_figures(figures), strict=True):
+        row = [figure.title, printed.value, figure.unit]
         if has_references:
-            reference = figure["reference"]
-            row.append("" if reference is None else number(reference))
-            row.append(figure["reference_source"])
+            row += [printed.reference, figure.reference_source]
         rows.append(row)
-    percentages = " and ".join(factor.title for factor in run.factors if factor.unit == "%")
-    points = f"Points are percentage points of {percentages}. " if percentages else ""
     references = ", beside their references" if has_references else ""
-    _add_table(page, "figures", columns, rows, references=references, points=points)
+    _add_table(page, "figures", columns, rows, references=references)
 
 
 def add_learnt_asset_table(page: Page, run: Run) -> None:
@@ -183,7 +182,7 @@ def add_calibrated_table(page: Page, run: Run) -> None:
     _add_table(page, "calibrated", columns, rows, kind=kind, asset=record["asset"], origin=origin)
 
 
-def calibrated_figures(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def calibrated_figures(record: JsonRecord) -> list[JsonRecord]:
     """Return the figures in the record of a calibration: parameters first, then quantities.
 
     Empty if the run was not calibrated from a file.
@@ -210,7 +209,7 @@ def add_run_table(page: Page, run: Run, seed: object) -> None:
         ("seed", f"{seed}"),
         ("asset", f"{run.tree.attrs.get('asset', '')}"),
         ("model that the twin believes", f"{run.tree.attrs.get('twin_model', '')}"),
-        ("log evidence of the observations", f"{run['filtered/log_evidence'].sum():.2f}"),
+        ("log evidence of the observations", f"{run['filtered/log_evidence'].sum():.0f} nat"),
         *_monitor_rows(run),
     ]
     _add_table(page, "run", [PageColumn("item"), PageColumn("value")], _with_value(rows))

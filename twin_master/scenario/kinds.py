@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 from pydantic import GetJsonSchemaHandler, ModelWrapValidatorHandler, model_validator
 from pydantic_core import CoreSchema
@@ -156,7 +156,7 @@ class KindSection(FileSection):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _validate_as_kind(cls, table: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _validate_as_kind(cls, table: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
         """Return the table as a record of the subclass that its `kind` names.
 
         A subclass with a kind of its own, and an existing record, are validated as usual.
@@ -171,6 +171,9 @@ class KindSection(FileSection):
         if "kind" not in table:
             raise missing_keys(["kind"], f"{expectation}, and it is missing")
         raise ValueError(f"{expectation}, and {short_repr(kind)} came")
+
+
+_Section = TypeVar("_Section", bound=KindSection)
 
 
 class BeliefSection(KindSection):
@@ -226,7 +229,7 @@ class AssetSection(KindSection):
         """
 
 
-def _all_subclasses(cls: type[KindSection]) -> Iterator[type[Any]]:
+def _all_subclasses(cls: type[_Section]) -> Iterator[type[_Section]]:
     """Yield the subclasses of a class, and theirs."""
     for subclass in cls.__subclasses__():
         yield subclass

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
 
 from reporting.choices import did_you_mean
 from reporting.former_names import with_present_names
@@ -35,7 +34,7 @@ _KEYS_OF_COUPLED_FMUS = ("component", "connection", "algorithm", "iterations", "
 _KEYS_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
 
 
-def from_format_1(table: Mapping[str, Any]) -> Table:
+def from_format_1(table: Mapping[str, object]) -> Table:
     """Convert the table of a scenario from format 1 to format 2.
 
     In format 1 the table `asset` also named the model that the twin believes. In format 2 the
@@ -63,7 +62,7 @@ def from_format_1(table: Mapping[str, Any]) -> Table:
     return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
 
 
-def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
+def _belief_of_format_1(asset: Mapping[str, object]) -> Table:
     """Return the table `belief` of format 2 from the table `asset` of format 1.
 
     The twin believes a library or a design if the keys name one, and otherwise the asset itself.
@@ -81,7 +80,7 @@ def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
     return belief
 
 
-def _asset_of_format_1(former: Mapping[str, Any]) -> Table:
+def _asset_of_format_1(former: Mapping[str, object]) -> Table:
     """Convert the table `asset` from format 1 to format 2.
 
     The caller has removed the keys on the believed model, except `design`. In format 1 the kind
@@ -240,7 +239,7 @@ def obstacle_to_notices(scenario: Scenario) -> str:
     return ""
 
 
-def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
+def parse_scenario(table: Mapping[str, object], source: str) -> Scenario:
     """Check the content of a scenario file, and return it as a `Scenario`.
 
     Files of earlier versions are converted first: those of format 1, and those with former names

@@ -9,7 +9,7 @@ import math
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -141,7 +141,7 @@ class Scenario(ScenarioTables):
         """Return the scenario with another seed of the run."""
         return self.with_changes("mission", seed=seed)
 
-    def with_changes(self, table: str, **changes: Any) -> Self:
+    def with_changes(self, table: str, **changes: object) -> Self:
         """Return the scenario with other values in one of its tables; they are not checked.
 
         Parameters

@@ -4,7 +4,7 @@ A key may carry its unit in its name (`levels_percent`); the value is converted 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
@@ -13,7 +13,7 @@ from reporting import toml_file
 from reporting.choices import nearest_word
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
 
-Table = dict[str, Any]
+Table: TypeAlias = toml_file.TomlTable
 """A table of a TOML or JSON file before it is checked: values of any type by key."""
 
 _BOUNDS_OF_SCHEMA = ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "default")

@@ -4,10 +4,11 @@ from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field
 
+from reporting.json_file import JsonRecord
 from reporting.toml_file import Fault, NotNegative, Number, Positive
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.observation import RecordSection
@@ -376,7 +377,7 @@ class Planner(Section):
         )
 
 
-def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
+def with_controls_of_actions(table: JsonRecord) -> JsonRecord:
     """Return the table of a scenario with a further control for each action.
 
     This control has the input values and probabilities of the action's base control. Its reward is
@@ -397,7 +398,7 @@ def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
     return extended
 
 
-def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
+def _add_control_of_action(table: Table, action: Table) -> None:
     """Add a control, its reward and probabilities for an action to a scenario's table, in place.
 
     Entries of that name are kept: the user gave them, or the table was extended before.

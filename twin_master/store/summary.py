@@ -89,6 +89,8 @@ class Fallback:
         The one state factor that the policy depends on; None if it depends on several or on none.
     switch_level : float or None
         The level of this factor, SI, from which on the policy leaves the first control.
+    switch_control : int or None
+        The index of the control that the policy takes there; None if it takes several.
     called_for_step : int or None
         The first step in which the true state reaches that level.
     fallback_step : int or None
@@ -99,6 +101,7 @@ class Fallback:
 
     switch_state: str | None = None
     switch_level: float | None = None
+    switch_control: int | None = None
     called_for_step: int | None = None
     fallback_step: int | None = None
     early_step: int | None = None
@@ -143,12 +146,15 @@ def find_fallback(
     is_called_for = true_state[:, switch.factor_index] >= switch.level - factor.slack
     called_for_step = _first_true(is_called_for)
     has_left = control_index != first_control
+    is_at_level = states.coordinates[:, switch.factor_index] >= switch.level - factor.slack
+    controls_at_level = np.unique(policy_index[is_at_level]).tolist()
     steps = len(control_index)
     is_before_call = np.arange(steps) < (steps if called_for_step is None else called_for_step)
     return Fallback(
         factor.name,
         switch.level,
-        called_for_step,
+        switch_control=controls_at_level[0] if len(controls_at_level) == 1 else None,
+        called_for_step=called_for_step,
         fallback_step=_first_true(has_left & ~is_before_call),
         early_step=_first_true(has_left & is_before_call),
     )
@@ -235,7 +241,7 @@ def summarise(
     """
     groups = [*first_groups]
     groups += _truth_figures(result) if result.flight.simulated else _watched_figures(result)
-    groups += _reward_figures(reward_mean)
+    groups += _reward_figures(reward_mean, result.scenario.mission.step_name)
     groups += _parameter_figures(result)
     groups.append(FigureGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
     groups += _learnt_figures(result)
@@ -270,7 +276,7 @@ def _schema_of(group: FigureGroup) -> Iterator[_FigureSchema]:
         )
 
 
-def _reward_figures(reward_mean: Float) -> Iterator[FigureGroup]:
+def _reward_figures(reward_mean: Float, step_name: str) -> Iterator[FigureGroup]:
     """Yield the mean of each reward over the steps, without those in which it is NaN.
 
     The mean is None if the reward is NaN in all steps.
@@ -278,7 +284,7 @@ def _reward_figures(reward_mean: Float) -> Iterator[FigureGroup]:
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         finite = rewards[np.isfinite(rewards)]
         mean = float(finite.mean()) if len(finite) else None
-        yield FigureGroup("reward", {"reward": name}, [mean])
+        yield FigureGroup("reward", {"reward": name, "step": step_name}, [mean])
 
 
 def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
@@ -440,8 +446,9 @@ def _truth_figures(result: MissionResult) -> Iterator[FigureGroup]:
     yield fallback_figures(fallback, scenario)
     errors = filtered_rms_error(knowledge.model, flight.filtered, flight.state)
     for factor, error in zip(scenario.state, errors.tolist(), strict=True):
-        scale, unit = printed_state(factor.unit, "points")
-        yield FigureGroup("error", {"state": factor.name, "unit": unit}, [scale * error])
+        scale, unit = printed_state(factor.unit, "percentage points")
+        fields = {"state": factor.name, "title": factor.title or factor.name, "unit": unit}
+        yield FigureGroup("error", fields, [scale * error])
 
 
 def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
@@ -456,7 +463,8 @@ def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
         values: list[FigureValue] = [None, None]
         if is_believed:
             values = [float(scale * mean), float(scale * deviation)]
-        yield FigureGroup("last", {"state": factor.name, "unit": unit}, values)
+        fields = {"state": factor.name, "title": factor.title or factor.name, "unit": unit}
+        yield FigureGroup("last", fields, values)
 
 
 def control_changes(
@@ -496,11 +504,17 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
 
     A single figure says so if the policy depends on no state factor, or on several.
     """
-    state = fallback.switch_state
     level = fallback.switch_level
-    if state is None or level is None:
-        return FigureGroup("nowhere", {}, ["nowhere, or by several states"])
-    scale, unit = printed_state(scenario.state[scenario.state_names.index(state)].unit)
+    first_control = scenario.mission.first_control
+    if fallback.switch_state is None or level is None:
+        return FigureGroup(
+            "nowhere", {"first": first_control}, ["none, or it depends on several states"]
+        )
+    factor = scenario.state[scenario.state_names.index(fallback.switch_state)]
+    scale, unit = printed_state(factor.unit)
+    new_control = "another control"
+    if fallback.switch_control is not None:
+        new_control = scenario.control_names[fallback.switch_control]
     fallback_step = fallback.fallback_step
     delay = fallback.delay
     if fallback.early_step is not None and delay == 0:
@@ -509,7 +523,14 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
         delay = None
     step = scenario.mission.step_name
     steps = step if delay == 1 else f"{step}s"
-    fields = {"state": state, "unit": unit, "step": step, "steps": steps}
+    fields = {
+        "title": factor.title or factor.name,
+        "first": first_control,
+        "new": new_control,
+        "unit": unit,
+        "step": step,
+        "steps": steps,
+    }
     values = [
         scale * level,
         fallback.called_for_step,

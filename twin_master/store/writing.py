@@ -13,14 +13,18 @@ from reporting.files import atomic_file, atomic_write_text, hash_record
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
+from reporting.notebook import html_table
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError
+from twin_master.pictures import plot_belief
 from twin_master.run_folder import FIELD_NAME, JsonObject, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
+from twin_master.store.printed_figures import printed_figures
 from twin_master.store.results import csv_tables, run_groups
 from twin_master.store.summary import Figure, FigureGroup, control_changes, notice_record, summarise
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from xarray import DataTree
 
 
@@ -222,6 +226,18 @@ class RunOutcome:
     def tree(self) -> "DataTree":
         """Everything that the run has stored, see `open_run`."""
         return open_run(self.folder)
+
+    def _repr_html_(self) -> str:
+        """Return the figures of the run beside their references, for a notebook."""
+        rows = []
+        for figure, printed in zip(self.figures, printed_figures(self.figures), strict=True):
+            rows.append([figure.title, printed.value, figure.unit, printed.reference])
+        headings = ("result", "this run", "unit", "reference")
+        return html_table(f"Run in {self.folder}", headings, rows, self.notices)
+
+    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+        """Draw the believed state over the steps, see `plot_belief`."""
+        return plot_belief(self, axes)
 
 
 def read_outcome(folder: Path) -> RunOutcome:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from discrepancy.estimation.effects import EffectLaws
-from discrepancy.estimation.estimator import EstimatorStart, MotionEstimator
+from discrepancy.estimation.estimator import MotionEstimator
+from discrepancy.estimation.gauss_newton import EstimatorStart
 from discrepancy.estimation.linearised import Trajectory
 from discrepancy.estimation.refinement import refine_hypotheses, unknowns_of_model_laws
 from discrepancy.fits.candidate import Candidate

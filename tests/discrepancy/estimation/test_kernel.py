@@ -98,3 +98,25 @@ def test_a_linear_law_in_the_steps_is_of_second_order_in_their_length():
         )
         errors.append(np.abs(np.linalg.multi_dot(transition[::-1]) - exact).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_stiff_law_reverses_no_motion_within_a_substep():
+    """Dry friction of a body that sticks: a damper that stops the motion far within a substep."""
+    generator = np.zeros((2, 2))
+    generator[0, 1] = 1.0
+    direction = np.array([[0.0], [-1.0]])
+    length = np.array([1.0])
+    begin, end = input_matrices(generator, length)
+    for damping, fastest in ((0.5, 0.7), (30.0, 0.05)):
+        transition, _ = substep_matrices_with_laws(
+            1,
+            np.zeros(2, dtype=np.int64),
+            expm(generator)[None],
+            np.zeros((1, 2, 2)),
+            begin @ direction,
+            end @ direction,
+            np.repeat(np.array([[[0.0, damping]]]), 2, axis=0),
+            np.zeros((2, 1, 1)),
+            np.zeros((1, 2, 1)),
+        )
+        assert 0.0 <= transition[0, 1, 1] < fastest

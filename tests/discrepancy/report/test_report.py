@@ -27,6 +27,7 @@ from discrepancy.judgement.separability import (
     Separability,
     compute_separability,
 )
+from discrepancy.pictures import plot_missing_force
 from discrepancy.report.decidability_text import (
     campaign_needs,
     confused_effects,
@@ -85,7 +86,13 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     )  # fmt: skip
     places = [text.index(words) for words in opening]
     assert places == sorted(places)
-    assert f">{number(held.chi_square_per_sample, 4)}<" in text
+    # one line says what is missing, where, how large and how sure that is; the others are unfolded
+    size = f"{number(force.rms)} N (rms) at {force.port}"
+    card = f"Quadratic aerodynamic damping at {force.port} is missing; {size}"
+    assert f'class="card">{card}; probability {probability_text(drag.verdict.probability)}.<' in text
+    assert text.index('class="card"') < text.index("<details>") < places[0]
+    assert f">{number(held.chi_square_per_sample)}<" in text
+    assert "rms residual of leaf strain (µε)<" in text
     for name, factor in (("displacement", 1e3), ("leaf_strain", 1e6)):
         assert f">{number(factor * held.rms[name])}<" in text
     # gates say what they compare
@@ -106,6 +113,20 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     text = page_of(replace(drag, proof=None), **unproved)
     assert "of the mean square error" not in text
     assert "p of the consistency; a fit has at least 0.001" in text
+
+
+def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(drag):
+    text = drag._repr_html_()
+    assert drag.verdict.sentence in html.unescape(text)
+    assert "quadratic aerodynamic damping" in text.lower()
+    panels = drag.plot()
+    assert len(panels) == len(drag.missing.courses[:6])
+    for panel, course in zip(panels, drag.missing.courses, strict=False):
+        force, law = panel.get_lines()
+        np.testing.assert_array_equal(force.get_ydata(), course.force)
+        np.testing.assert_array_equal(law.get_ydata(), course.law)
+    with pytest.raises(ValueError, match="has no missing force"):
+        plot_missing_force(replace(drag, missing=None))
 
 
 def test_members_of_a_group_stand_apart_and_first(drag):

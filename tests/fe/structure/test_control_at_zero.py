@@ -1,4 +1,4 @@
-"""A bar of one hexahedron: loads whose control is nominally zero, and elements that are not built."""
+"""A bar of one hexahedron: loads with a control of zero, and elements that are not built."""
 
 from pathlib import Path
 
@@ -97,7 +97,10 @@ def test_hexahedra_that_are_not_those_of_this_project_are_refused(tmp_path, kind
 
 @pytest.mark.parametrize("kind", ["C3D8IH", "C3D8RT", "C3D8HT", "C3D8S"])
 def test_every_other_variant_of_a_hexahedron_is_refused_by_its_name(tmp_path, kind):
-    sentence = f"line 10: elements of type {kind} cannot be read: they are other elements, not C3D8; .*C3D20R"
+    sentence = (
+        f"line 10: elements of type {kind} cannot be read: "
+        "they are other elements, not C3D8; .*C3D20R"
+    )
     with pytest.raises(MeshError, match=sentence):
         load_and_assemble(bar(tmp_path, kind=kind))
 
@@ -143,7 +146,7 @@ def slender(folder: Path, kind: str) -> Path:
 @needs_calculix
 @pytest.mark.parametrize("kind", ["C3D20", "C3D20R"])
 def test_calculix_agrees_about_hexahedra_of_full_and_reduced_integration(tmp_path, kind):
-    """The reduced one is softer: the same deck with the other one is off by more than the agreement."""
+    """The reduced element is softer: with the other one, the deck is off by more."""
     structure = load_and_assemble(slender(tmp_path, kind), mass_as_stiffness=True)
     assert structure.mesh.kind.calculix == kind
     differences = agreement(structure_deck(structure), tmp_path, 2).loads["push"]

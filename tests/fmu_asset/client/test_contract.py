@@ -1,4 +1,4 @@
-"""What holds of every asset, whatever its FMU is: one of our own, of others, or a system of several."""
+"""What holds of every asset: of our own FMUs, of others, and of systems of several."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -63,10 +63,18 @@ def onwards(asset: FmiAsset, kind: Kind) -> Bits:
 
 
 IN_A_WORKER = (
-    "wing in motion", "compiled wing in motion", "wing of FMI 3 in motion",
-    "model exchange wing of FMI 3 in motion", "spring", "FMI 1", "FMI 2 of a Modelica tool", "whole arrays",
-    "model exchange of FMI 3 with a time event", "lines in model exchange", "a system",
-)  # fmt: skip
+    "wing in motion",
+    "compiled wing in motion",
+    "wing of FMI 3 in motion",
+    "model exchange wing of FMI 3 in motion",
+    "spring",
+    "FMI 1",
+    "FMI 2 of a Modelica tool",
+    "whole arrays",
+    "model exchange of FMI 3 with a time event",
+    "lines in model exchange",
+    "a system",
+)
 """One of each sort: how packed, version, interface, way of states, arrays, lines."""
 
 
@@ -86,7 +94,8 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(
             extra = np.array(list(history.extra.values())).reshape(-1, STEPS).T
             rows = zip(history.values, extra, history.time, strict=True)
             assert [(row.tobytes(), more.tobytes(), time) for row, more, time in rows] == single
-            # All are in the same state, and the inputs are held. An FMU may write addresses into its own.
+            # All are in the same state, and the inputs are held. An FMU may write addresses into
+            # its own.
             saved = SavedState.from_bytes(whole.save_state())
             assert saved.model_copy(update={"body": b""}) == now.model_copy(update={"body": b""})
             assert kind.state == "serialised" or saved.body == now.body
@@ -124,7 +133,7 @@ def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, name
         sibling.close()
         assert onwards(asset, kind) == there
         fork.close()
-        # Back in the same instance, and in another one, here: of some the first is in a process of its own.
+        # Back in the same instance, and in another one here: the first may be in another process.
         other.step(**kind.at(1))
         for one in (asset, other):
             one.restore_state(saved)

@@ -1,4 +1,4 @@
-"""What an FMU is told before its first step: the end of the experiment, enumerations by name, texts."""
+"""What an FMU is told before its first step: end of the experiment, enumerations, texts."""
 
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,10 @@ def test_a_stop_time_of_the_binding_is_told(foreign_fmu) -> None:
 
 
 def test_a_start_without_an_end_names_the_key(foreign_fmu) -> None:
-    words = r"(?s)told no end of the experiment.*give `stop_time` in the table \[binding\].*must be given"
+    words = (
+        r"(?s)told no end of the experiment.*"
+        r"give `stop_time` in the table \[binding\].*must be given"
+    )
     asset = FmiAsset(foreign_fmu("siren2", WANTS_A_DAY), bound(900.0, SIREN))
     with pytest.raises(errors.FmuCallError, match=words):
         asset.reset()
@@ -106,7 +109,10 @@ def test_an_input_moves_through_items_by_name_or_number(foreign_fmu, history) ->
 @pytest.mark.parametrize("value", [2, 4, "noisy"])
 def test_a_value_that_an_enumeration_does_not_define_is_refused(foreign_fmu, value) -> None:
     binding = bound(1.0, SIREN, control={"switch": ("switch", "1")})
-    words = r"control\.switch must be an item of the enumeration 'switch' \(quiet = 1, loud = 3\), but is "
+    words = (
+        r"control\.switch must be an item of the enumeration 'switch' "
+        r"\(quiet = 1, loud = 3\), but is "
+    )
     asset = FmiAsset(foreign_fmu("siren2"), binding, isolated=False)
     with asset, pytest.raises(errors.FmuInputError, match=words):
         asset.step({"switch": value})

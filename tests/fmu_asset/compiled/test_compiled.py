@@ -273,7 +273,7 @@ def test_the_windows_binary_needs_only_libraries_of_every_windows(windows_fmu, t
 def test_the_windows_binary_gives_the_same_under_wine(
     windows_fmu, compiler, run_in_wine, tmp_path, folder_name
 ):
-    """Statics, bound and modes to the last bit, also from a folder with letters of other scripts."""
+    """Statics, bound and modes to the last bit, also from a folder with letters beyond ASCII."""
     folder = tmp_path / folder_name
     shutil.unpack_archive(windows_fmu, folder, "zip")
     host = folder / "host"

@@ -382,23 +382,28 @@ def test_no_variables_in_python_have_no_values(python_slave):
     assert list(python_slave.fmu.getReal([])) == []
 
 
-def test_a_step_after_termination_is_refused(slave):
+@pytest.fixture
+def terminated(slave) -> Slave:
+    """An instance that was terminated after a step."""
     assert slave.start() == OK
     assert slave.step(LEVEL_FLIGHT, 0.0, 1.0) == OK
     slave.fmu.terminate()
+    return slave
 
-    assert slave.step(LEVEL_FLIGHT, 1.0, 1.0) != OK
 
-    first_result = slave.everything()[RESULTS.start]
+def test_a_step_after_termination_is_refused(terminated):
+    assert terminated.step(LEVEL_FLIGHT, 1.0, 1.0) != OK
+    assert "after termination" in terminated.log[-1][1] or is_compiled(terminated)
+
+
+def test_results_can_be_read_after_termination(terminated):
+    first_result = terminated.everything()[RESULTS.start]
+
     assert first_result != 0.0
-    assert "after termination" in slave.log[-1][1] or is_compiled(slave)
 
 
-def test_an_instance_starts_again_after_termination(slave):
-    assert slave.start() == OK
-    slave.fmu.terminate()
-
-    assert slave.start() == OK
+def test_an_instance_starts_again_after_termination(terminated):
+    assert terminated.start() == OK
 
 
 def test_an_initialisation_that_was_not_entered_cannot_be_left(compiled_slave):

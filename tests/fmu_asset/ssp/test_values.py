@@ -1,10 +1,8 @@
 """Values of parameter sets that are no numbers: texts, and items of enumerations by their names."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fmu_asset.coupling.asset import CoupledAsset
@@ -46,7 +44,7 @@ Pack = Callable[..., Path]
 
 @pytest.fixture
 def alarm(foreign_fmu, tmp_path: Path) -> Pack:
-    """Return what packs a siren with a parameter set: `alarm("siren2", binding, name=value element)`."""
+    """Pack a siren with a parameter set: its model, the binding, and value elements by name."""
 
     def pack(model: str, binding: str, parameters: dict[str, str]) -> Path:
         rows = (
@@ -65,65 +63,104 @@ def alarm(foreign_fmu, tmp_path: Path) -> Pack:
 
 
 def heard(wiring: Wiring) -> float:
-    """Return the sound of a siren after a step: 10 if loud, 1 if quiet, plus the length of its label."""
+    """Return the sound of a siren after a step.
+
+    It is 10 if loud and 1 if quiet, plus the length of its label.
+    """
     with CoupledAsset(wiring, watch("siren.y", step_size=0.1), isolated=False) as asset:
         return float(asset.step().values[0])
 
 
-@pytest.mark.parametrize(
-    ("binding", "text_name", "item_name"),
-    [
-        (IN_THE_FILE, "siren.label", "siren.loudness"),
-        (BESIDE, "siren.label", "siren.loudness"),
-        (MAPPED, "name", "horn"),
-    ],
-    ids=["in the file", "in a file of its own", "by a mapping"],
-)
-def test_a_text_and_an_item_are_set_on_the_fmu(
-    alarm, binding, text_name, item_name, tmp_path
-) -> None:
-    """Also a text that looks like a number; both are written as they were read."""
+NUMBER_LIKE_TEXT = "1,25 é"
+WAYS_OF_VALUES = {
+    "in the file": (IN_THE_FILE, "siren.label", "siren.loudness"),
+    "in a file of its own": (BESIDE, "siren.label", "siren.loudness"),
+    "by a mapping": (MAPPED, "name", "horn"),
+}
+"""The binding, and the names of text and item in it."""
+
+
+@pytest.fixture(params=WAYS_OF_VALUES)
+def alarm_with_text(request, alarm) -> Path:
+    """A file that sets a text, which looks like a number, and an item of an enumeration."""
+    binding, text_name, item_name = WAYS_OF_VALUES[request.param]
     parameters = {
-        text_name: '<ssv:String value="1,25 é"/>',
+        text_name: f'<ssv:String value="{NUMBER_LIKE_TEXT}"/>',
         item_name: '<ssv:Enumeration value="loud"/>',
     }
-    path = alarm("siren2", binding, parameters)
-    wiring = join_ssp(read_ssp(path, tmp_path / "fmus"))
-    assert wiring.settings["siren"] == {"label": "1,25 é", "loudness": 3.0}
+    return alarm("siren2", binding, parameters)
+
+
+def join_file(path: Path, folder: Path) -> Wiring:
+    """Read a file, extract its FMUs into a folder, and join them."""
+    return join_ssp(read_ssp(path, folder))
+
+
+def test_a_text_and_an_item_are_read(alarm_with_text, tmp_path):
+    wiring = join_file(alarm_with_text, tmp_path / "fmus")
+
+    assert wiring.settings["siren"] == {"label": NUMBER_LIKE_TEXT, "loudness": 3.0}
     assert wiring.left_out == []
-    assert heard(wiring) == 10.0 + len("1,25 é".encode())
-    check = check_ssp(path)
+
+
+def test_a_text_and_an_item_are_set_on_the_fmu(alarm_with_text, tmp_path):
+    wiring = join_file(alarm_with_text, tmp_path / "fmus")
+
+    assert heard(wiring) == 10.0 + len(NUMBER_LIKE_TEXT.encode())
+
+
+def test_a_text_and_an_item_are_checked(alarm_with_text):
+    check = check_ssp(alarm_with_text)
+
     assert (check.problems, check.parameters) == ((), 2)
-    again = join_ssp(read_ssp(write_ssp(wiring, tmp_path / "again.ssp"), tmp_path / "more"))
+
+
+def test_a_text_and_an_item_are_written_as_they_were_read(alarm_with_text, tmp_path):
+    wiring = join_file(alarm_with_text, tmp_path / "fmus")
+
+    again = join_file(write_ssp(wiring, tmp_path / "again.ssp"), tmp_path / "more")
+
     assert again.settings == wiring.settings
     assert heard(again) == heard(wiring)
 
 
 @pytest.mark.parametrize("model", ["siren1", "siren3"])
-def test_an_fmu_of_another_version_takes_a_text(alarm, model, tmp_path) -> None:
-    plain = alarm(model, BESIDE, {"siren.broken": '<ssv:Real value="0"/>'}).rename(
-        tmp_path / "plain.ssp"
-    )
-    path = alarm(model, BESIDE, {"siren.label": '<ssv:String value="horn"/>'})
-    sounds = [heard(join_ssp(read_ssp(each, tmp_path / each.stem))) for each in (path, plain)]
-    assert sounds[0] == sounds[1] + len("horn")
+def test_an_fmu_of_another_version_takes_a_text(alarm, model, tmp_path):
+    without_text = alarm(model, BESIDE, {"siren.broken": '<ssv:Real value="0"/>'})
+    sound_without_text = heard(join_file(without_text, tmp_path / "without"))
+    with_text = alarm(model, BESIDE, {"siren.label": '<ssv:String value="horn"/>'})
+
+    sound = heard(join_file(with_text, tmp_path / "with"))
+
+    assert sound == sound_without_text + len("horn")
 
 
-def test_a_text_stays_after_a_reset_and_another_one_is_another_system(foreign_fmu) -> None:
-    """Where the same system has another text, no state of it is taken."""
-    siren = Component("siren", foreign_fmu("siren2"), {"label": ComponentSetting("horn")})
-    other = replace(siren, settings={"label": ComponentSetting("whistle")})
-    binding = watch("siren.y", step_size=0.1)
-    first, second = (
-        CoupledAsset(SystemStructure("s", (c,)), binding, isolated=False) for c in (siren, other)
-    )
-    with first, second:
-        sounds = []
-        for asset in (first, second):
-            asset.step()
-            asset.reset({})
-            sounds.append(asset.step().values[0])
-        np.testing.assert_array_equal(sounds, [1.0 + len("horn"), 1.0 + len("whistle")])
+@pytest.fixture
+def open_siren(foreign_fmu) -> Callable[[str], CoupledAsset]:
+    """A function that opens a system of one siren with a text."""
+
+    def open_with(text: str) -> CoupledAsset:
+        siren = Component("siren", foreign_fmu("siren2"), {"label": ComponentSetting(text)})
+        binding = watch("siren.y", step_size=0.1)
+        return CoupledAsset(SystemStructure("s", (siren,)), binding, isolated=False)
+
+    return open_with
+
+
+@pytest.mark.parametrize("text", ["horn", "whistle"])
+def test_a_text_stays_after_a_reset(open_siren, text):
+    with open_siren(text) as asset:
+        asset.step()
+        asset.reset({})
+
+        (sound,) = asset.step().values
+
+    assert sound == 1.0 + len(text)
+
+
+def test_a_system_with_another_text_is_another_system(open_siren):
+    """So that no state of one is taken by the other."""
+    with open_siren("horn") as first, open_siren("whistle") as second:
         assert first.description.sha256 != second.description.sha256
 
 

@@ -1,4 +1,4 @@
-"""FMUs that do what they must not: the twin lives on, says what happened, and leaves nothing behind."""
+"""FMUs that do what they must not: the twin lives on, says so, and leaves nothing behind."""
 
 import json
 import os
@@ -30,7 +30,7 @@ REPLAYED = changed(HOSTILE, header={"state": "replay"})
 FREE = changed(HOSTILE, limits={"sandbox": False})
 LIMITS = {"step_timeout": 30.0, "load_timeout": 30.0, "memory_limit": 400.0}
 NEVER_ANSWERED = 5.0
-"""Limit [s] that FMUs reach which never answer; a loaded machine, too, makes a sound step in less."""
+"""Limit [s] of FMUs that never answer; a loaded machine, too, makes a sound step in less."""
 Hostile = Callable[..., FmiAsset]
 
 
@@ -43,7 +43,7 @@ def hostile(foreign_fmu: Any) -> Hostile:
 
 
 def cases(table: str) -> pytest.MarkDecorator:
-    """Return the parametrisation by a table of the file: what is done, the error, and its sentence."""
+    """Return the parametrisation by a table: what is done, the error, and its sentence."""
     rows = [
         (row["what"], getattr(errors, row["error"]), row["sentence"])
         for row in MISBEHAVIOURS[table]
@@ -191,7 +191,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
 
 @contextmanager
 def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A twin in another process that carries out these lines with its asset, and is killed in the end."""
+    """A twin in another process that runs these lines with its asset, and is killed in the end."""
     program = (
         "import json, sys\n"
         "from fmu_asset.client.binding import parse_binding\n"
@@ -220,7 +220,7 @@ def kill_supervisor(worker: int | None) -> None:
 
 @pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
 def test_nothing_is_left_when_the_supervisor_is_killed(hostile, scratch, end) -> None:
-    """The worker has cleared its parent-death signal, and what it has started is in a session of its own."""
+    """The worker has cleared its parent-death signal; what it has started has its own session."""
     with hostile(f"ESCAPE={end}", binding=FREE, step_timeout=NEVER_ANSWERED) as asset:
         asset.step(), asset.step()
         if end == "hang()":
@@ -297,7 +297,7 @@ def test_an_fmu_in_python_that_spoils_what_we_share(
 
 @pytest.mark.parametrize("misbehaviour", [8, 9], ids=["loop", "hold"])
 def test_an_fmu_in_python_that_loops(spring_mass, scratch, misbehaviour) -> None:
-    """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
+    """It holds the interpreter of the worker, which neither the limit nor a dead twin needs."""
     load = {"misbehaviour": misbehaviour}
     asset = FmiAsset(spring_mass, SPRING_BINDING, step_timeout=NEVER_ANSWERED)
     with asset, pytest.raises(errors.FmuTimeoutError, match=r"longer than 5 s for the step"):

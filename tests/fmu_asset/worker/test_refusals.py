@@ -190,5 +190,6 @@ def test_where_the_system_forbids_tracing_the_report_says_so() -> None:
         report = RefusalReport(file)
         assert report.verdict() == "skipped"
         assert report.sentence() == (
-            "What the sandbox refuses could not be counted on this machine (Operation not permitted)."
+            "What the sandbox refuses could not be counted on this machine "
+            "(Operation not permitted)."
         )

@@ -84,7 +84,7 @@ Target = Callable[[str], str]
 
 @pytest.fixture
 def target(tmp_path: Path, key: Path) -> Iterator[Target]:
-    """Return what is attempted upon, by name, as the FMU is told it; it says whether it reached it."""
+    """Return what the FMU is told to reach, by name; it says whether it reached it."""
     inet, unix, stream, datagram = (
         socket.AF_INET,
         socket.AF_UNIX,
@@ -222,9 +222,15 @@ def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch) -> 
 def sampled(fmu: Path) -> SamplingGrid:
     """Return a grid of two points."""
     return SamplingGrid(
-        fmu=str(fmu), binding=str(BINDINGS_FOLDER / "hostile2_damaged.toml"), role="y", parameter="",
-        draws=(0.0,), settling_steps=5, states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
-    )  # fmt: skip
+        fmu=str(fmu),
+        binding=str(BINDINGS_FOLDER / "hostile2_damaged.toml"),
+        role="y",
+        parameter="",
+        draws=(0.0,),
+        settling_steps=5,
+        states={"damage": (0.0, 0.1)},
+        controls={"go": {"u": 1.0}},
+    )
 
 
 def test_components_and_samplers_are_confined_too(attempting, key, tmp_path) -> None:
@@ -257,7 +263,7 @@ def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(
 
 @pytest.mark.parametrize("version", [1, 3, 5, 6])
 def test_what_older_kernels_know_is_asked_of_them(tmp_path, key, version) -> None:
-    """By the rights of that version, which newer kernels take as well; its own files can be made."""
+    """By the rights of that version, which newer kernels take, too; its own files can be made."""
     own = tmp_path / "own"
     own.mkdir()
     program = (
@@ -279,7 +285,7 @@ def test_what_older_kernels_know_is_asked_of_them(tmp_path, key, version) -> Non
 
 @pytest.mark.parametrize("trap", ['symlink(TARGET,"worker.log")', 'mkfifo("worker.log",0600)'])
 def test_a_trap_in_the_place_of_the_log(attempting, key, trap) -> None:
-    """The twin, which may read the key, reads the last words of a worker that has died, not the key."""
+    """The twin may read the key, but reads the last words of a worker that died, not the key."""
     asset = attempting(f'(unlink("worker.log"),{trap},raise(SIGKILL))', key)
     assert not refused(asset, "SIGKILL", errors.FmuWorkerError).messages
 

@@ -1,0 +1,535 @@
+"""Gauss-Newton's method for the motion, the missing force and the unknowns of a hypothesis.
+
+The trials are linearised along the last trajectory, and one filter and one smoother give the next
+one, until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4,
+626-636; damped: Särkkä and Svensson 2020, ICASSP). The innovations at the end give the evidence by
+Laplace's approximation.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Protocol
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.missing_force.filtered import (
+    LEAST_PRECISION,
+    Process,
+    Regression,
+    Solution,
+    integrate_out_last,
+)
+from discrepancy.missing_force.process_search import prior_log_density
+from discrepancy.missing_force.trial import PortedTrial
+
+from .laws import LawForce
+from .linearised import (
+    LawArguments,
+    LinearisedForce,
+    LinearisedSensorErrors,
+    LinearisedTrial,
+    SmoothedTrial,
+    Trajectory,
+)
+
+MOST_ITERATIONS = 12
+"""Largest number of linearisations at one size of the missing force."""
+CONVERGED_STEP = 0.02
+"""Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
+CONVERGED_EVIDENCE = 0.05
+"""Change of the log evidence below which the iteration has converged [nat]."""
+LEAST_RISE, MOST_STAGNANT_ITERATIONS = 0.5, 2
+"""Rise of the log evidence that counts as progress [nat], and the number of iterations in a row
+without progress after which the iteration ends."""
+STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Fractions of a step that are tried in turn."""
+LONGEST_STEP = 2.0
+"""Longest step of the unknown of an effect, in prior standard deviations."""
+
+
+class HypothesisLaws(Protocol):
+    """The laws and sensor errors of a hypothesis, as the estimator needs them."""
+
+    @property
+    def effect_unknown_count(self) -> int:
+        """The number E of unknowns of its effects, each with a standard normal prior."""
+
+    def linearise_along_trajectory(
+        self, arguments: LawArguments
+    ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
+        """Return forces at ports and changes of readings along a trajectory, and derivatives.
+
+        Parameters
+        ----------
+        arguments : LawArguments
+            The trial, its motion, and the values of unknowns.
+
+        Returns
+        -------
+        (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
+            The forces by the number of the port, and the changes of the readings; None if an effect
+            is not possible at these values.
+        """
+
+    def forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, LawForce] | None:
+        """Return the forces of all laws at ports along a trajectory, not their derivatives.
+
+        Parameters
+        ----------
+        arguments : LawArguments
+            The trial, its motion, and the values of unknowns.
+
+        Returns
+        -------
+        mapping of int to LawForce or None
+            The forces by the number of the port; None if an effect is not possible at these values.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class MotionEstimate:
+    """A hypothesis at its most probable values, estimated together with the motion of the trials.
+
+    Attributes
+    ----------
+    effect : (E,) ndarray
+        The unknowns of its effects, with standard normal prior.
+    shared : (K,) ndarray
+        The unknowns that all trials share.
+    local : tuple of (L,) ndarray
+        The unknowns of each trial alone.
+    covariance : (K + E, K + E) ndarray
+        The covariance of shared unknowns and effect parameters.
+    processes : mapping of int to Process
+        The forces that remain missing with its laws, by the numbers of their ports.
+    log_evidence : float
+        The log evidence with the priors of the processes [nat].
+    trials : tuple of SmoothedTrial
+        The motion and the missing forces of each trial.
+    converged : bool
+        Whether the last step was short enough.
+    speed_window : float
+        The half width of the window of speeds with which it was estimated, see `LawArguments`.
+    """
+
+    effect: FloatArray
+    shared: FloatArray
+    local: tuple[FloatArray, ...]
+    covariance: FloatArray
+    processes: Mapping[int, Process]
+    log_evidence: float
+    trials: tuple[SmoothedTrial, ...]
+    converged: bool
+    speed_window: float
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """All trials, linear along their trajectories.
+
+    Attributes
+    ----------
+    trials : tuple of LinearisedTrial
+        The trials.
+    prior_precision : (K + E,) ndarray
+        The prior precisions of the shared unknowns, and of those of the effects.
+    """
+
+    trials: tuple[LinearisedTrial, ...]
+    prior_precision: FloatArray
+
+    def solve(self) -> tuple[Solution, list[FloatArray]]:
+        """Return the most probable values of all unknowns.
+
+        Returns
+        -------
+        solution : Solution
+            The shared unknowns, then those of effects.
+        local : list of (L,) array
+            The unknowns of each trial alone.
+        """
+        # normal equations of the shared and effect unknowns, summed over the trials
+        sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
+        half_log_determinant = 0.0
+        for linear_trial in self.trials:
+            products, half_determinant = linear_trial.whitened_products
+            products_without_local, half_determinant_without_local = integrate_out_last(
+                products, np.asarray(half_determinant), linear_trial.trial.local_precision
+            )
+            sum_of_products += products_without_local
+            half_log_determinant += float(half_determinant_without_local)
+        regression = Regression(sum_of_products, half_log_determinant)
+        all_unknowns = range(len(self.prior_precision))
+        solution = regression.solve(all_unknowns, self.prior_precision)
+        local = [self._local_unknowns(linear_trial, solution.mean) for linear_trial in self.trials]
+        return solution, local
+
+    def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
+        """Return the same linear trials with other missing forces."""
+        trials = tuple(replace(trial, processes=processes) for trial in self.trials)
+        return Linearisation(trials, self.prior_precision)
+
+    def _local_unknowns(
+        self, linear_trial: LinearisedTrial, shared_and_effect: FloatArray
+    ) -> FloatArray:
+        """Return the most probable unknowns (L,) of a trial alone, given the others.
+
+        Parameters
+        ----------
+        linear_trial : LinearisedTrial
+            The trial.
+        shared_and_effect : (K + E,) array
+            The values of the shared unknowns, and of those of effects.
+        """
+        # the rows of the local unknowns in the normal equations, with the others on the right side
+        products, _ = linear_trial.whitened_products
+        first_local = 1 + len(shared_and_effect)
+        precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
+        right_side = (
+            products[first_local:, 0] - products[first_local:, 1:first_local] @ shared_and_effect
+        )
+        return np.linalg.solve(
+            products[first_local:, first_local:] + np.diag(precision), right_side
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorStart:
+    """The values and trajectories with which an estimate begins.
+
+    Attributes
+    ----------
+    effect, shared : (E,), (K,) ndarray
+        The unknowns of effects, and those that all trials share.
+    trajectories : tuple of Trajectory
+        The trajectory of each trial.
+    processes : mapping of int to Process
+        The missing forces. They are large enough for the trajectory to follow the readings with any
+        laws.
+    """
+
+    effect: FloatArray
+    shared: FloatArray
+    trajectories: tuple[Trajectory, ...]
+    processes: Mapping[int, Process]
+
+    def law_arguments(self, trial_index: int, speed_window: float) -> LawArguments:
+        """Return the arguments of the laws in a trial; `speed_window` as in `LawArguments`."""
+        return LawArguments(
+            trial_index, self.trajectories[trial_index], self.effect, self.shared, speed_window
+        )
+
+
+def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
+    """Return the start of an estimate that continues from the result of another one."""
+    return EstimatorStart(
+        estimate.effect,
+        estimate.shared,
+        tuple(smoothed.trajectory for smoothed in estimate.trials),
+        estimate.processes,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GaussNewton:
+    """Gauss-Newton iterations of hypotheses on the same trials, under given missing forces.
+
+    Attributes
+    ----------
+    trials : tuple of PortedTrial
+        The dynamic trials.
+    shared_precision : (K,) ndarray
+        The prior precisions of the shared unknowns.
+    prior_medians : mapping of int to Process
+        The prior medians of the missing forces, by the number of the port.
+    """
+
+    trials: tuple[PortedTrial, ...]
+    shared_precision: FloatArray
+    prior_medians: Mapping[int, Process]
+
+    def iterate(
+        self,
+        laws: HypothesisLaws,
+        start: EstimatorStart,
+        speed_window: float,
+        most_iterations: int = MOST_ITERATIONS,
+    ) -> MotionEstimate | None:
+        """Return the estimate under given missing forces, by damped Gauss-Newton steps.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values and trajectories to begin with, and the missing forces.
+        speed_window : float
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
+        most_iterations : int
+            The largest number of linearisations.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The last estimate; None if the laws are not possible along the first trajectories, or if
+            the first evidence is not finite.
+        """
+        current = start
+        last_evidence = -inf
+        estimate: MotionEstimate | None = None
+        stagnant_iterations = 0
+        largest_evidence = -inf
+        for _ in range(most_iterations):
+            linear = self.linearise(laws, current, speed_window)
+            if linear is None:
+                return estimate
+            new_estimate = self._estimate_of_linearisation(
+                linear, current, last_evidence, speed_window
+            )
+            if new_estimate is None:
+                return estimate
+            estimate = new_estimate
+            if estimate.log_evidence > largest_evidence + LEAST_RISE:
+                stagnant_iterations = 0
+            else:
+                stagnant_iterations += 1
+            largest_evidence = max(largest_evidence, estimate.log_evidence)
+            if estimate.converged or stagnant_iterations == MOST_STAGNANT_ITERATIONS:
+                return estimate
+            last_evidence = estimate.log_evidence
+            next_start = self._take_step(laws, current, estimate, linear, speed_window)
+            if next_start is None:
+                return estimate
+            current = next_start
+        return estimate
+
+    def _estimate_of_linearisation(
+        self,
+        linear: Linearisation,
+        start: EstimatorStart,
+        last_evidence: float,
+        speed_window: float,
+    ) -> MotionEstimate | None:
+        """Return the estimate of linear trials, after a whole Gauss-Newton step from a start.
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials, linear about the start.
+        start : EstimatorStart
+            The values and trajectories about which they are linear.
+        last_evidence : float
+            The log evidence of the previous estimate [nat]. The iteration has converged if neither
+            the evidence nor an unknown changes notably.
+        speed_window : float
+            The half width of the window of speeds with which the laws are linear.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if its evidence is not finite.
+        """
+        solution, local = linear.solve()
+        if not np.isfinite(solution.log_evidence):
+            return None
+        unknowns = solution.mean
+        smoothed = tuple(
+            trial.smooth(np.concatenate((unknowns, local_unknowns)))
+            for trial, local_unknowns in zip(linear.trials, local, strict=True)
+        )
+        evidence = solution.log_evidence + self._log_prior(start.processes)
+        # the change of each unknown in posterior standard deviations
+        last_unknowns = np.concatenate((start.shared, start.effect))
+        deviations = np.sqrt(np.diag(solution.covariance))
+        largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+        evidence_change = abs(evidence - last_evidence)
+        shared_count = len(self.shared_precision)
+        return MotionEstimate(
+            effect=unknowns[shared_count:],
+            shared=unknowns[:shared_count],
+            local=tuple(local),
+            covariance=solution.covariance,
+            processes=start.processes,
+            log_evidence=evidence,
+            trials=smoothed,
+            converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
+            speed_window=speed_window,
+        )
+
+    def evidence_with_processes(
+        self, linear: Linearisation, processes: Mapping[int, Process]
+    ) -> float:
+        """Return log evidence plus log prior of missing forces, with the linearisation kept [nat].
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials.
+        processes : mapping of int to Process
+            The missing forces, by the number of the port.
+        """
+        solution, _ = linear.with_processes(processes).solve()
+        return solution.log_evidence + self._log_prior(processes)
+
+    def linearise(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+    ) -> Linearisation | None:
+        """Return all trials with a hypothesis' laws, linearised along trajectories.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The trajectories, the values of unknowns and the missing forces.
+        speed_window : float
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
+
+        Returns
+        -------
+        Linearisation or None
+            The linear trials; None if the laws are not possible in one of them.
+        """
+        linear_trials = []
+        for trial_index, trial in enumerate(self.trials):
+            trajectory = start.trajectories[trial_index]
+            forces_and_sensor_errors = laws.linearise_along_trajectory(
+                start.law_arguments(trial_index, speed_window)
+            )
+            if forces_and_sensor_errors is None:
+                return None
+            forces, sensor_errors = forces_and_sensor_errors
+            linear_trial = LinearisedTrial(
+                trial=trial,
+                processes=start.processes,
+                trajectory=trajectory,
+                forces=forces,
+                sensor_errors=sensor_errors,
+                effect=start.effect,
+                shared=start.shared,
+            )
+            linear_trials.append(linear_trial)
+        # the unknowns of effects have standard normal priors, of precision one
+        precision = np.concatenate((self.shared_precision, np.ones(laws.effect_unknown_count)))
+        return Linearisation(tuple(linear_trials), precision)
+
+    def _take_step(
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        estimate: MotionEstimate,
+        linear: Linearisation,
+        speed_window: float,
+    ) -> EstimatorStart | None:
+        """Return the start of the next iteration, after the longest admissible fraction of a step.
+
+        At the end of a step the linear laws differ from the true ones. This difference acts like a
+        further missing force, which is not part of the smoother's model. A fraction is admissible
+        if the rms difference is at most the standard deviation of the missing force. If no fraction
+        of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        current : EstimatorStart
+            The values and trajectories before the step.
+        estimate : MotionEstimate
+            The values and trajectories at the end of the whole step.
+        linear : Linearisation
+            The trials, linear about `current`.
+        speed_window : float
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
+
+        Returns
+        -------
+        EstimatorStart or None
+            The next start; None if the laws are not possible after any of the fractions.
+        """
+        # no unknown of an effect moves by more than `LONGEST_STEP`
+        change = estimate.effect - current.effect
+        longest_change = float(np.max(np.abs(change), initial=0.0))
+        largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
+        next_start: EstimatorStart | None = None
+        for fraction in STEP_FRACTIONS:
+            fraction_taken = min(fraction, largest_fraction)
+            trajectories = tuple(
+                trajectory.interpolate(smoothed.trajectory, fraction_taken)
+                for trajectory, smoothed in zip(current.trajectories, estimate.trials, strict=True)
+            )
+            stepped = EstimatorStart(
+                effect=current.effect + fraction_taken * change,
+                shared=current.shared + fraction_taken * (estimate.shared - current.shared),
+                trajectories=trajectories,
+                processes=current.processes,
+            )
+            # admissible if the error is at most one; None if the laws are not possible there
+            error = self._linearisation_error(laws, current, stepped, linear, speed_window)
+            if error is None:
+                continue
+            next_start = stepped
+            if error <= 1.0:
+                break
+        return next_start
+
+    def _linearisation_error(
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        stepped: EstimatorStart,
+        linear: Linearisation,
+        speed_window: float,
+    ) -> float | None:
+        """Return the rms error of the linear laws after a step, over the missing force's deviation.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        current, stepped : EstimatorStart
+            The values and trajectories before and after a step.
+        linear : Linearisation
+            The trials, linear about `current`.
+        speed_window : float
+            The half width of the window of speeds over which laws of the speed are averaged,
+            divided by the rms speed.
+
+        Returns
+        -------
+        float or None
+            The largest ratio of all trials and ports; None if the laws are not possible after the
+            step.
+        """
+        unknowns_change = np.concatenate(
+            (stepped.shared - current.shared, stepped.effect - current.effect)
+        )
+        largest_deviation = max(
+            process.standard_deviation for process in stepped.processes.values()
+        )
+        largest_ratio = 0.0
+        for trial_index, trial in enumerate(linear.trials):
+            trajectory = stepped.trajectories[trial_index]
+            true_forces = laws.forces_along_trajectory(
+                stepped.law_arguments(trial_index, speed_window)
+            )
+            if true_forces is None:
+                return None
+            # the linear law after the step, against the true law there
+            for port, linearised_force in trial.forces.items():
+                linear_force = linearised_force.extrapolate(
+                    trajectory.positions[:, port] - trial.trajectory.positions[:, port],
+                    trajectory.speeds[:, port] - trial.trajectory.speeds[:, port],
+                    unknowns_change,
+                )
+                error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
+                largest_ratio = max(largest_ratio, error / largest_deviation)
+        return largest_ratio
+
+    def _log_prior(self, processes: Mapping[int, Process]) -> float:
+        """Return the logarithm of the prior of missing forces [nat], up to a constant."""
+        return prior_log_density(self.prior_medians, processes)

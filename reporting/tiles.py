@@ -1,0 +1,212 @@
+"""The tiles of a figure, which a narrow page shows below one another.
+
+A figure is drawn for the width of a page. On the screen of a telephone its letters would be too
+small to read, so the page shows the panels one below the other instead. The figure is cut where no
+panel is cut: between columns of panels or, where a panel is as wide as the figure, between rows
+(recursive X-Y cut, Nagy and Seth 1984).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import RendererAgg
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.transforms import Bbox
+
+NARROW = 340.0
+"""Width of a tile that fits a screen of 400 pixels with letters that can be read [pt]."""
+_ALLOWED_OVERLAP = 4.0
+"""Overlap of two boxes that is ignored, since it is the margin around their letters [pt]."""
+_MARGIN = 3.0
+"""Margin around the boxes of a tile [pt]."""
+_POINTS_PER_INCH = 72.0
+
+
+class Tile(NamedTuple):
+    """A rectangle of a figure in the coordinates of its SVG, whose vertical axis points down.
+
+    Attributes
+    ----------
+    x, y, width, height : float
+        Position of the upper left corner, and size [pt].
+    """
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    @property
+    def x_end(self) -> float:
+        """Position of the right edge [pt]."""
+        return self.x + self.width
+
+    @property
+    def y_end(self) -> float:
+        """Position of the lower edge [pt]."""
+        return self.y + self.height
+
+    @property
+    def view_box(self) -> str:
+        """The rectangle as the attribute `viewBox` of an SVG."""
+        return " ".join(f"{value:.1f}" for value in self)
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether the tile fits a narrow screen."""
+        return self.width <= NARROW
+
+
+def tiles_of_figure(figure: Figure) -> list[Tile]:
+    """Return the tiles of a figure in the order in which they are read.
+
+    Legends of the whole figure come first. Then the columns of panels follow from left to right,
+    each from top to bottom; a colour bar stays beside its panel.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    """
+    figure.draw_without_rendering()  # places the entries of legends
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())
+
+    def tile_of_box(box: Bbox) -> Tile:
+        scale = _POINTS_PER_INCH / figure.dpi
+        return Tile(scale * box.x0, height - scale * box.y1, scale * box.width, scale * box.height)
+
+    legend_boxes: list[Tile] = []
+    for legend in figure.legends:
+        legend_boxes += [tile_of_box(box) for box in _boxes_of_entries(legend, renderer)]
+    panel_boxes = [tile_of_box(box) for box in _boxes_of_panels(figure, renderer)]
+    panel_boxes += [tile_of_box(text.get_window_extent(renderer)) for text in figure.texts]
+    groups = [*_cut(legend_boxes), *_cut(panel_boxes)]
+    return [_surrounding_tile(group, width, height) for group in groups]
+
+
+def _boxes_of_entries(legend: Legend, renderer: RendererAgg) -> list[Bbox]:
+    """Return the box of each entry of a legend: its handle with its text, in pixels."""
+    boxes = []
+    for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+        box = text.get_window_extent(renderer)
+        if handle is not None:
+            box_of_handle = handle.get_window_extent(renderer)
+            if np.isfinite(box_of_handle.extents).all():  # a handle without a line has no extent
+                box = Bbox.union([box_of_handle, box])
+        boxes.append(box)
+    return boxes
+
+
+def _boxes_of_panels(figure: Figure, renderer: RendererAgg) -> list[Bbox]:
+    """Return the box of each panel with its titles, labels and colour bars, in pixels."""
+    panel_of_bar: dict[Axes, Axes] = {}
+    for axes in figure.axes:
+        for artist in (*axes.collections, *axes.images):
+            if artist.colorbar is not None:
+                panel_of_bar[artist.colorbar.ax] = axes
+    boxes: dict[Axes, Bbox] = {}
+    for axes in figure.axes:
+        box = axes.get_tightbbox(renderer)
+        if box is not None and axes.get_visible():
+            boxes[axes] = box
+    panels = [axes for axes in boxes if not hasattr(axes, "_colorbar")]
+    for axes in [axes for axes in boxes if axes not in panels]:
+        # The bar of a map that no panel holds belongs to the nearest panel.
+        panel = panel_of_bar.get(axes) or _nearest_panel(boxes, panels, axes)
+        if panel in boxes:
+            boxes[panel] = Bbox.union([boxes[panel], boxes.pop(axes)])
+    return list(boxes.values())
+
+
+def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axes) -> Axes | None:
+    """Return the panel whose box has the smallest gap to that of another panel; None without one.
+
+    Parameters
+    ----------
+    boxes : mapping of Axes to Bbox
+        The boxes of all panels.
+    panels : sequence of Axes
+        The panels that are compared.
+    axes : Axes
+        The other panel.
+    """
+    box = boxes[axes]
+
+    def gap(panel: Axes) -> float:
+        box_of_panel = boxes[panel]
+        horizontal_gap = max(box_of_panel.x0 - box.x1, box.x0 - box_of_panel.x1, 0.0)
+        vertical_gap = max(box_of_panel.y0 - box.y1, box.y0 - box_of_panel.y1, 0.0)
+        return float(horizontal_gap + vertical_gap)
+
+    return min(panels, key=gap, default=None)
+
+
+def _cut(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
+    """Yield groups of boxes that are narrow, as far as no box is cut."""
+    if not boxes:
+        return
+    x_start = min(box.x for box in boxes)
+    x_end = max(box.x_end for box in boxes)
+    if x_end - x_start <= NARROW:
+        yield list(boxes)
+        return
+    columns = _separate(boxes, lambda box: (box.x, box.x_end))
+    if len(columns) > 1:
+        for group in _side_by_side(columns):
+            yield from [group] if len(group) == len(boxes) else _cut(group)
+        return
+    rows = _separate(boxes, lambda box: (box.y, box.y_end))
+    if len(rows) > 1:
+        for row in rows:
+            yield from _cut(row)
+        return
+    yield list(boxes)
+
+
+def _separate(
+    boxes: Sequence[Tile], ends_of: Callable[[Tile], tuple[float, float]]
+) -> list[list[Tile]]:
+    """Return boxes in groups that do not overlap along one direction, in their order along it.
+
+    Parameters
+    ----------
+    boxes : sequence of Tile
+        The boxes.
+    ends_of : callable
+        Returns the ends of a box along the direction.
+    """
+    in_order = sorted(boxes, key=ends_of)
+    groups = [[in_order[0]]]
+    for box in in_order[1:]:
+        end_of_group = max(ends_of(member)[1] for member in groups[-1])
+        if ends_of(box)[0] > end_of_group - _ALLOWED_OVERLAP:
+            groups.append([box])
+        else:
+            groups[-1].append(box)
+    return groups
+
+
+def _side_by_side(columns: Sequence[list[Tile]]) -> list[list[Tile]]:
+    """Return neighbouring columns joined, as many as are narrow together."""
+    groups = [list(columns[0])]
+    for column in columns[1:]:
+        x_start = min(box.x for box in groups[-1])
+        x_end = max(box.x_end for box in column)
+        if x_end - x_start <= NARROW:
+            groups[-1] += column
+        else:
+            groups.append(list(column))
+    return groups
+
+
+def _surrounding_tile(boxes: Sequence[Tile], width: float, height: float) -> Tile:
+    """Return the tile around boxes with its margin, inside a figure of a size [pt]."""
+    x_start = max(0.0, min(box.x for box in boxes) - _MARGIN)
+    y_start = max(0.0, min(box.y for box in boxes) - _MARGIN)
+    x_end = min(width, max(box.x_end for box in boxes) + _MARGIN)
+    y_end = min(height, max(box.y_end for box in boxes) + _MARGIN)
+    return Tile(x_start, y_start, x_end - x_start, y_end - y_start)

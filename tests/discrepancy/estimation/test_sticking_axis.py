@@ -1,0 +1,78 @@
+"""An axis that is pushed through dry friction: its law is estimated with the motion, in long records too."""
+
+import numpy as np
+import pytest
+
+from benchmarks.pushed_axis import DAMPING, FRICTION, MASS, axis_model, pushed_axis
+from discrepancy.estimation import ranking
+from discrepancy.estimation.refinement import estimate_hypothesis
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.missing_force.explained import ForceHypothesis
+from discrepancy.missing_force.naming import ForceSearch
+from discrepancy.workflow import problem_without_wrong_ends
+from tests.discrepancy.rigs import chosen
+
+TRUE_UNKNOWNS = np.array([(MASS / 10.0 - 1.0) / 0.05, (DAMPING / 20.0 - 1.0) / 0.3])
+"""Mass and damping of the true axis, in prior standard deviations from those of the model."""
+
+
+@pytest.fixture(scope="module")
+def search() -> ForceSearch:
+    """Return the search for the missing force of the axis."""
+    return ForceSearch(problem_without_wrong_ends(pushed_axis(600), axis_model()))
+
+
+def friction_of(search: ForceSearch, hypothesis: ForceHypothesis) -> float:
+    """Return the force of the dry friction of a hypothesis [N]."""
+    (term,) = hypothesis.candidate.terms
+    (law,) = term.patch(search.problem.setting, hypothesis.effect)
+    return float(law.coefficient)
+
+
+def assert_values_of_the_truth(search: ForceSearch, hypothesis: ForceHypothesis) -> None:
+    """Check friction, mass and damping, the last two as shared unknowns."""
+    assert friction_of(search, hypothesis) == pytest.approx(FRICTION, rel=5e-3)
+    # in trials that are linear about the unknowns without friction, the damping is off by 0.35
+    np.testing.assert_allclose(hypothesis.shared, TRUE_UNKNOWNS, atol=0.08)
+
+
+def test_values_are_true_though_the_search_is_linear_about_others(search: ForceSearch) -> None:
+    (effect,) = chosen("coulomb_friction")
+    candidate = Candidate((EffectTerm(effect, "slide"),))
+    along = search.fit_along_motion(search.hypothesis_of_all_ports, candidate, np.array([2.0]))
+    assert along is not None
+    # without friction the mass and the damping come out wrong, and the trials are linear about that
+    assert np.abs(search.point.shared - TRUE_UNKNOWNS).max() > 0.5
+    estimated = estimate_hypothesis(search, along)
+    assert estimated is not None
+    assert_values_of_the_truth(search, estimated)
+    assert np.all(np.abs(estimated.linear_trials.trials[0].linearisation_point[:2] - estimated.shared) < 0.1)
+
+
+def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -> None:
+    trial = search.hypothesis_of_all_ports.linear_trials.trials[0]
+    thinned = trial.thinned(3, trial.substeps)
+    np.testing.assert_array_equal(thinned.residual, trial.residual[::3])
+    count = len(thinned.fine_time)
+    np.testing.assert_allclose(thinned.fine_time, trial.fine_time[::3][:count], rtol=1e-12)
+    slow_force = np.sin(5.0 * trial.fine_time)
+    state = trial.state_under_force(0, slow_force)[::3][:count]
+    # both take the force as linear between their stamps
+    np.testing.assert_allclose(
+        thinned.state_under_force(0, slow_force[::3][:count]), state, atol=1e-4 * np.abs(state).max()
+    )
+
+
+def test_long_records_are_ranked_in_thinned_ones_and_estimated_in_all_samples(
+    search: ForceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranking, "MOST_SAMPLES_OF_FIRST_ROUND", 400)
+    thinned = ranking.search_in_thinned_records(search)
+    assert thinned is not None
+    assert [trial.stride for trial in thinned.hypothesis_of_all_ports.linear_trials.trials] == [3, 3]
+    effects = chosen("coulomb_friction", "quadratic_damping")
+    best, *others = ranking.rank_by_missing_force(search, effects)
+    assert best.candidate.identifiers == ("coulomb_friction",)
+    for hypothesis in (best, *others):
+        assert {trial.stride for trial in hypothesis.linear_trials.trials} == {1}
+    assert_values_of_the_truth(search, best)

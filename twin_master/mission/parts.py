@@ -1,0 +1,292 @@
+"""Parts of a twin that a user gives in the place of those of the scenario, as objects or by name.
+
+A name is that of an entry point of an installed package, ``MODULE:NAME`` for an object of a module,
+or ``FILE.py:NAME`` for one of a file. Names and objects are never stored in a form that would be
+run later: a run folder only records how they are called, and whoever resumes the run gives them
+again.
+"""
+
+import importlib.util
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol, cast
+
+from numpy.typing import ArrayLike
+
+from reporting.arrays import Float
+from reporting.words import listing
+from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.mission.planning import read_policy
+from twin_master.network.estimator import Estimator
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.planner import BeliefPolicy
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.twin import Planner
+from twin_master.scenario.schema import Scenario
+
+ENTRY_POINT_GROUPS = {
+    "policy": "uav_twin.policies",
+    "sensor_model": "uav_twin.sensor_models",
+    "estimator": "uav_twin.estimators",
+}
+"""The group of entry points of each part."""
+
+
+class TwinBeforeFlight(Protocol):
+    """What a function that makes a part is given: a `Knowledge` without that part."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario."""
+
+    @property
+    def model(self) -> GraphicalModel:
+        """The states, controls and transitions."""
+
+    @property
+    def sensor_model(self) -> GaussianSensorModel:
+        """The sensor model that the scenario asks for, or the given one."""
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator that the scenario asks for."""
+
+
+GivenPolicy = ArrayLike | BeliefPolicy | Planner | Path | str
+"""A policy (S, U), one on the belief, a function of the graphical model, a file, or a name."""
+GivenSensorModel = GaussianSensorModel | Callable[[TwinBeforeFlight], GaussianSensorModel] | str
+"""A sensor model, a function that makes one, or the name of either."""
+GivenEstimator = Estimator | Callable[[TwinBeforeFlight], Estimator] | str
+"""An estimator, a function that makes one, or the name of either."""
+
+
+@dataclass(frozen=True)
+class TwinParts:
+    """The parts of a twin that a user gives in the place of those of the scenario.
+
+    Attributes
+    ----------
+    policy : GivenPolicy or None
+        The policy that is flown instead of a plan.
+    sensor_model : GivenSensorModel or None
+        The probability of observations in each state.
+    estimator : GivenEstimator or None
+        The estimator of the belief.
+    """
+
+    policy: GivenPolicy | None = None
+    sensor_model: GivenSensorModel | None = None
+    estimator: GivenEstimator | None = None
+
+    @property
+    def is_any_given(self) -> bool:
+        """Whether any part is not that of the scenario."""
+        return self.policy is not None or self.replace_filter
+
+    @property
+    def replace_filter(self) -> bool:
+        """Whether the belief is not that of the scenario's own sensor model and estimator."""
+        return self.sensor_model is not None or self.estimator is not None
+
+    def record(self) -> dict[str, str]:
+        """Return how sensor model and estimator are called, for ``config.json``."""
+        given = {"sensor_model": self.sensor_model, "estimator": self.estimator}
+        return {role: description(part) for role, part in given.items() if part is not None}
+
+    def with_objects(self) -> "TwinParts":
+        """Return the parts with objects in the place of names.
+
+        Raises
+        ------
+        MissionInputError
+            If a name is not that of an object.
+        """
+        parts = self
+        if isinstance(self.policy, str) and _is_name_of_policy(self.policy):
+            policy = cast(GivenPolicy, object_by_name("policy", self.policy))
+            parts = replace(parts, policy=policy)
+        if isinstance(self.sensor_model, str):
+            sensor_model = cast(GivenSensorModel, object_by_name("sensor_model", self.sensor_model))
+            parts = replace(parts, sensor_model=sensor_model)
+        if isinstance(self.estimator, str):
+            estimator = cast(GivenEstimator, object_by_name("estimator", self.estimator))
+            parts = replace(parts, estimator=estimator)
+        return parts
+
+    def policy_for(self, model: GraphicalModel) -> Float | BeliefPolicy | None:
+        """Return the policy for the states and controls of a model; None if none is given.
+
+        Raises
+        ------
+        PlanningError
+            If the file is not a policy, or its policy is for other states or controls.
+        InvalidModelError
+            If an array is not a policy for the model.
+        MissionInputError
+            If a name is not that of an object.
+        """
+        policy = self.with_objects().policy
+        if policy is None or isinstance(policy, BeliefPolicy):
+            return policy
+        if isinstance(policy, str | Path):
+            return read_policy(Path(policy), model)
+        return model.policy(policy(model) if callable(policy) else policy)
+
+    def make_sensor_model(self, twin: TwinBeforeFlight) -> GaussianSensorModel:
+        """Return the given sensor model.
+
+        Parameters
+        ----------
+        twin : TwinBeforeFlight
+            What the twin knows; its sensor model is that of the scenario.
+
+        Raises
+        ------
+        MissionInputError
+            If it is not a `GaussianSensorModel`, or does not fit states, controls and sensors.
+        """
+        part = self.with_objects().sensor_model
+        if callable(part) and not isinstance(part, GaussianSensorModel):
+            part = part(twin)
+        if not isinstance(part, GaussianSensorModel):
+            raise MissionInputError(
+                "the sensor model of a mission must be a GaussianSensorModel or a class derived "
+                "from it, because planner and report use its predictions, and "
+                f"{description(part)} came: derive the class, or step a `uav_twin.Twin` with it."
+            )
+        needed = twin.sensor_model.mean.shape
+        if part.mean.shape != needed:
+            raise MissionInputError(
+                f"the sensor model {description(part)} is for (states, controls, sensors) = "
+                f"{part.mean.shape}, and the scenario has {needed}: make it of "
+                "`sensor_model.value_per_draw` of `uav_twin.prepare_twin`."
+            )
+        return part
+
+    def make_estimator(self, twin: TwinBeforeFlight) -> Estimator:
+        """Return the given estimator.
+
+        Parameters
+        ----------
+        twin : TwinBeforeFlight
+            What the twin knows; its estimator is that of the scenario.
+
+        Raises
+        ------
+        MissionInputError
+            If it is not an estimator, or if the scenario asks for one that learns.
+        """
+        if twin.scenario.learning is not None:
+            raise MissionInputError(
+                "the scenario has a table `learning`, whose estimator would be replaced by the "
+                "given one: leave the table out, or fly without `estimator`."
+            )
+        part = self.with_objects().estimator
+        if callable(part) and not _is_estimator(part):
+            part = part(twin)
+        if part is None or isinstance(part, str) or not _is_estimator(part):
+            raise MissionInputError(
+                "an estimator needs `model`, `step(before, observation, control_index, step)` and "
+                f"`smoothed(carried)`, and {description(part)} came: see `uav_twin.ExactFilter`."
+            )
+        states = part.model.states.size  # type: ignore[union-attr]
+        if states != twin.model.states.size:
+            raise MissionInputError(
+                f"the estimator {description(part)} is for {states} states, and the scenario has "
+                f"{twin.model.states.size}: make it of the model of `uav_twin.prepare_twin`."
+            )
+        return part  # type: ignore[return-value]
+
+    def check_same(self, recorded: Mapping[str, str], folder: Path) -> None:
+        """Refuse to resume a run with other parts than it was begun with.
+
+        Raises
+        ------
+        NotResumableError
+            If the parts are not those of the record.
+        """
+        given = self.record()
+        for role in ("sensor_model", "estimator"):
+            if recorded.get(role) != given.get(role):
+                begun_with = recorded.get(role, "that of the scenario")
+                now = given.get(role, "that of the scenario")
+                words = role.replace("_", " ")
+                advice = f"give `{role}` again" if role in recorded else f"leave `{role}` out"
+                raise NotResumableError(
+                    f"the run in {folder} was begun with another {words} ({begun_with}) than it "
+                    f"would be continued with ({now}): {advice}, or fly it again with --replace."
+                )
+
+
+NO_PARTS = TwinParts()
+"""All parts are those of the scenario."""
+
+
+def _is_name_of_policy(text: str) -> bool:
+    """Return whether a text is the name of a policy, and not the file of one."""
+    return ":" in text or bool(entry_points(group=ENTRY_POINT_GROUPS["policy"], name=text))
+
+
+def _is_estimator(part: object) -> bool:
+    """Return whether an object, and not a class, has the methods of an `Estimator`."""
+    has_methods = all(hasattr(part, name) for name in ("model", "step", "smoothed"))
+    return has_methods and not isinstance(part, type)
+
+
+def description(part: object) -> str:
+    """Return how a part is called in records and sentences."""
+    if isinstance(part, str):
+        return part
+    named = part if hasattr(part, "__qualname__") else type(part)
+    article = "" if named is part else "object of "
+    return f"{article}{named.__module__}.{named.__qualname__}"
+
+
+def object_by_name(role: str, name: str) -> object:
+    """Return the object that a name stands for.
+
+    Parameters
+    ----------
+    role : str
+        The part: "policy", "sensor_model" or "estimator".
+    name : str
+        The name of an entry point, ``MODULE:NAME`` or ``FILE.py:NAME``.
+
+    Raises
+    ------
+    MissionInputError
+        If there is no such object, or if its module cannot be imported.
+    """
+    words = role.replace("_", " ")
+    group = ENTRY_POINT_GROUPS[role]
+    try:
+        for point in entry_points(group=group, name=name):
+            return point.load()
+        file, colon, attribute = name.rpartition(":")
+        if colon and file.endswith(".py"):
+            return _object_of_file(Path(file), attribute)
+        if colon:
+            return pkgutil.resolve_name(name)
+    except Exception as error:  # the module may fail with any error while it is imported
+        raise MissionInputError(
+            f"the {words} {name!r} cannot be loaded ({type(error).__name__}: {error}): give "
+            "MODULE:NAME of a module that Python finds, or FILE.py:NAME."
+        ) from error
+    installed = sorted(point.name for point in entry_points(group=group))
+    raise MissionInputError(
+        f"there is no {words} {name!r}: give MODULE:NAME, FILE.py:NAME, or the name of an entry "
+        f"point of the group {group} (installed: {listing(installed) or 'none'})."
+    )
+
+
+def _object_of_file(path: Path, attribute: str) -> object:
+    """Return an attribute of the module that a Python file defines."""
+    specification = importlib.util.spec_from_file_location(path.stem, path)
+    if specification is None or specification.loader is None:
+        raise ImportError(f"{path} is no Python file")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return getattr(module, attribute)

@@ -1,0 +1,180 @@
+"""The two pictures of a run that are wanted in a notebook: the belief, and the residuals by gauge.
+
+They are drawn from `run.nc` alone, so that they take whatever `open_run` returns.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol, cast
+
+import numpy as np
+
+from reporting.notebook import new_panels
+from twin_master.scenario.section import printed_state
+
+if TYPE_CHECKING:  # both take long to import
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+LARGEST_SHOWN = 4.0
+"""Residuals beyond this are drawn in the colour of this residual [standard deviations]."""
+
+
+class HasTree(Protocol):
+    """A result with the arrays of a run, such as what `fly` returns."""
+
+    @property
+    def tree(self) -> "xr.DataTree":
+        """All groups of `run.nc`."""
+
+
+def plot_belief(run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+    """Draw the believed state over the steps, with the truth where it is known.
+
+    Each factor of the state has a panel with the mean and two standard deviations of the belief
+    p(D_t | o_0..o_t), within the range of the factor's levels.
+
+    Parameters
+    ----------
+    run : DataTree or RunOutcome
+        What `open_run` or `fly` returns.
+    axes : Axes or sequence of Axes, optional
+        A panel for each factor; new ones of pyplot by default.
+
+    Returns
+    -------
+    list of Axes
+        The panels.
+
+    Raises
+    ------
+    ValueError
+        If another number of panels came.
+    """
+    from reporting import figures as style
+
+    tree = _tree_of(run)
+    filtered = tree["filtered"].to_dataset()
+    policy = tree["policy"].to_dataset()
+    truth = tree["truth"].to_dataset() if "truth" in tree.children else {}
+    names = [str(name) for name in filtered["region"].values]
+    steps = filtered["step"].values
+    panels = new_panels(len(names), axes)
+    for panel, name in zip(panels, names, strict=True):
+        scale, unit = printed_state(policy[name].attrs.get("units", "1"))
+        mean = scale * filtered["mean"].sel(region=name).values
+        deviation = scale * filtered["standard_deviation"].sel(region=name).values
+        levels = scale * policy[name].values
+        lower = np.clip(mean - 2.0 * deviation, levels.min(), levels.max())
+        upper = np.clip(mean + 2.0 * deviation, levels.min(), levels.max())
+        style.band(panel, steps, lower, upper, style.PRESENT)
+        panel.plot(steps, mean, color=style.PRESENT, label="believed, with two standard deviations")
+        if "state" in truth:
+            true_state = scale * truth["state"].sel(region=name).values
+            panel.plot(steps, true_state, **style.TRUTH_LINE, label="truth")
+        panel.set_ylabel(f"{name} ({unit})")
+    panels[0].legend(frameon=False)
+    panels[-1].set_xlabel("step")
+    return panels
+
+
+def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> "Axes":
+    """Draw what each gauge measured less what the twin expected, over the steps.
+
+    The residual is in the standard deviations that the twin assumes: if the model holds, 95 % of
+    all cells are between -2 and 2. Cells of lost readings are grey.
+
+    Parameters
+    ----------
+    run : DataTree or RunOutcome
+        What `open_run` or `fly` returns.
+    axes : Axes, optional
+        The panel; a new one of pyplot by default.
+
+    Returns
+    -------
+    Axes
+        The panel.
+    """
+    from reporting import figures as style
+
+    residual = _tree_of(run)["filtered"].to_dataset()["residual"]
+    (panel,) = new_panels(1, axes)
+    panel.set_facecolor("#c8c8c8")
+    colours = style.RESIDUALS.copy()
+    colours["vmin"] = -LARGEST_SHOWN
+    colours["vmax"] = LARGEST_SHOWN
+    image = panel.pcolormesh(
+        residual["step"].values,
+        np.arange(1, residual.sizes["sensor"] + 1),
+        np.ma.masked_invalid(residual.transpose("sensor", "step").values),
+        **colours,
+    )
+    panel.set_xlabel("step")
+    panel.set_ylabel("number of the gauge")
+    figure = panel.get_figure()
+    assert figure is not None
+    panel.set_title("measured less expected", loc="left")
+    figure.colorbar(image, ax=panel, extend="both", label="standard deviations")
+    return panel
+
+
+def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+    """Draw the believed states of the twins of a fleet over the steps.
+
+    Each factor of the state of each group has a panel with the medians over the twins of the
+    believed and of the true states, and with the bands that hold 50 % and 90 % of the believed
+    ones.
+
+    Parameters
+    ----------
+    fleet : DataTree
+        What `open_fleet` returns.
+    axes : Axes or sequence of Axes, optional
+        A panel for each factor of each group; new ones of pyplot by default.
+
+    Returns
+    -------
+    list of Axes
+        The panels.
+    """
+    from reporting import figures as style
+
+    rows = []
+    for group_name, group in fleet.children.items():
+        for factor in group["filtered"].to_dataset()["region"].values:
+            rows.append((group_name, str(factor)))
+    panels = new_panels(len(rows), axes)
+    for panel, (group_name, factor) in zip(panels, rows, strict=True):
+        group = fleet.children[group_name]
+        believed = group["filtered"].to_dataset()["mean"].sel(region=factor).values
+        truth = group["truth"].to_dataset()["state"].sel(region=factor).values
+        steps = np.flatnonzero(~np.isnan(believed).all(axis=0))
+        quantiles = np.nanquantile(believed[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+        style.band(panel, steps, quantiles[0], quantiles[4], style.PRESENT)
+        style.band(panel, steps, quantiles[1], quantiles[3], style.PRESENT)
+        panel.plot(steps, quantiles[2], color=style.PRESENT, label="believed, median of the twins")
+        known_steps = np.flatnonzero(~np.isnan(truth).all(axis=0))
+        true_median = np.nanmedian(truth[:, known_steps], axis=0)
+        panel.plot(known_steps, true_median, **style.TRUTH_LINE, label="truth, median of the twins")
+        panel.set_ylabel(f"{factor} (SI)")
+        panel.set_title(group_name, loc="left")
+        panel.set_xlabel(group.attrs["step_name"])
+    panels[0].legend(frameon=False)
+    return panels
+
+
+def _tree_of(run: "xr.DataTree | HasTree") -> "xr.DataTree":
+    """Return the arrays of a run.
+
+    Raises
+    ------
+    TypeError
+        If neither arrays nor the result of a run came.
+    """
+    tree: object = getattr(run, "tree", run)
+    if not hasattr(tree, "children"):
+        raise TypeError(
+            f"A run is needed, as `uav_twin.open_run` or `uav_twin.fly` returns it, and a "
+            f"{type(run).__name__} came: open a folder with `uav_twin.open_run`."
+        )
+    return cast("xr.DataTree", tree)
