@@ -302,9 +302,9 @@ def test_the_command_line(library_file, tmp_path):
     said(*words, "3:5", "--out", tmp_path / "b")
     compared = json.loads(said("compare", tmp_path / "a", tmp_path / "b", "--json"))
     assert [group["twins"] for group in compared.values()] == [3, 2]
-    (notices,) = (tmp_path / "b" / "fleet.zarr").glob("*/notices")
-    shutil.rmtree(notices)
-    assert "lacks notices: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
+    (counts,) = (tmp_path / "b" / "fleet.zarr").glob("*/notice/count")
+    shutil.rmtree(counts)
+    assert "lacks notice/count: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
 
 
 def test_all_processors_fly_unless_the_user_says_how_many():

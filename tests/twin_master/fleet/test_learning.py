@@ -41,6 +41,7 @@ from twin_master.fleet.reading import (
     severity,
 )
 from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.store_layout import observation_rows
 from twin_master.fleet.view import ATTENTION_ROWS
 from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
@@ -230,11 +231,12 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     (stored,) = open_fleet(folder).values()
     (group,) = fleet.groups
     known = load_knowledge(group_folder(folder, group, 0), group.scenarios[0])
-    rows, control = stored["observed/strain"].values, stored["observed/control_index"].values.astype(int)
+    rows = observation_rows(stored, known.scenario)
+    control = stored["observed/control_index"].values.astype(int)
     assert np.isfinite(rows[:, 0, 24:]).all()
     family = TransitionFamily.learnable(known.scenario)
     model = with_noise_factor(known.sensor_model, 1.0)  # as the lessons are learnt with
-    scaled, common = scaled_likelihood(model, rows.astype(float), control)
+    scaled, common = scaled_likelihood(model, rows, control)
     found = transition_evidence(family, family.assumed[None], scaled, control)[:, 0] + common
     np.testing.assert_allclose(found, stored["filtered/log_evidence"].values.sum(axis=1), rtol=1e-5)
 
@@ -356,9 +358,9 @@ def test_figures_of_a_fleet_have_standard_errors():
             "status": np.r_[np.ones(50), 3.0, 2.0],
             "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(6, np.nan), 1.0],
             "early": np.r_[np.ones(10), np.zeros(40), -1.0, 1.0],  # the last but one cannot be
-            "mean": error + 1.0,
-            "state": np.ones((52, 3, 2)),
-            "log_evidence": error[..., 0],
+            "filtered/mean": error + 1.0,
+            "truth/state": np.ones((52, 3, 2)),
+            "filtered/log_evidence": error[..., 0],
             "credible": credible,
         }
     )
