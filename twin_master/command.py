@@ -125,7 +125,8 @@ def run(
         typer.Option(
             "--seeds",
             metavar="FIRST:END",
-            help="Fly one mission for each of these seeds, END left out, into a store; see `uav-twin fleet`.",
+            help="Fly one mission for each of these seeds, END left out, into a store; see "
+            "`uav-twin fleet`.",
         ),
     ] = None,
     workers: WorkersOption = None,
@@ -214,7 +215,8 @@ def _resumed_mission(
     loaded = None if scenario_name is None else load_scenario(scenario_name)
     if has_changes:
         raise typer.BadParameter(
-            "a run is continued with what its folder holds: give nothing beside it that would change it.",
+            "a run is continued with what its folder holds: give nothing beside it that would "
+            "change it.",
             param_hint="--resume",
         )
     return partial(
@@ -264,7 +266,9 @@ def _fly_and_print_mission(
             print_outcome(outcome)
 
 
-def _scenario_and_ssp(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
+def _scenario_and_ssp(
+    scenario: str | None, with_scenario: str | None
+) -> tuple[str | None, Path | None]:
     """Return the scenario, and the SSP file that is flown instead of its asset.
 
     An SSP file in the place of the scenario is flown; the option --scenario then names the

@@ -28,7 +28,9 @@ from twin_master.scenario.reading import LoadedScenario, load_scenario
 try:
     import gymnasium
 except ImportError:
-    raise MissionInputError("a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'.") from None
+    raise MissionInputError(
+        "a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'."
+    ) from None
 
 Info = dict[str, Any]
 """What is known of a step beside its observation, see `ScenarioEnvironment`."""
@@ -119,7 +121,9 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (values,), np.float64)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float, Info]:
         """Begin a mission, and fly its first step under the first control of the scenario.
 
         Parameters

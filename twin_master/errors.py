@@ -34,7 +34,9 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
         The residuals of the sensors that fit worst, in standard deviations; empty if unknown.
     """
 
-    def __init__(self, twin: str, step: int, worst_residuals: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, twin: str, step: int, worst_residuals: Mapping[str, float] | None = None
+    ) -> None:
         self.twin = twin
         self.step = step
         self.worst_residuals = dict(worst_residuals or {})

@@ -80,7 +80,7 @@ def watch(
     ca_file: CertificateOption = None,
     view: ViewOption = False,
 ) -> None:
-    """Watch many real assets: observations in, a decision for each step of each asset out, as a line of JSON.
+    """Watch many real assets: observations in, a decision for each step of each asset out.
 
     Each asset has a folder DIR/GROUP/NAME, which is that of `uav-twin watch`.
 
@@ -206,7 +206,7 @@ def _table_of_worst_assets(standing: Standing) -> "Table":
             assets[name] = asset
 
     def urgency(name: str) -> tuple[int, float]:
-        """Return alarms and severity, which is infinite for an asset whose state is not believed."""
+        """Return alarms and severity; the severity is infinite if no state is believed."""
         severity = assets[name]["severity"]
         return assets[name]["alarms"], inf if severity is None else severity
 
@@ -286,7 +286,7 @@ def learn(
     no_report: NoReportOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ.
+    """Learn from a fleet: how fast damage grows, how noisy sensors are, how assets differ.
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
@@ -358,7 +358,9 @@ def fly_and_print_fleet(
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
     with terminal.interruptible(lambda: hint):
-        outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
+        outcome = fly_fleet(
+            fleet, folder, engine, replace_old=replace, progress=terminal.progress()
+        )
     if report:
         _write_report(outcome.folder)
     figures = _figures_by_group([outcome.folder])
@@ -541,7 +543,9 @@ def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None
     while is_mission_alive() and not server.is_ready(folder):
         time.sleep(_POLLING_INTERVAL)
     try:
-        server.serve(folder, 0, lambda address: _print_beside_results(f"View: {address}"), is_mission_alive)
+        server.serve(
+            folder, 0, lambda address: _print_beside_results(f"View: {address}"), is_mission_alive
+        )
     except (TwinMasterError, ReportingError) as error:
         typer.secho(f"The view ended: {error}", fg="red", err=True)
 

@@ -27,7 +27,9 @@ class HasTree(Protocol):
         """All groups of `run.nc`."""
 
 
-def plot_belief(run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+def plot_belief(
+    run: "xr.DataTree | HasTree", axes: "Axes | Sequence[Axes] | None" = None
+) -> "list[Axes]":
     """Draw the believed state over the steps, with the truth where it is known.
 
     Each factor of the state has a panel with the mean and two standard deviations of the belief

@@ -239,7 +239,9 @@ def _without_information(knowledge: "Knowledge", names: Sequence[str]) -> "Knowl
     for action in scenario.action:
         changes = blind_inspection if action.name in names else {}
         actions.append(action.model_copy(update=changes))
-    blind_scenario = scenario.with_changes("observation", standard_deviation=tuple(deviation.tolist()))
+    blind_scenario = scenario.with_changes(
+        "observation", standard_deviation=tuple(deviation.tolist())
+    )
     blind_scenario = blind_scenario.model_copy(update={"action": tuple(actions)})
     return replace(knowledge, scenario=blind_scenario)
 
@@ -295,7 +297,8 @@ def design(
         typer.Option(
             "--candidates",
             metavar="N|FILE",
-            help="More candidates on a structure: N rosettes spread over its surface, or a file of gauges.",
+            help="More candidates on a structure: N rosettes spread over its surface, or a file of "
+            "gauges.",
         ),
     ] = None,
     picture: Annotated[
@@ -376,7 +379,7 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
 def _compare_returns(
     knowledge: "Knowledge", chosen: Sequence[str], candidates: Sequence[str]
 ) -> dict[str, list[float]]:
-    """Return the returns with the chosen sensors and with all candidates, as mean and half width."""
+    """Return mean and half width of the returns: with the chosen and with all sensors."""
     titles = _sensor_titles(knowledge.scenario)
     not_chosen = [title for title in titles if title not in chosen]
     no_candidates = [title for title in titles if title not in candidates]
@@ -396,7 +399,9 @@ def _print_design(record: Record, candidates: int) -> None:
         terminal.say(f"{sensor}: {information:.3f} bit with those before it.")
     terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")
     for levels in record["not_separated"]:
-        terminal.say(f"No gauge separates {levels}: less than one standard deviation by all candidates.")
+        terminal.say(
+            f"No gauge separates {levels}: less than one standard deviation by all candidates."
+        )
     for sensors, (mean, half_width) in record.get("worth", {}).items():
         terminal.say(f"Expected return, {sensors}: {mean:.4g} ± {half_width:.2g} (95 %).")
 
@@ -420,7 +425,9 @@ def _write_vtu(path: Path, places: _GaugePlaces, choice: "SensorDesign") -> None
     from fe.structure.operators import write_vtu
 
     if places.positions is None:
-        raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
+        raise MissionInputError(
+            "--vtu needs a wing or a structure whose file says where its gauges are."
+        )
     rank = np.zeros(len(places.positions))
     rank[list(choice.sensors)] = np.arange(1, len(choice.sensors) + 1)
     cells = ("vertex", np.arange(len(rank))[:, None])

@@ -149,7 +149,9 @@ def lock_run_folder(folder: Path) -> int:
     # Another process may have replaced the folder after it was opened for the lock.
     if not folder.is_dir() or not os.path.samestat(os.fstat(descriptor), folder.stat()):
         os.close(descriptor)
-        raise RunFolderError(f"another process has just put another run into {folder}: look at that one.")
+        raise RunFolderError(
+            f"another process has just put another run into {folder}: look at that one."
+        )
     return descriptor
 
 
@@ -229,10 +231,13 @@ def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -
         atomic_write_text(folder / CONFIG_NAME, to_json(config))
         return config
     if recorded != dict(hashes):
-        changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
+        changed = sorted(
+            name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name)
+        )
         names = ", ".join(changed).replace("_", " ")
         raise NotResumableError(
-            f"the {names} changed since the run in {folder} was begun: fly the mission again with --replace."
+            f"the {names} changed since the run in {folder} was begun: fly the mission again with "
+            "--replace."
         )
     return config
 

@@ -50,7 +50,7 @@ def check_scenario(
     calibration: CalibrationOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it.
+    """Say what a scenario flies, believes and takes; exit code 1 if anything is wrong with it.
 
     Example: `uav-twin scenario check level_turns`
     """
@@ -68,5 +68,7 @@ def check_scenario(
     terminal.say(f"Uncertain: {record['uncertain']}, {record['draws']} draws.")
     terminal.say(f"State: {record['states']} states, {_levels_in_words(record['levels'])}.")
     terminal.say(f"Controls: {', '.join(record['controls'])}. Sensors: {record['sensors']}.")
-    terminal.say(f"Mission: {record['steps']} {record['step_name']}s, {record['prediction_steps']} ahead.")
+    terminal.say(
+        f"Mission: {record['steps']} {record['step_name']}s, {record['prediction_steps']} ahead."
+    )
     terminal.say(f"Memory of the twin: about {memory:.3g} MiB.")

@@ -153,7 +153,8 @@ def watch(
 
     The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
 
-    Everything is kept in the folder after every step. Ctrl-C ends a watch in order; --resume takes it up.
+    Everything is kept in the folder after every step. Ctrl-C ends a watch in order; --resume
+    takes it up.
 
     Example: `uav-twin watch watched_wing --out runs/watched`
     """

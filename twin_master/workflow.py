@@ -263,8 +263,8 @@ def _note_mismatches(
         mismatch = truth_mismatch(draws.name, truth, draws.mean, draws.standard_deviation)
         if mismatch is not None:
             progress.note(
-                f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` in "
-                "the scenario's table `asset`."
+                f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` "
+                "in the scenario's table `asset`."
             )
     calibrated = calibration_sentence(
         draws.record or {}, source.origin.asset, source.origin.model, config["inputs"]
@@ -295,8 +295,8 @@ def _advice_on_error(folder: Path) -> Iterator[None]:
     except Exception as error:
         if (folder / JOURNAL_NAME).exists():
             error.add_note(
-                f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where "
-                "the scenario itself is to be changed, fly the changed one with --replace."
+                f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, "
+                "where the scenario itself is to be changed, fly the changed one with --replace."
             )
         else:
             error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")

@@ -73,7 +73,8 @@ VARIABLES = {
 
 def viscosity(temperature: float, factor: float) -> float:
     """Return the dynamic viscosity [Pa s] at a temperature [C]."""
-    return factor * DENSITY * KINEMATIC_VISCOSITY * math.exp(-VISCOSITY_DECAY * (temperature - 40.0))
+    decay = math.exp(-VISCOSITY_DECAY * (temperature - 40.0))
+    return factor * DENSITY * KINEMATIC_VISCOSITY * decay
 
 
 class Conditions(NamedTuple):
