@@ -67,10 +67,15 @@ def state_at_first_stamp(
             np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
         ]
         # an exact zero, since dry friction acts at any other speed
-        drive_speeds[np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)] = 0.0
+        is_at_rest = np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)
+        drive_speeds[is_at_rest & ~system.prescribes_state] = 0.0
     # equilibrium under the first loads and the first positions of the drives
     if excitation.begins is Start.SETTLED:
         load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))
+        # a state is the speed of its coordinate, and a prescribed one acts through the damping
+        prescribed_states = np.where(system.prescribes_state, drive_speeds, 0.0)
+        if prescribed_states.any():
+            load = load - system.damping @ (system.drive_shapes @ prescribed_states)
         if load.any() or drive_positions.any():
             drive_displacement = system.drive_shapes @ drive_positions
             equilibrium = system.static_path(

@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg import eigh, null_space
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation
 from fe.compilation import compiled_kernel
@@ -117,7 +117,8 @@ class LinearSystem:
     state_count : int
         Number of states, N - n.
     drives : (P, N) ndarray
-        Rows whose motion is prescribed.
+        Rows that are prescribed: each of displacements alone, whose motion is prescribed, or of
+        states alone.
     actions : mapping of str to (N,) ndarray
         Directions in which laws at ports act, for all ports; empty if they are the rows of the
         ports.
@@ -156,12 +157,18 @@ class LinearSystem:
 
     @cached_property
     def drive_shapes(self) -> FloatArray:
-        """Displacements (N, P) under a unit motion of each drive."""
+        """Displacements and states (N, P) under a unit motion, or a unit state, of each drive."""
         shapes = np.zeros((self.unknown_count, len(self.drives)))
         if len(self.drives):
             n = self.displacement_count
             shapes[:n] = np.linalg.pinv(self.drives[:, :n])
+            shapes[n:] = np.linalg.pinv(self.drives[:, n:])
         return shapes
+
+    @cached_property
+    def prescribes_state(self) -> BoolArray:
+        """Whether each of the P drives prescribes a state, and no motion."""
+        return np.asarray(np.any(self.drives[:, self.displacement_count :], axis=1))
 
     @cached_property
     def modes(self) -> Modes:
@@ -172,14 +179,32 @@ class LinearSystem:
         squares, displacement_shapes = self._displacement_modes()
         n = self.displacement_count
         count = len(squares)
-        shapes = np.zeros((self.unknown_count, count + self.state_count))
+        state_shapes = self._state_shapes()
+        state_mode_count = state_shapes.shape[1]
+        shapes = np.zeros((self.unknown_count, count + state_mode_count))
         shapes[:n, :count] = displacement_shapes
-        if self.state_count:
-            # states of first order: unit shapes along the principal axes of the capacity matrix
-            capacities, principal_axes = np.linalg.eigh(self.mass[n:, n:])
-            shapes[n:, count:] = principal_axes / np.sqrt(capacities)
+        shapes[n:, count:] = state_shapes
         frequency = np.sqrt(np.maximum(squares, 0.0))
-        return Modes(np.concatenate((frequency, np.zeros(self.state_count))), shapes, count)
+        return Modes(np.concatenate((frequency, np.zeros(state_mode_count))), shapes, count)
+
+    def _state_shapes(self) -> FloatArray:
+        """Return the shapes of the states that no drive prescribes, one in each column.
+
+        They are unit shapes along the principal axes of the capacity matrix, with a modal capacity
+        of 1.
+        """
+        n = self.displacement_count
+        if not self.state_count:
+            return np.zeros((0, 0))
+        capacity = self.mass[n:, n:]
+        drives = self.drives[self.prescribes_state, n:]
+        if not len(drives):
+            capacities, principal_axes = np.linalg.eigh(capacity)
+            return np.asarray(principal_axes / np.sqrt(capacities))
+        # an orthonormal basis of the states that leave all prescribed ones at zero
+        undriven_states = null_space(drives)
+        capacities, principal_axes = np.linalg.eigh(undriven_states.T @ capacity @ undriven_states)
+        return np.asarray(undriven_states @ principal_axes / np.sqrt(capacities))
 
     def _displacement_modes(self) -> tuple[FloatArray, FloatArray]:
         """Return the modes of the n displacements, with all drives held at zero.
@@ -196,8 +221,9 @@ class LinearSystem:
         stiffness = 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         # an orthonormal basis of the motions that leave all drives at zero
         undriven_motions = np.eye(n)
-        if len(self.drives):
-            undriven_motions = null_space(self.drives[:, :n])
+        drives = self.drives[~self.prescribes_state, :n] if len(self.drives) else self.drives
+        if len(drives):
+            undriven_motions = null_space(drives)
             mass = undriven_motions.T @ mass @ undriven_motions
             stiffness = undriven_motions.T @ stiffness @ undriven_motions
         # eigenvalue problem

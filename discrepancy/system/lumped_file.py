@@ -185,7 +185,7 @@ class LumpedDescription(ModelDescription):
             return False
         if self.state_count or self.load or self.damping_part or self.controller:
             return False
-        prescribes_motion = any(section.quantity.motion_chain for section in self.input)
+        prescribes_motion = any(section.is_prescribed for section in self.input)
         acts_through_matrix = any(section.through for section in self.input)
         acts_elsewhere = any(port.acts for port in self.port)
         shows_more = any(output.reaction or output.constant for output in self.output)
@@ -374,6 +374,8 @@ class LumpedDescription(ModelDescription):
         )
         if isinstance(section, PortSection) and section.acts is not None:
             yield self._flow_fault(section, row, np.array(section.acts))
+        if isinstance(section, InputSection) and section.prescribes_state:
+            yield self._prescribed_state_fault(section, row)
         if isinstance(section, ControllerSection):
             order = section.quantity.order
             sees_speed = order > 0 or any(row[n:])
@@ -382,6 +384,17 @@ class LumpedDescription(ModelDescription):
                 f"the controller {section.name!r} cannot follow an acceleration, nor the "
                 "derivative of a speed or of a state: leave `derivative` out",
             )
+
+    def _prescribed_state_fault(self, section: InputSection, row: FloatArray) -> Fault:
+        """Return the rule that a prescribed state is one of the states, and no motion or load."""
+        n = self.displacement_count
+        is_of_states = not any(row[:n])
+        is_load = section.through is not None or section.station_derivative is not None
+        return (
+            not is_of_states or is_load or bool(section.quantity.motion_chain),
+            f"the input {section.name!r} prescribes a state: give it a vector of states alone, a "
+            "quantity that is no motion, and neither `through` nor `station_derivative`",
+        )
 
     def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
         """Return the rule that a flow at a port of states lowers the reading of the port.

@@ -145,8 +145,9 @@ class LumpedModel(DescribedModel, SystemModel):
             if name in references:
                 continue
             section = self._section_of(trial, offset_input.recorded)
-            if section.quantity.motion_chain:
-                motions[name] = _prescribed_motion(trial, offset_input, rig.term_factor(name))
+            if section.is_prescribed:
+                factor = rig.term_factor(name)
+                motions[name] = _prescribed_motion(trial, offset_input, section, factor)
             else:
                 direction = self._input_direction(rig, section, load_change)
                 loads.append(Load(direction, _load_history(trial, offset_input, load_change)))
@@ -217,8 +218,8 @@ class LumpedModel(DescribedModel, SystemModel):
         Raises
         ------
         ModelError
-            If the model has no such input, or one of another quantity, or if a motion that is
-            prescribed goes in steps or corners.
+            If the model has no such input, or one of another quantity, or if a motion or state that
+            is prescribed goes in steps or corners.
         """
         section = self._inputs.get(recorded.name)
         if section is None:
@@ -232,9 +233,10 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
                 f"but the trial {trial.name!r} records {recorded.quantity.value}."
             )
-        if motion_chain and recorded.hold not in (None, Hold.SMOOTH):
+        if section.is_prescribed and recorded.hold not in (None, Hold.SMOOTH):
+            prescribed = "state" if section.prescribes_state else "motion"
             raise ModelError(
-                f"The input {recorded.name!r} of the trial {trial.name!r} is a motion that "
+                f"The input {recorded.name!r} of the trial {trial.name!r} is a {prescribed} that "
                 f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
                 "`reference` and `hold` out."
             )
@@ -245,7 +247,7 @@ class LumpedModel(DescribedModel, SystemModel):
         candidates = [
             name
             for name, section in self._inputs.items()
-            if name == place or not section.quantity.motion_chain
+            if name == place or not section.is_prescribed
         ]
         return self._inputs[choose_load_place(candidates, place, self.quoted_name)]
 
@@ -448,7 +450,7 @@ class LumpedModel(DescribedModel, SystemModel):
             mode_count=MOST_MODES if description.is_structure_on_springs else None,
             relaxation=rig.term_factor("damping") * (beta or 0.0),
             state_count=count - description.displacement_count,
-            drives=np.array(drives),
+            drives=np.array(drives).reshape(len(drives), count),
             actions=self.law_directions,
         )
 
@@ -464,9 +466,14 @@ def _trial_kinds(description: LumpedDescription) -> frozenset[TrialKind]:
     return kinds
 
 
-def _prescribed_motion(trial: Trial, offset_input: OffsetInput, factor: float) -> RecordedHistory:
-    """Return the motion that an input prescribes, times a factor of it."""
-    order = offset_input.recorded.quantity.order
+def _prescribed_motion(
+    trial: Trial, offset_input: OffsetInput, section: InputSection, factor: float
+) -> RecordedHistory:
+    """Return the motion that an input prescribes, times a factor of it.
+
+    A state is the speed of its coordinate, so that a prescribed state is a recorded velocity.
+    """
+    order = 1 if section.prescribes_state else offset_input.recorded.quantity.order
     return RecordedHistory(
         trial.time, factor * offset_input.values, Hold.SMOOTH, motion_order=order
     )

@@ -109,18 +109,26 @@ class LoadSection(NamedVector):
 
 
 class InputSection(LoadSection):
-    """`[[input]]`: a load or a prescribed motion that a trial records.
+    """`[[input]]`: a load, or a prescribed motion or state, that a trial records.
 
     A motion (displacement, velocity or acceleration, linear or angular) is prescribed to vector .
-    u. Any other quantity is a load: its value times the vector, or, with `through`, its value times
-    the matrix of that name times the vector. `station_derivative` is the change of the vector if
-    the load moves along the structure [1/m].
+    u. Another quantity is prescribed to vector . x, a state such as the temperature of a room, if
+    `prescribes_state` is true. Otherwise it is a load: its value times the vector, or, with
+    `through`, its value times the matrix of that name times the vector. `station_derivative` is the
+    change of the vector if the load moves along the structure [1/m].
     """
 
     quantity: Quantity = Quantity.FORCE
     """What the input is; a motion is prescribed, anything else is a load."""
     station_derivative: Vector | None = None
     """Change of the vector for each metre that the load moves along the structure [1/m]."""
+    prescribes_state: bool = False
+    """Whether the input prescribes its value to a state (vector . x), and is no load."""
+
+    @property
+    def is_prescribed(self) -> bool:
+        """Whether the input prescribes a motion or a state, and is no load."""
+        return self.prescribes_state or bool(self.quantity.motion_chain)
 
 
 class OutputSection(NamedSection):
