@@ -96,6 +96,35 @@ class ClosedShare:
 
 
 @dataclass(frozen=True)
+class ErrorComparison:
+    """The errors of the deciding trials without and with a hypothesis.
+
+    The deciding trials are the held-out ones if there are any, else the fitted ones. The sentence
+    of a verdict and its proof state this one record.
+
+    Attributes
+    ----------
+    closed : ClosedShare or None
+        Fraction of the mean square error that the hypothesis removes; None with the reason in
+        `closed_reason`.
+    closed_reason : str
+        Why the fraction cannot be given, or why it is that of fitted trials; else empty.
+    rms_before, rms_after : mapping of str to float
+        Root mean square residual by channel without and with the hypothesis [channel's unit].
+    """
+
+    closed: ClosedShare | None
+    closed_reason: str
+    rms_before: Mapping[str, Number]
+    rms_after: Mapping[str, Number]
+
+    @property
+    def has_grown(self) -> bool:
+        """Whether the error is larger with the hypothesis than without it."""
+        return self.closed is not None and self.closed.has_grown
+
+
+@dataclass(frozen=True)
 class Proof:
     """What a hypothesis does to trials: before and after, on held-out and on fitted ones.
 

@@ -31,7 +31,7 @@ from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
-from discrepancy.judgement.proof import prove_effects
+from discrepancy.judgement.proof import errors_of_fit, prove_effects
 from discrepancy.judgement.remarks import (
     KINDS_WITHOUT_GAP,
     look_alike_remark,
@@ -199,10 +199,10 @@ def investigate(
                 f"{SEARCH.largest_step_error:g} that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
-        before = residual_set(problem, search.no_effect, sensitivities=thorough)
-        after = before
-        if fit is not search.no_effect:
-            after = residual_set(problem, fit, sensitivities=False)
+        before = search.residuals(search.no_effect)
+        if thorough:
+            before = residual_set(problem, search.no_effect)
+        after = before if fit is search.no_effect else search.residuals(fit)
     location = None
     missing = None
     proof = None
@@ -223,7 +223,10 @@ def investigate(
             )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
-            proof = prove_effects(before, after, effects=effect_labels(fit), seed=seed)
+            errors = errors_of_fit(search, fit)
+            proof = prove_effects(
+                before, after, errors=errors, effects=effect_labels(fit), seed=seed
+            )
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):

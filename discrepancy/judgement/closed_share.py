@@ -14,7 +14,7 @@ import numpy as np
 from discrepancy.campaign.records import Channel, FloatArray
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
-from discrepancy.proof_record import ClosedShare
+from discrepancy.proof_record import ClosedShare, ErrorComparison
 from reporting.words import counted
 
 BLOCKS_OF_TRIAL = 12
@@ -221,32 +221,23 @@ def _recorded_noise_or_fallback(channel: Channel, fallback: float) -> float:
     return recorded or fallback or 1.0
 
 
-def closed_share_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) -> str:
+def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) -> str:
     """Return the share as a clause, such as "it explains 93 % of the mean square error in ...".
 
     Parameters
     ----------
-    before, after : ResidualSet
-        All trials of a campaign without and with the hypothesis.
-    closed : ClosedShare
-        The share.
+    channels : mapping of str to Channel
+        The channels by name.
+    errors : ErrorComparison
+        The errors without and with the hypothesis; they must have a share.
     """
-    compared_before, compared_after = compared_trials(before, after, closed)
-    rms_before = rms_by_channel(compared_before)
-    errors = rms_errors_text(before.channels, rms_before, rms_by_channel(compared_after))
+    closed = errors.closed
+    assert closed is not None
+    rms_errors = rms_errors_text(channels, errors.rms_before, errors.rms_after)
     trials = compared_trials_text(closed)
     if closed.has_grown:
-        return f"it makes the error in {trials} larger (rms of {errors})"
+        return f"it makes the error in {trials} larger (rms of {rms_errors})"
     return (
         f"it explains {percent_with_interval(closed)} of the mean square error in {trials} "
-        f"(rms of {errors})"
+        f"(rms of {rms_errors})"
     )
-
-
-def compared_trials(
-    before: ResidualSet, after: ResidualSet, closed: ClosedShare
-) -> tuple[ResidualSet, ResidualSet]:
-    """Return the trials that a share refers to, without and with the hypothesis."""
-    if closed.trials == "held-out":
-        return before.held_out or before, after.held_out or after
-    return before.fitted or before, after.fitted or after

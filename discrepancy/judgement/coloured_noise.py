@@ -51,7 +51,7 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
     ):
         return None
     probability = comparison.probability(best)
-    held_out_residuals = comparison.residuals(replace(best, residual_process=None))
+    held_out_residuals = comparison.search.residuals(replace(best, residual_process=None))
     gates = (
         check_absolute_fit(problem, best),
         check_consistency(problem, best),

@@ -10,7 +10,7 @@ named in the verdict.
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache, cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.special import logsumexp
@@ -20,10 +20,8 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm, Point
 from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
-from discrepancy.fits.predictive import residual_set
-from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.gap_share import GapShare
-from discrepancy.proof_record import ClosedShare
+from discrepancy.proof_record import ErrorComparison
 from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -31,7 +29,7 @@ from discrepancy.verdict import Gate
 
 from .closed_share import closed_share_text
 from .conclusion import ComparedHypothesis
-from .proof import closed_share_or_reason
+from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
 """Share of the gap below which held-out trials in which a law has hardly any force contradict
@@ -40,21 +38,6 @@ it."""
 HypothesisT = TypeVar("HypothesisT", bound=ComparedHypothesis)
 EffectPlacePairs = frozenset[tuple[str, str]]
 """Pairs of an effect, or a family of effects, and its place."""
-
-
-class DescribedShare(NamedTuple):
-    """The share of the mean square error that a hypothesis removes, as a number and in words.
-
-    Attributes
-    ----------
-    share : ClosedShare or None
-        The share; None if none can be given.
-    clause : str
-        The share in words, or the reason why none can be given.
-    """
-
-    share: ClosedShare | None
-    clause: str
 
 
 class Comparison(ABC, Generic[HypothesisT]):
@@ -87,8 +70,6 @@ class Comparison(ABC, Generic[HypothesisT]):
         # the methods are cached, so that each result is computed once for a hypothesis
         self.gap_share = cache(self._compute_gap_share)
         self.simulation = cache(self._compute_simulation)
-        self.closed_share = cache(self._compute_closed_share)
-        self.residuals = cache(self._compute_residuals)
 
     # ---------------------------------------------------------------- how they are compared
 
@@ -160,32 +141,30 @@ class Comparison(ABC, Generic[HypothesisT]):
             return False
         return not check_absolute_fit(self.problem, simulation).has_failed
 
-    def _compute_residuals(self, simulation: CandidateFit) -> ResidualSet:
-        """Return the residuals of a simulation in the fitted and held-out trials."""
-        return residual_set(self.problem, simulation, sensitivities=False)
+    def errors(self, hypothesis: HypothesisT) -> ErrorComparison:
+        """Return the errors of simulations without and with a hypothesis.
 
-    def _compute_closed_share(self, hypothesis: HypothesisT) -> DescribedShare:
-        """Return the share of the mean square error that a hypothesis removes.
-
-        The errors are those of simulations without and with the hypothesis, even if hypotheses are
-        compared by the missing force.
+        They are those of simulations even if hypotheses are compared by the missing force.
         """
-        before = self.residuals(self.search.no_effect)
-        after = self.residuals(self.simulation(hypothesis))
-        share, reason = closed_share_or_reason(before, after)
-        if share is None:
+        return errors_of_fit(self.search, self.simulation(hypothesis))
+
+    def closed_share_clause(self, hypothesis: HypothesisT) -> str:
+        """Return the share of the mean square error that a hypothesis removes, as a clause.
+
+        It is the reason why there is no share, if there is none.
+        """
+        errors = self.errors(hypothesis)
+        if errors.closed is None:
             # the reason is a sentence; a clause has neither its capital letter nor its full stop
-            clause = f"{reason[0].lower()}{reason[1:-1]}"
-            return DescribedShare(None, clause)
-        return DescribedShare(share, closed_share_text(before, after, share))
+            return f"{errors.closed_reason[0].lower()}{errors.closed_reason[1:-1]}"
+        return closed_share_text(self.problem.campaign.channels, errors)
 
     def enlarges_error(self, hypothesis: HypothesisT) -> bool:
         """Return whether a hypothesis makes the error larger, or cannot be simulated."""
         if self.simulation(hypothesis) is self.search.no_effect:
             # the simulation without effect stands for a hypothesis that cannot be simulated
             return True
-        share = self.closed_share(hypothesis).share
-        return share is not None and share.has_grown
+        return self.errors(hypothesis).has_grown
 
     # ---------------------------------------------------------------- which may be named
 

@@ -268,7 +268,7 @@ def _named_in_part_outcome(
     if family:
         phrases.append(f"an effect of the family {family}, with a shape of its own,")
     # what it explains, and what remains
-    share_clause = comparison.closed_share(best).clause
+    share_clause = comparison.closed_share_clause(best)
     sentence = (
         f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
         f"{share_clause}."
@@ -344,18 +344,18 @@ def _group_sentence(
     """Return the sentence that lists the members of a group, each with the share it explains."""
     member_texts = []
     for member, effects in zip(members, effects_by_member, strict=True):
-        member_share = comparison.closed_share(member).share
+        member_share = comparison.errors(member).closed
         share_in_brackets = ""
         if member_share is not None:
             share_in_brackets = f" ({percent_with_interval(member_share)})"
         member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
     sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
-    best_share = comparison.closed_share(members[0])
-    if best_share.share is None:
-        return f"{sentence} {capital(best_share.clause)}."
+    best_share = comparison.errors(members[0]).closed
+    if best_share is None:
+        return f"{sentence} {capital(comparison.closed_share_clause(members[0]))}."
     return (
         f"{sentence} In brackets the share of the mean square error that each explains in "
-        f"{compared_trials_text(best_share.share)}."
+        f"{compared_trials_text(best_share)}."
     )
 
 
@@ -442,7 +442,7 @@ def _best_hypothesis_sentence(
 ) -> str:
     """Return the sentence on the best hypothesis, and the reason why it is not named, if any."""
     effects = effects_text(named_effects(comparison.problem, hypothesis))
-    share_clause = comparison.closed_share(hypothesis).clause
+    share_clause = comparison.closed_share_clause(hypothesis)
     sentence = f"The best hypothesis is {effects}: {share_clause}."
     return f"{sentence} {not_named_sentence(reason)}" if reason else sentence
 
@@ -464,7 +464,7 @@ def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: Hypo
     nearest = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
         return f"{nearest} it cannot be simulated: nothing is named."
-    share_clause = comparison.closed_share(hypothesis).clause
+    share_clause = comparison.closed_share_clause(hypothesis)
     return f"{nearest} {share_clause}: nothing is named, and nothing to be applied."
 
 

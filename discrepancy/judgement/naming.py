@@ -6,7 +6,6 @@ from dataclasses import replace
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, try_fit
-from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import OnProgress, changes_structure, ignore_progress
 from discrepancy.search.strategy import Search
@@ -121,7 +120,7 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
     # test on held-out trials
     may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if may_be_named or verdict.kind is VerdictKind.GROUP:
-        gate = check_held_out(residual_set(search.problem, outcome.fit, sensitivities=False))
+        gate = check_held_out(search.residuals(outcome.fit))
         sentence = verdict.sentence
         if gate.has_failed:
             sentence = f"{sentence} {gate.reason}"
@@ -208,8 +207,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
         return None
     if not _are_instrument_errors_with_gain(verdict):
         return None
-    residuals = residual_set(problem, search.no_effect, sensitivities=False)
-    if not check_held_out(residuals).passed:
+    if not check_held_out(search.residuals(search.no_effect)).passed:
         return None
     sentence = (
         "The model predicts held-out trials as it is, but with calibrated parameters beside their "

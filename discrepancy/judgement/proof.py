@@ -17,8 +17,10 @@ from scipy import stats
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits, mean_square_ratio
-from discrepancy.proof_record import ClosedShare, Proof, Scores
+from discrepancy.proof_record import ClosedShare, ErrorComparison, Proof, Scores
+from discrepancy.search.fitted_candidates import FittedCandidates
 from discrepancy.verdict import Gate
 
 from .closed_share import closed_share, residuals_with_noise_of, rms_by_channel
@@ -325,7 +327,36 @@ def chi_square_text(trial_scores: Scores) -> str:
 # ---------------------------------------------------------------- proof of a verdict
 
 
-def closed_share_or_reason(
+def compare_errors(before: ResidualSet, after: ResidualSet) -> ErrorComparison:
+    """Return the errors of the deciding trials without and with a hypothesis.
+
+    Parameters
+    ----------
+    before, after : ResidualSet
+        The same trials and samples, without and with the hypothesis.
+    """
+    closed, reason = _closed_share_or_reason(before, after)
+    return ErrorComparison(
+        closed=closed,
+        closed_reason=reason,
+        rms_before=rms_by_channel(before.held_out or before.fitted or before),
+        rms_after=rms_by_channel(after.held_out or after.fitted or after),
+    )
+
+
+def errors_of_fit(search: FittedCandidates, fit: CandidateFit) -> ErrorComparison:
+    """Return the errors of the deciding trials without effect and with a fit of a search.
+
+    They are computed once for each fit, so that all that is said of a fit is said of one record.
+    """
+    key = (fit, search.problem.refinement)
+    if key not in search.errors_by_fit:
+        before = search.residuals(search.no_effect)
+        search.errors_by_fit[key] = compare_errors(before, search.residuals(fit))
+    return search.errors_by_fit[key]
+
+
+def _closed_share_or_reason(
     before: ResidualSet, after: ResidualSet
 ) -> tuple[ClosedShare | None, str]:
     """Return the share of the mean square error that a hypothesis removes, or None and the reason.
@@ -370,7 +401,12 @@ def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
 
 
 def prove_effects(
-    before: ResidualSet, after: ResidualSet, *, effects: tuple[str, ...] = (), seed: int = 0
+    before: ResidualSet,
+    after: ResidualSet,
+    *,
+    errors: ErrorComparison | None = None,
+    effects: tuple[str, ...] = (),
+    seed: int = 0,
 ) -> Proof:
     """Return the proof of an effect: errors and scores without and with it.
 
@@ -378,6 +414,8 @@ def prove_effects(
     ----------
     before, after : ResidualSet
         The same trials and samples, without and with the effect.
+    errors : ErrorComparison, optional
+        Their errors, if they are known already, as the sentence of a verdict states them.
     effects : tuple of str
         The labels of the effects that are added, see `discrepancy.verdict.effect_label`.
     seed : int
@@ -394,7 +432,7 @@ def prove_effects(
     held_out_after = _held_out_scores(after, seed)
     fitted_before = compute_scores(before.fitted or before, seed=seed)
     fitted_after = compute_scores(after.fitted or after, seed=seed)
-    closed, reason = closed_share_or_reason(before, after)
+    errors = errors or compare_errors(before, after)
     gain = nan
     gain_error = nan
     if before.held_out is not None and after.held_out is not None:
@@ -405,11 +443,11 @@ def prove_effects(
         held_out_after=held_out_after,
         fitted_before=fitted_before,
         fitted_after=fitted_after,
-        closed=closed,
+        closed=errors.closed,
         log_score_gain=gain,
         log_score_gain_error=gain_error,
         remaining=_remaining_sentence(decisive_trials, held_out_after or fitted_after),
-        closed_reason=reason,
+        closed_reason=errors.closed_reason,
         effects=effects,
     )
 

@@ -70,8 +70,8 @@ class SimulationComparison(Comparison[CandidateFit]):
 
         Squared residuals are summed over blocks of the records, for the bootstrap of the share.
         """
-        without_effect = self.residuals(self.search.no_effect).trials
-        with_effect = self.residuals(hypothesis).trials
+        without_effect = self.search.residuals(self.search.no_effect).trials
+        with_effect = self.search.residuals(hypothesis).trials
         trials_before = _trials_in_role(without_effect, held_out=held_out)
         trials_after = _trials_in_role(with_effect, held_out=held_out)
         block_sums: list[list[float]] = []
@@ -203,7 +203,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             return ""
         gates = [check_consistency(self.problem, hypothesis)]
         if not self._explains_nearly_all_held_out(hypothesis):
-            gates.append(check_held_out(self.residuals(hypothesis)))
+            gates.append(check_held_out(self.search.residuals(hypothesis)))
         return next((gate.reason for gate in gates if gate.has_failed), "")
 
     def _explains_nearly_all_held_out(self, hypothesis: CandidateFit) -> bool:

@@ -12,14 +12,13 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.campaign.units import UNITS
-from discrepancy.fits.predictive import residual_set
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
 from .closed_share import NOMINAL_UNIT, closed_share_text, rms_by_channel
 from .conclusion import VerdictOutcome, effects_text
-from .proof import closed_share_or_reason
+from .proof import errors_of_fit
 from .remarks import KINDS_WITHOUT_GAP
 
 VETO_NOISE_DEVIATIONS = 5.0
@@ -50,25 +49,20 @@ def check_against_trials(outcome: VerdictOutcome) -> VerdictOutcome:
         The verdict, its search, and the fit that represents it.
     """
     verdict, search, fit = outcome
-    problem = search.problem
     no_effect = search.no_effect
-    residuals_without_effect = residual_set(problem, no_effect, sensitivities=False)
-    residuals_with_effect = residuals_without_effect
-    if fit is not no_effect:
-        residuals_with_effect = residual_set(problem, fit, sensitivities=False)
     # check 1: residuals against the signal
-    unfitted = unfitted_records(residuals_with_effect)
+    unfitted = unfitted_records(search.residuals(fit))
     if unfitted:
         return VerdictOutcome(_unfitted_verdict(verdict, unfitted), search, no_effect)
     # check 2: the error with and without the effects
     if fit.candidate.terms:
-        closed, _ = closed_share_or_reason(residuals_without_effect, residuals_with_effect)
-        if closed is not None and closed.has_grown:
-            sentence = _larger_error_sentence(
-                verdict, closed_share_text(residuals_without_effect, residuals_with_effect, closed)
-            )
+        errors = errors_of_fit(search, fit)
+        if errors.has_grown:
+            channels = search.problem.campaign.channels
+            sentence = _larger_error_sentence(verdict, closed_share_text(channels, errors))
             return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
     # check 3: held-out trials
+    residuals_without_effect = search.residuals(no_effect)
     far_records = (
         far_held_out_records(residuals_without_effect) if verdict.kind in KINDS_WITHOUT_GAP else []
     )

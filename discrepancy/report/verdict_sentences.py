@@ -6,7 +6,7 @@ from math import isnan
 
 from discrepancy.judgement.closed_share import closed_share_text
 from discrepancy.judgement.conclusion import effects_text, probability_text
-from discrepancy.proof_record import Proof, Scores
+from discrepancy.proof_record import ErrorComparison, Proof, Scores
 from discrepancy.report.text import (
     NAMING,
     estimate_text,
@@ -169,15 +169,15 @@ def error_sentence(investigation: Investigation) -> str:
     nothing was added to the model.
     """
     proof = investigation.proof
-    before = investigation.before
-    after = investigation.after
-    if proof is None or before is None or after is None:
+    if proof is None:
         return ""
     if proof.closed is None:
         return proof.closed_reason
     is_named = investigation.verdict.kind in NAMING
     # the clause begins with the subject "it", which is replaced
-    predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
+    before, after, _ = proof_scores(proof)
+    errors = ErrorComparison(proof.closed, proof.closed_reason, before.rms, after.rms)
+    predicate = closed_share_text(investigation.campaign.channels, errors).removeprefix("it ")
     if proof.closed.has_grown:
         subject = "With it" if is_named else "With the best hypothesis, which is no name,"
     else:

@@ -9,9 +9,12 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, CandidateKey
 from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import check_absolute_fit
+from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
+from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.hypotheses import log_prior
+from discrepancy.proof_record import ErrorComparison
 from discrepancy.search_settings import SEARCH
 
 
@@ -34,6 +37,9 @@ class FittedCandidates:
     wide_fits : dict of CandidateKey to CandidateFit
         The candidates that were fitted under a wider noise than recorded; if there are any, only
         these are compared.
+    errors_by_fit : dict of (CandidateFit, int) to ErrorComparison
+        The errors of trials without effect and with a fit, by the fit and the refinement of the
+        time steps. They are added when a verdict asks for them.
     """
 
     problem: Problem
@@ -42,6 +48,12 @@ class FittedCandidates:
     exact_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
     rough_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
     wide_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    errors_by_fit: dict[tuple[CandidateFit, int], ErrorComparison] = field(
+        init=False, repr=False, default_factory=dict
+    )
+    _residuals: dict[tuple[CandidateFit, int], ResidualSet] = field(
+        init=False, repr=False, default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         self.exact_fits[()] = self.no_effect
@@ -83,6 +95,16 @@ class FittedCandidates:
         return max(
             (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
         )
+
+    def residuals(self, fit: CandidateFit) -> ResidualSet:
+        """Return the residuals of a fit in the fitted and the held-out trials.
+
+        They are computed once for each fit and size of the time steps, without sensitivities.
+        """
+        key = (fit, self.problem.refinement)
+        if key not in self._residuals:
+            self._residuals[key] = residual_set(self.problem, fit, sensitivities=False)
+        return self._residuals[key]
 
     def fitted_effects(self) -> frozenset[str]:
         """Return the identifiers of all effects that were fitted, alone or with others."""

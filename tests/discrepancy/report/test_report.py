@@ -18,8 +18,10 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
+from discrepancy.judgement import proof
 from discrepancy.judgement.closed_share import percent_with_interval
 from discrepancy.judgement.conclusion import probability_text
+from discrepancy.judgement.proof import errors_of_fit
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,
     DETECTION_DISTANCE,
@@ -27,6 +29,7 @@ from discrepancy.judgement.separability import (
     Separability,
     compute_separability,
 )
+from discrepancy.judgement.simulation_comparison import SimulationComparison
 from discrepancy.pictures import plot_missing_force
 from discrepancy.report.decidability_text import (
     campaign_needs,
@@ -40,7 +43,7 @@ from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.sizes import si_sizes
 from discrepancy.report.tables import detectable_sizes_table, parameter_rows
 from discrepancy.report.text import formula, number
-from discrepancy.report.verdict_sentences import headline, remainders_sentence
+from discrepancy.report.verdict_sentences import error_sentence, headline, proof_scores, remainders_sentence
 from discrepancy.system.structures import WingModel
 from discrepancy.verdict import NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
@@ -65,6 +68,27 @@ def drag():
 @pytest.fixture(scope="module")
 def able(drag):
     return compute_separability(drag.campaign, drag.model, drag.problem.setting, FEW)
+
+
+def test_page_file_and_sentences_state_one_record_of_the_errors(drag, tmp_path, monkeypatch):
+    """The errors of a fit are computed once; all that states them reads that record."""
+    errors = errors_of_fit(drag.search, drag.fit)
+    assert drag.proof.closed is errors.closed
+    before, after, trials = proof_scores(drag.proof)
+    assert trials == errors.closed.trials
+    assert before.rms == errors.rms_before
+    assert after.rms == errors.rms_after
+    # what judges this fit after the verdict computes no share again
+    monkeypatch.setattr(proof, "closed_share", lambda *residuals: pytest.fail("computed twice"))
+    clause = SimulationComparison(drag.search).closed_share_clause(drag.fit)
+    percent = percent_with_interval(errors.closed)
+    assert percent in clause
+    assert percent in error_sentence(drag)
+    assert percent in page_of(drag)
+    write_verdict_folder(tmp_path / "verdict", ReportInput(drag, ORIGIN), report=False)
+    stored = read_verdict(tmp_path / "verdict")
+    assert stored.proof.closed == errors.closed
+    assert stored.proof.held_out_after.rms == errors.rms_after
 
 
 def page_of(investigation, **verdict):
