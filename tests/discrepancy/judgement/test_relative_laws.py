@@ -122,7 +122,7 @@ def tank_campaign() -> Campaign:
 def support_campaign() -> Campaign:
     """Return three trials of a body whose mount stiffens with its distance from a moved support."""
     generator = np.random.default_rng(6)
-    time = 0.02 * np.arange(300.0)
+    time = 0.03 * np.arange(150.0)
     trials = []
     for name in ("one", "two", "three"):
         course = smooth_course(generator, 0.4, 5)
@@ -174,6 +174,7 @@ def test_a_leak_by_the_difference_to_a_measured_level_is_found_and_proved(
     assert flow == pytest.approx(LEAK, rel=0.02)
 
 
+@pytest.mark.long
 def test_the_law_in_the_model_leaves_nothing_missing(leaking_tank: Investigation) -> None:
     (effect,) = leaking_tank.verdict.effects
     patched = model_of(TANK).with_patch(effect.patch)
@@ -182,6 +183,7 @@ def test_the_law_in_the_model_leaves_nothing_missing(leaking_tank: Investigation
     assert again.verdict.kind is VerdictKind.NOTHING_MISSING, again.verdict.sentence
 
 
+@pytest.mark.long
 def test_a_mount_that_stiffens_with_the_distance_from_a_moved_support_is_found_and_proved() -> None:
     effects = chosen("cubic_stiffness", "quadratic_damping", "coulomb_friction")
     found = investigate(support_campaign(), model_of(SUPPORT), effects, thorough=False)
