@@ -39,9 +39,9 @@ _INTRODUCTION = """\
 <!-- Written by `python -m benchmarks.store_page` from `twin_master/store/run.toml`. -->
 # Stores of runs and fleets
 
-What `run.nc` of a run or a watch and `fleet.zarr` of a fleet contain. Both have the same groups,
-variables, axes, labels and units. In a store of a fleet every variable has the axis `twin` before
-its others.
+What `run.nc` of a run or a watch and `fleet.zarr` of a fleet contain. What they share has the same
+groups, variables, axes, labels and units. In a store of a fleet every variable has the axis `twin`
+before its others.
 
 ```python
 import uav_twin

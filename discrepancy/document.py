@@ -130,6 +130,11 @@ def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
     kind_of_primitive = {"const": primitive.kind, "description": "Kind of the primitive."}
     columns: dict[str, Any] = {"kind": kind_of_primitive}
     for name, kind in primitive.value_types().items():
+        if name not in _MEANING_OF_VALUE:
+            raise TypeError(
+                f"The number {name!r} of {primitive.__module__}.{primitive.__name__} has no "
+                "meaning: give one in `_MEANING_OF_VALUE` of discrepancy/document.py."
+            )
         columns[name] = {"type": _JSON_TYPES[kind], "description": _MEANING_OF_VALUE[name]}
         if name in units:
             columns[name]["unit"] = units[name]

@@ -146,8 +146,15 @@ class TwinParts:
         Raises
         ------
         MissionInputError
-            If it is not a `GaussianSensorModel`, or does not fit states, controls and sensors.
+            If it is not a `GaussianSensorModel`, does not fit states, controls and sensors, or if
+            the scenario asks for a twin that learns.
         """
+        if twin.scenario.learning is not None:
+            raise MissionInputError(
+                "the scenario has a table `learning`, whose estimator has a sensor model of its "
+                "own and would ignore the given one: leave the table out, or fly without "
+                "`sensor_model`."
+            )
         part = self.with_objects().sensor_model
         if callable(part) and not isinstance(part, GaussianSensorModel):
             part = part(twin)

@@ -134,6 +134,22 @@ def test_a_sensor_model_of_other_states_is_refused(fly):
         fly("never", sensor_model=other)
 
 
+@pytest.mark.parametrize("role", ["sensor_model", "estimator"])
+def test_a_twin_that_learns_takes_no_part_that_it_would_ignore(role, library_file, module, tmp_path):
+    changes = {"mission": {"steps": 2}, "notice": "", "learning": {"transition_factors": [0.1, 10.0]}}
+    learning = changed_scenario("paper_level_turns", changes)
+    name = {"sensor_model": f"{module}:noisy", "estimator": f"{module}:forgetful"}[role]
+
+    with pytest.raises(MissionInputError, match="the scenario has a table `learning`"):
+        uav_twin.fly(
+            learning,
+            tmp_path / "never",
+            {"strain_library": library_file},
+            report=False,
+            **{role: name},
+        )
+
+
 def test_twins_of_an_ensemble_fly_what_runs_fly(library_file, module, tmp_path):
     overrides = {"strain_library": library_file}
     parts = {"estimator": f"{module}:forgetful", "policy": f"{module}:gentle"}
