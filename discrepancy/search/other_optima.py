@@ -23,8 +23,8 @@ def canonical_relatives(
 
     Such a hypothesis consists of one effect. The effect has the same family (such as friction) and
     the same place as the leading effect, which fits best so far; it may be the leading effect
-    itself. It has a magnitude, from which the fit can start, and its other shape parameters have
-    the values of the catalogue: they are not free.
+    itself. It has a magnitude, from which the fit can start. The shape of its law is the canonical
+    one of the catalogue, as its shape parameters are not fitted.
 
     Parameters
     ----------

@@ -324,7 +324,7 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
         scenario = Scenario.model_validate(record["scenarios"][0])
         names = [name for name, _seed, _scenario_number in record["members"]]
         tree = in_present_layout(stored_group, scenario, names)
-    # a path with a placeholder such as "{name}" stands for arrays that a group need not have
+    # A path with braces is a template, such as "{input}", whose arrays differ between groups.
     required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
     missing = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
     if missing:
