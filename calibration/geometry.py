@@ -189,11 +189,12 @@ def tailored_geometry(lengths: Lengths) -> Geometry:
 def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     """Return a wing's design with the planform that was measured on the built wing.
 
-    Only semi-span and chords change. Parts whose place the design gives as a fraction move with the
-    planform: ribs, point masses and bands of the skin along the span, and everything along the
-    chord. Parts whose place it gives as a distance stay: gauges and defect regions, measured from
-    the root, and the test load, measured from the tip. Unchanged are also the net load in a turning
-    flight, the thicknesses of skin and webs, and the size of the largest cell of the mesh.
+    Only the semi-span and the chords change. Some positions are fractions in the design, and so
+    move with the planform: those of ribs, point masses and bands of the skin along the span, and
+    all positions along the chord. Other positions are distances in the design, and so do not
+    change: those of gauges and defect regions from the root, and that of the test load from the
+    tip. The net load in a turning flight, the thicknesses of skin and webs, and the size of the
+    largest cell of the mesh do not change either.
 
     Parameters
     ----------

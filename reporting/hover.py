@@ -248,23 +248,25 @@ def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
 
 
 def _map_records(axes: Axes) -> list[JsonObject]:
-    """Return the heat maps of a panel with linear axes, as the script of the page reads them.
+    """Return the heat maps of a panel as JSON, for the script that shows values under the mouse.
 
     Returns
     -------
     list of dict
         For each map the edges of its columns ("x") and of its rows ("y"), its values row by row
-        ("values", null if a cell has no finite value), and the quantity ("name"). Maps with few
-        colours or too many cells are left out.
+        ("values", null if a cell has no finite value), and the quantity ("name"). A map is left out
+        if it has too many cells, or fewer than `_FEW_COLOURS` colours: these then stand for names,
+        not for values. A colour bar and a panel with a logarithmic axis have no maps.
     """
     figure = axes.get_figure(root=True)
-    if figure is None or _is_color_bar(axes):
+    if figure is None or _is_colour_bar(axes):
         return []
-    if {axes.get_xscale(), axes.get_yscale()} != {"linear"}:
+    has_linear_axes = axes.get_xscale() == "linear" and axes.get_yscale() == "linear"
+    if not has_linear_axes:
         return []
-    # All heat maps of a figure of the project show one quantity: that of its first colour bar.
-    color_bar_labels = [panel.get_ylabel() for panel in figure.axes if _is_color_bar(panel)]
-    quantity = color_bar_labels[0] if color_bar_labels else ""
+    # The project's figures show one quantity in all their heat maps: that of the first colour bar.
+    colour_bar_labels = [panel.get_ylabel() for panel in figure.axes if _is_colour_bar(panel)]
+    quantity = colour_bar_labels[0] if colour_bar_labels else ""
     records: list[JsonObject] = []
     for artist in (*axes.collections, *axes.images):
         if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
@@ -306,7 +308,7 @@ def _rounded_cells(row: Sequence[float | None]) -> list[float | None]:
     return [None if value is None else float(f"{value:.3g}") for value in row]
 
 
-def _is_color_bar(axes: Axes) -> bool:
+def _is_colour_bar(axes: Axes) -> bool:
     """Return whether a panel is a colour bar."""
     return hasattr(axes, "_colorbar")
 

@@ -61,10 +61,11 @@ class Tile(NamedTuple):
 
 
 def tiles_of_figure(figure: Figure) -> list[Tile]:
-    """Return the tiles of a figure in the order in which they are read.
+    """Return the tiles into which a figure is cut for a narrow screen, in the order of reading.
 
-    Legends of the whole figure come first. Then the columns of panels follow from left to right,
-    each from top to bottom; a colour bar stays beside its panel.
+    A tile is a rectangle around a few panels or entries of a legend, narrow enough to be shown
+    alone. The legends of the whole figure come first. Then the columns of panels follow from left
+    to right, each from top to bottom; a colour bar stays beside its panel.
 
     Parameters
     ----------
@@ -76,6 +77,7 @@ def tiles_of_figure(figure: Figure) -> list[Tile]:
     width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())
 
     def tile_of_box(box: Bbox) -> Tile:
+        """Convert a box in pixels, with y upwards, to a tile in points, with y downwards."""
         scale = _POINTS_PER_INCH / figure.dpi
         return Tile(scale * box.x0, height - scale * box.y1, scale * box.width, scale * box.height)
 
@@ -84,7 +86,7 @@ def tiles_of_figure(figure: Figure) -> list[Tile]:
         legend_boxes += [tile_of_box(box) for box in _boxes_of_entries(legend, renderer)]
     panel_boxes = [tile_of_box(box) for box in _boxes_of_panels(figure, renderer)]
     panel_boxes += [tile_of_box(text.get_window_extent(renderer)) for text in figure.texts]
-    groups = [*_cut(legend_boxes), *_cut(panel_boxes)]
+    groups = [*_split_into_narrow_groups(legend_boxes), *_split_into_narrow_groups(panel_boxes)]
     return [_surrounding_tile(group, width, height) for group in groups]
 
 
@@ -145,8 +147,11 @@ def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axe
     return min(panels, key=gap, default=None)
 
 
-def _cut(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
-    """Yield groups of boxes that are narrow, as far as no box is cut."""
+def _split_into_narrow_groups(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
+    """Yield groups of boxes that are at most `NARROW` wide, unless a box would have to be cut.
+
+    Columns of boxes are yielded from left to right, rows of boxes from top to bottom.
+    """
     if not boxes:
         return
     x_start = min(box.x for box in boxes)
@@ -157,12 +162,12 @@ def _cut(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
     columns = _separate(boxes, lambda box: (box.x, box.x_end))
     if len(columns) > 1:
         for group in _side_by_side(columns):
-            yield from [group] if len(group) == len(boxes) else _cut(group)
+            yield from [group] if len(group) == len(boxes) else _split_into_narrow_groups(group)
         return
     rows = _separate(boxes, lambda box: (box.y, box.y_end))
     if len(rows) > 1:
         for row in rows:
-            yield from _cut(row)
+            yield from _split_into_narrow_groups(row)
         return
     yield list(boxes)
 

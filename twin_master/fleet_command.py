@@ -180,20 +180,28 @@ class _Console:
 
 
 def _heading(standing: Standing) -> str:
-    """Return how many assets are watched, with their steps and alarms, in words."""
+    """Return the heading of a table of watched assets, such as "3 assets, 120 steps, 1 alarm".
+
+    Refused messages, and assets that could not be watched, are added if there are any.
+
+    Parameters
+    ----------
+    standing : mapping
+        The last records of all watched assets, from `read_standing`.
+    """
     from twin_master.fleet.watched_asset import counts_of
 
     counts = counts_of(standing)
-    words = [
+    phrases = [
         counted(counts["assets"], "asset"),
         counted(counts["steps"], "step"),
         counted(counts["alarms"], "alarm"),
     ]
     if counts["messages refused"]:
-        words.append(f"{counted(counts['messages refused'], 'message')} refused")
+        phrases.append(f"{counted(counts['messages refused'], 'message')} refused")
     if counts["not watched"]:
-        words.append(f"{counts['not watched']} not watched")
-    return ", ".join(words)
+        phrases.append(f"{counts['not watched']} not watched")
+    return ", ".join(phrases)
 
 
 def _table_of_worst_assets(standing: Standing) -> "Table":

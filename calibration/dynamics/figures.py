@@ -11,7 +11,7 @@ from reporting import figures as style
 from .damped_cosine import RingDownMode
 from .trials import Fits, ModalFigure, RingDownFit, amplitude_dependence, average, spectrum
 
-_MILLIVOLTS = 1e3  # in a volt
+_MILLIVOLTS_PER_VOLT = 1e3
 
 
 class _AmplitudePanel(NamedTuple):
@@ -27,24 +27,36 @@ class _AmplitudePanel(NamedTuple):
 
 @style.publication_style()
 def ring_down_figure(trials: Fits) -> Figure:
-    """Return the figure of fitted trials.
+    """Return a figure with four panels of fitted ring-down trials.
 
-    It shows the first trial with its two modes, the spectra of all trials, and frequency and
-    damping ratio of the first mode over its amplitude.
+    It shows the first trial with its two modes, the spectra of all trials, and natural frequency
+    and damping ratio of the first mode over its amplitude.
     """
     figure, (upper, lower) = style.panels(
-        2, 2, 4.8, 0.29, 0.43, left=0.075, wspace=0.26, hspace=0.48
+        rows=2, columns=2, height=4.8, top=0.29, bottom=0.43, left=0.075, wspace=0.26, hspace=0.48
     )
     _draw_record(upper[0], trials[0])
     _draw_spectra(upper[1], trials)
     windows = [window for fit in trials for window in amplitude_dependence(fit)]
-    frequency_title = "First mode within windows of 0.8 s"
-    for panel in (
-        _AmplitudePanel(lower[0], "frequency", 1.0, "natural frequency (Hz)", "c", frequency_title),
-        _AmplitudePanel(lower[1], "damping_ratio", 100.0, "damping ratio (%)", "d", "Its damping"),
-    ):
-        mean = average(trials, panel.quantity, 0).mean
-        _draw_amplitude_dependence(panel, windows, mean)
+    frequency_panel = _AmplitudePanel(
+        axes=lower[0],
+        quantity="frequency",
+        scale=1.0,
+        ylabel="natural frequency (Hz)",
+        letter="c",
+        title="First mode within windows of 0.8 s",
+    )
+    damping_panel = _AmplitudePanel(
+        axes=lower[1],
+        quantity="damping_ratio",
+        scale=100.0,  # to per cent
+        ylabel="damping ratio (%)",
+        letter="d",
+        title="Its damping",
+    )
+    for panel in (frequency_panel, damping_panel):
+        mean_over_trials = average(trials, panel.quantity, mode=0).mean
+        _draw_amplitude_dependence(panel, windows, mean_over_trials)
     return figure
 
 
@@ -53,7 +65,7 @@ def _draw_amplitude_dependence(
 ) -> None:
     """Draw a modal value of the windows over their amplitudes, and its mean over whole records."""
     axes = panel.axes
-    amplitudes = [window.amplitude * _MILLIVOLTS for window in windows]
+    amplitudes = [window.amplitude * _MILLIVOLTS_PER_VOLT for window in windows]
     values = [panel.scale * getattr(window, panel.quantity) for window in windows]
     axes.semilogx(amplitudes, values, "o", color=style.OBSERVED, ms=2.4)
     axes.axhline(panel.scale * mean, color=style.PAST, lw=1.0, label="whole record")
@@ -64,15 +76,18 @@ def _draw_amplitude_dependence(
 
 
 def _draw_record(axes: Axes, fit: RingDownFit) -> None:
-    """Draw a measured record, its fit, and the envelopes of the two modes."""
+    """Draw a measured record, its fit, and the envelopes of the two modes.
+
+    The style names colours by what they show in most figures; here they only tell curves apart.
+    """
     time = fit.record.time
-    measured = fit.record.signal * _MILLIVOLTS
+    measured = fit.record.signal * _MILLIVOLTS_PER_VOLT
     axes.plot(time, measured, ".", color=style.OBSERVED, ms=2.2, label="measured")
-    axes.plot(time, fit.fitted * _MILLIVOLTS, color=style.PAST, lw=0.9, label="two modes")
+    axes.plot(time, fit.fitted * _MILLIVOLTS_PER_VOLT, color=style.PAST, lw=0.9, label="two modes")
     colours = (style.PRESENT, style.PREDICTION)
     for mode, colour, dashes in zip(fit.modes, colours, ("--", ":"), strict=True):
         decay = np.exp(mode.pole.real * (time - time[0]))
-        envelope = mode.amplitude * decay * _MILLIVOLTS
+        envelope = mode.amplitude * decay * _MILLIVOLTS_PER_VOLT
         label = f"envelope, {mode.frequency:.2f} Hz"
         axes.plot(time, envelope, color=colour, lw=0.9, ls=dashes, label=label)
     axes.set(xlim=(0.0, min(2.0, float(time[-1]))), xlabel="time (s)", ylabel="strain signal (mV)")
@@ -87,7 +102,7 @@ def _draw_spectra(axes: Axes, trials: Fits) -> None:
         label = f"{len(spectra)} trials" if number == 0 else None
         axes.semilogy(
             frequency,
-            amplitude * _MILLIVOLTS,
+            amplitude * _MILLIVOLTS_PER_VOLT,
             color=style.OBSERVED,
             lw=0.5,
             alpha=0.6,
@@ -96,7 +111,7 @@ def _draw_spectra(axes: Axes, trials: Fits) -> None:
     for mode, name, dashes in ((0, "first", "--"), (1, "second", ":")):
         mean = average(trials, "frequency", mode).mean
         axes.axvline(mean, color=style.PAST, lw=0.8, ls=dashes, label=f"{name} mode")
-    highest = _MILLIVOLTS * max(float(amplitude.max()) for _, amplitude in spectra)
+    highest = _MILLIVOLTS_PER_VOLT * max(float(amplitude.max()) for _, amplitude in spectra)
     last_frequency, _ = spectra[-1]
     axes.set(xlim=(0.0, float(last_frequency[-1])), ylim=(2e-4 * highest, 2.0 * highest))
     axes.set(xlabel="frequency (Hz)", ylabel="amplitude (mV)")

@@ -83,21 +83,26 @@ _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 def wing_priors(
     validity: Mapping[str, tuple[float, float]], **stated: tuple[float, float]
 ) -> tuple[ParameterPrior, ...]:
-    """Return the priors of e, masses and damping, in the order of `STATE`.
+    """Return the priors of a wing's parameters: stiffness, two masses and two damping coefficients.
 
-    The prior of e is the paper's N(1, (0.05 / 1.96)^2). The others are weak. Each mass has a mean
-    of a third of the weighed total and a standard deviation of 50 g (servo) or 100 g (pitot tube);
-    given the weighed total, a servo's mass then has a standard deviation of 30 g. The damping
-    coefficients have half Gaussians from zero with scales 3 1/s and 1.5e-3 s; at these values each
-    coefficient alone would damp mode 1 by 4 % and mode 2 by 14 %, twice the measured ratios. e and
-    the masses are confined to the range of the model.
+    The stiffness is given by e, a factor on Young's modulus of the skin. Its prior is that of the
+    paper, N(1, (0.05 / 1.96)^2). The other priors are weak:
+
+    - Two servos and a pitot tube were weighed together. The mean of each mass is a third of their
+      total mass. The standard deviation is 50 g for a servo and 100 g for the pitot tube. Given the
+      total, the standard deviation of a servo's mass is then 30 g.
+    - The Rayleigh damping coefficients alpha and beta are not negative. Their priors are the
+      halves above zero of Gaussians with mean zero and standard deviations 3 1/s and 1.5e-3 s. A
+      coefficient of this size alone gives a damping ratio of 4 % (alpha, mode 1) or 14 % (beta,
+      mode 2), twice the measured ratio.
 
     Parameters
     ----------
     validity : mapping of str to (float, float)
-        The ranges of e and the masses in the model.
+        The least and the largest value of e and of each mass for which the model is valid. They
+        limit the priors.
     **stated : (float, float)
-        Means and standard deviations that replace these, by name.
+        Means and standard deviations that replace the ones above, by the name of the parameter.
     """
     ranges = {**validity, **_DAMPING_RANGES}
     priors = []

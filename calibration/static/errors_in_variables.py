@@ -72,9 +72,13 @@ def pair_log_likelihoods(
     young_modulus_factor: ArrayLike,
     measure: Measure = "displacement",
 ) -> Float:
-    """Return the log likelihood of each pair at values of e.
+    """Return the log likelihood of e for each measured pair of load and displacement.
 
-    With the measure "ratio" it is the limit of the paper's kernel likelihoods.
+    Here e is the factor on Young's modulus that is to be calibrated; the wing has the stiffness
+    k(e) [N/m]. Both readings of a pair have Gaussian errors. The true displacement is integrated
+    out, with a flat prior; the module's docstring derives the formulas. With the measure "ratio"
+    the likelihood is the limit for many particles of the kernel density estimate in the paper that
+    published the experiment.
 
     Parameters
     ----------
@@ -85,12 +89,13 @@ def pair_log_likelihoods(
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}
-        The quantity whose prior is flat, see the module's docstring.
+        The true quantity of a pair whose prior is flat: displacement, load, or load over
+        displacement, which is the stiffness.
 
     Returns
     -------
     (n_pairs, N) array
-        The logarithms of likelihoods in 1/N.
+        The natural logarithms of the likelihoods, at each of the N values of e.
     """
     factor = np.atleast_1d(np.asarray(young_modulus_factor, dtype=float))
     k = curve.stiffness(factor)
@@ -98,18 +103,21 @@ def pair_log_likelihoods(
     displacement = data.displacement[:, None]
     variance = residual_variance(data, k)
     squared_score = (load - k * displacement) ** 2 / variance
-    likelihood = -0.5 * (squared_score + np.log(2.0 * math.pi * variance))
+    log_likelihood = -0.5 * (squared_score + np.log(2.0 * math.pi * variance))
     if measure == "load":
-        likelihood += np.log(k)
+        # A prior that is flat in the true load is k times one that is flat in the displacement.
+        log_likelihood += np.log(k)
     if measure == "ratio":
-        # Mean and standard deviation of the true displacement given both readings
+        # The density of a ratio (Hinkley 1969) has the factors |dk/de| and E|X|, where X is the
+        # true displacement given both readings. X is Gaussian with this mean and deviation, so |X|
+        # is a folded Gaussian.
         load_variance = data.load_standard_deviation**2
         displacement_variance = data.displacement_standard_deviation**2
         mean = (displacement * load_variance + k * load * displacement_variance) / variance
         deviation = np.sqrt(load_variance * displacement_variance / variance)
         mean_displacement = _mean_of_folded_gaussian(mean, deviation)
-        likelihood += np.log(mean_displacement) + np.log(curve.slope(factor))
-    return np.asarray(likelihood)
+        log_likelihood += np.log(mean_displacement) + np.log(curve.slope(factor))
+    return np.asarray(log_likelihood)
 
 
 def _mean_of_folded_gaussian(mean: Float, deviation: Float) -> Float:

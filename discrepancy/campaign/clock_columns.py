@@ -59,12 +59,13 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
 
 
 def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str, list[str]] | None:
-    """Return the heads that each column of times stamps, by the words in their names.
+    """Assign columns of readings to columns of times, by the words that their names share.
 
     Returns
     -------
     dict of str to list of str, or None
-        None if a column fits no clock or several, or a clock has no column.
+        For each column of times the names of the columns that were read at these times. None if a
+        column of readings fits no column of times or several, or if a column of times gets none.
     """
     common = shared_words(times)
     labels = {time: words_of_head(time) - common for time in times}
@@ -79,29 +80,44 @@ def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str,
     return stamped if all(stamped.values()) else None
 
 
-def _columns_by_position(times: Sequence[str], heads: Sequence[str]) -> dict[str, list[str]] | None:
-    """Return the heads that each column of times stamps, by the order of the columns.
+def _columns_by_position(
+    time_columns: Sequence[str], columns: Sequence[str]
+) -> dict[str, list[str]] | None:
+    """Assign columns of readings to columns of times, by the order of the columns in a table.
+
+    Either each column of times stands before the columns of its readings, or each stands after
+    them.
+
+    Parameters
+    ----------
+    time_columns : sequence of str
+        The names of the columns of times.
+    columns : sequence of str
+        The names of all columns, in the order of the table.
 
     Returns
     -------
     dict of str to list of str, or None
-        None if no column of times comes first or last, or a clock has no column.
+        For each column of times the names of the columns that were read at these times. None if
+        neither the first nor the last column of the table has times, or if a column of times has
+        no columns of readings.
     """
-    in_order = heads if heads[0] in times else heads[::-1]
-    if in_order[0] not in times:
+    # If times stand after their readings, the table is read backwards.
+    in_reading_order = columns if columns[0] in time_columns else columns[::-1]
+    if in_reading_order[0] not in time_columns:
         return None
     stamped: dict[str, list[str]] = {}
-    current = in_order[0]
-    for head in in_order:
-        if head in times:
-            current = head
-            stamped[current] = []
+    current_time_column = in_reading_order[0]
+    for column in in_reading_order:
+        if column in time_columns:
+            current_time_column = column
+            stamped[current_time_column] = []
         else:
-            stamped[current].append(head)
+            stamped[current_time_column].append(column)
     if not all(stamped.values()):
         return None
-    # each list in the order of the table, although the columns may have been read backwards
+    # The columns of readings are returned in the order of the table, even if it was read backwards.
     in_table_order: dict[str, list[str]] = {}
-    for time, members in stamped.items():
-        in_table_order[time] = [head for head in heads if head in members]
+    for time_column, stamped_columns in stamped.items():
+        in_table_order[time_column] = [column for column in columns if column in stamped_columns]
     return in_table_order

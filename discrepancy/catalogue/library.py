@@ -42,12 +42,16 @@ def library() -> tuple[Effect, ...]:
 
 
 def effects_of_entry_points() -> tuple[Effect, ...]:
-    """Return the effects of installed packages that offer some, by the name of the entry point.
+    """Return the effects that installed packages add to the catalogue.
+
+    A package adds effects by an entry point of the group `GROUP`: a function without arguments
+    that returns an effect or several. The effects are sorted by the names of their entry points.
 
     Raises
     ------
     CatalogueError
-        If an entry point fails or does not return effects; the sentence names it.
+        If an entry point fails or returns something other than effects. The message names the
+        entry point.
     """
     all_effects: list[Effect] = []
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):

@@ -133,21 +133,23 @@ def _largest_reading(context: BuildContext) -> float:
 
 
 def _compute_largest_reading(context: BuildContext) -> float:
-    """Return the largest absolute used reading of the target channel or channels [their unit].
+    """Return the largest absolute reading of the channels on which an effect acts.
 
-    It is 0 if there is no used reading.
+    It has the unit of the channels, and is 0 if they have no reading. Readings that are marked as
+    not used are left out.
     """
     target = context.target
-    names: tuple[str, ...] = (target.name,)
+    target_channels: tuple[str, ...] = (target.name,)
     if target.name == EVERY_CHANNEL:
-        names = context.effect.channels_of(
+        # all channels that measure the quantity of the target; "" stands for any quantity
+        target_channels = context.effect.channels_of(
             lambda channel: target.quantity in ("", channel.quantity.value)
         )
     largest = 0.0
-    for trial in context.effect.trials:
+    for trial in context.effect.trials:  # the trials in which the effect can act
         for column, name in enumerate(trial.channels):
             used = trial.used[:, column]
-            if name in names and used.any():
+            if name in target_channels and used.any():
                 readings = np.abs(trial.values[used, column])
                 largest = max(largest, float(np.max(readings)))
     return largest

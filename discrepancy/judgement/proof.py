@@ -457,32 +457,36 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
     return None if residuals.held_out is None else compute_scores(residuals.held_out, seed=seed)
 
 
-def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
-    """Return a sentence on the residuals that the effect does not explain.
+def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
+    """Return a sentence on what is left in the residuals of a model that contains the effect.
 
     Parameters
     ----------
     residuals : ResidualSet
-        The residuals with the effect, of the held-out trials, or of the fitted ones if no trial is
-        held out.
-    after : Scores
-        Their scores.
+        The residuals with the effect: either all of held-out trials, or, if no trial is held out,
+        all of fitted trials.
+    scores : Scores
+        The scores of these residuals.
     """
-    if not isfinite(after.chi_square_per_sample):
+    if not isfinite(scores.chi_square_per_sample):
         return "Without a noise record it is not known what remains."
+    # the trials are all of one kind, so the first one shows which
     trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
-    chi_square_phrase = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
+    chi_square_phrase = f"χ² per sample {scores.chi_square_per_sample:.3g} on {trials}"
     channels = residuals.recorded_channels
-    mean_square_residual, freedom = mean_square_ratio(residuals, channels)
+    # Are the residuals larger than the noise? The mean square has the expectation one for noise.
+    mean_square, degrees_of_freedom = mean_square_ratio(residuals, channels)
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
-    if variance_p_value(mean_square_residual, freedom, noise_freedom) < REMAINING_LEVEL:
+    size_p_value = variance_p_value(mean_square, degrees_of_freedom, noise_freedom)
+    if size_p_value < REMAINING_LEVEL:
         by_channel = {name: _channel_chi_square(residuals, name) for name in channels}
         worst = max(by_channel, key=lambda name: by_channel[name])
         return f"Still unexplained: {chi_square_phrase}, most on {worst} ({by_channel[worst]:.3g})."
-    if after.whiteness < REMAINING_LEVEL:
+    # `whiteness` is the p-value of a test whether successive residuals are independent.
+    if scores.whiteness < REMAINING_LEVEL:
         return (
             f"The size is that of noise ({chi_square_phrase}), but residuals are not white "
-            f"(p = {after.whiteness:.1g})."
+            f"(p = {scores.whiteness:.1g})."
         )
     return f"Nothing that these data can show remains ({chi_square_phrase})."
 

@@ -523,34 +523,42 @@ def _variance_cells(
 def _frequency_cells(
     series: FloatArray, interval: float, template: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the cells of a dynamic record in bands of frequency, which are wider at high frequency.
+    """Yield the variance of a channel's residuals in bands of frequency, and its p-value.
+
+    Each band is one cell of the map of residuals. Bands are wider at high frequency.
 
     Parameters
     ----------
     series : (N,) ndarray
-        White residuals of a channel.
+        Residuals of a channel that are white, of variance one, if they contain noise alone.
     interval : float
         Sampling interval [s].
     template : Cell
-        Cell with the names of trial and channel.
+        A cell with the names of trial and channel, from which the others are copied.
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 if it has none.
     """
-    ordinates = periodogram(series)
-    if ordinates.size < 4 * BIN_COUNT or noise_freedom <= 0.0:
+    ordinates = periodogram(series)  # of the frequencies 1, 2, 3, ... times the resolution
+    # With four ordinates in each band on average, the variance of a band can be tested.
+    is_too_short = ordinates.size < 4 * BIN_COUNT
+    if is_too_short or noise_freedom <= 0.0:
         return
-    edges = np.unique(np.round(np.geomspace(4, ordinates.size, BIN_COUNT)).astype(int)).tolist()
+    # The first band has four ordinates; the ends of the others grow geometrically.
+    band_ends = np.round(np.geomspace(4, ordinates.size, BIN_COUNT)).astype(int)
+    edges = [0, *np.unique(band_ends).tolist()]
     resolution = 1.0 / (series.size * interval)
-    for first_ordinate, last_ordinate in pairwise([0, *edges]):
-        count = 2 * (last_ordinate - first_ordinate)  # a cosine and a sine for each ordinate
-        value = float(ordinates[first_ordinate:last_ordinate].mean())
+    for start, end in pairwise(edges):
+        count = 2 * (end - start)  # a cosine and a sine for each ordinate
+        variance = float(ordinates[start:end].mean())
+        # Ordinate j has the frequency (j + 1) times the resolution; the edge lies half a step
+        # below the frequency of ordinate `start`.
         yield replace(
             template,
             axis="frequency",
             statistic="variance",
-            low=(first_ordinate + 0.5) * resolution,
-            high=(last_ordinate + 0.5) * resolution,
+            low=(start + 0.5) * resolution,
+            high=(end + 0.5) * resolution,
             count=count,
-            value=value,
-            p_value=variance_p_value(value, count, noise_freedom),
+            value=variance,
+            p_value=variance_p_value(variance, count, noise_freedom),
         )

@@ -126,23 +126,26 @@ class ForceFilter:
 
     @cached_property
     def state_units(self) -> FloatArray:
-        """The unit (n,) by which each state of the structure is divided, so that it is near one.
+        """The typical size (n,) of each state of the structure, by which the filter divides it.
 
-        A missing force of one standard deviation at the highest natural frequency moves a speed by
-        the rate that it causes over that frequency, and a position by the speed over the frequency.
+        Let the missing force, which the model lacks, vary at the highest natural frequency omega
+        with an amplitude of one standard deviation, and let it cause the acceleration a. The size
+        of a speed is then a / omega, and the size of a position is a / omega^2.
         """
         system = self.trial.system
         state_count = len(system.generator)
         highest_frequency = max(
             float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9
         )
-        largest_rates = [
+        # a row of `actions` holds the rates (n,) of the states that a unit force at a port causes
+        accelerations = [
             np.abs(system.actions[port]).max(initial=0.0) * process.standard_deviation
             for port, process in self.processes
         ]
-        largest_rate = max(*largest_rates, 1e-300)
-        units = np.full(state_count, largest_rate / highest_frequency)
-        # with an even number of states, the first half are positions, the second half their speeds
+        largest_acceleration = max([*accelerations, 1e-300])  # not zero, as it divides
+        units = np.full(state_count, largest_acceleration / highest_frequency)
+        # The system does not say which states are positions. An even number of states is taken for
+        # positions and then as many speeds, an odd number for speeds alone.
         has_positions = state_count % 2 == 0
         if has_positions:
             units[: state_count // 2] /= highest_frequency

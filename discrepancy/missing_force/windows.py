@@ -315,35 +315,41 @@ def _best_channel_error(
 
 
 def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: str) -> PortedTrial:
-    """Return a trial whose only port is a channel: a force there is an error of its readings.
+    """Return a trial in which the missing force is an error of the readings of one channel.
+
+    The ports of the model, at which forces act on the structure, are replaced by a single port
+    that acts on the readings alone. A force of one there raises the reading of the channel by one
+    standard deviation of its noise.
 
     Parameters
     ----------
     trial : PortedTrial
-        The trial.
+        The trial, with N samples of C channels and n states.
     channels : sequence of str
-        The channels of the trial.
+        The names of the C channels.
     channel : str
-        The channel with the error. A force of one changes its reading by one noise deviation.
+        The name of the channel with the error.
     """
-    # readings are C s - e f (see `PortedSystem`): the minus sign makes a positive force raise them
-    through = -trial.deviation[None] * (np.array(channels) == channel)
-    no_motion = np.zeros((len(trial.port_positions), 1))
-    no_action = np.zeros((1, len(trial.system.generator)))
+    # The readings (C,) are C s - e f, with state s and force f; `through` is e, an array (1, C).
+    # It has a minus sign, so that a positive force raises the reading.
+    has_error = np.array(channels) == channel
+    through = -trial.deviation[None] * has_error
+    zeros_of_states = np.zeros((1, len(trial.system.generator)))
+    zeros_of_samples = np.zeros((len(trial.port_positions), 1))
     system = replace(
         trial.system,
         ports=("reading",),
-        actions=no_action,
-        positions=no_action,
-        speeds=no_action,
+        actions=zeros_of_states,
+        positions=zeros_of_states,
+        speeds=zeros_of_states,
         through=through,
     )
     return replace(
         trial,
         system=system,
-        port_positions=no_motion,
-        port_speeds=no_motion,
-        port_motion_derivatives={},
+        port_positions=zeros_of_samples,
+        port_speeds=zeros_of_samples,
+        port_motion_derivatives={},  # the port does not move
     )
 
 

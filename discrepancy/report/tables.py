@@ -298,10 +298,16 @@ def _channels_text(trial: Trial) -> str:
 
 
 def origin_table(origin: Origin) -> TitledTable:
-    """Return the table of where a verdict comes from."""
+    """Return the table of the data, model, command and software from which a verdict was computed.
+
+    Rows without a value are left out.
+    """
     provenance = origin.provenance
     versions = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
-    sources = ", ".join(f"{name} {value[:12]}" for name, value in provenance.source_hashes.items())
+    # the first 12 digits of the hash of each package's source text
+    sources = ", ".join(
+        f"{name} {digest[:12]}" for name, digest in provenance.source_hashes.items()
+    )
     items = {
         "campaign": f"{origin.campaign}, SHA-256 {origin.data_hash}",
         "model": f"{origin.model}, SHA-256 {origin.model_hash}",

@@ -55,19 +55,28 @@ def headline(verdict: Verdict) -> str:
 
 
 def group_members(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
-    """Return the effects of each member of a group by its name; empty for any other verdict."""
+    """Return the members of a group: explanations that the data cannot tell apart.
+
+    Returns
+    -------
+    dict of str to tuple of NamedEffect
+        The effects of each member, by a text that names them. Empty if the verdict is not a group.
+    """
     if verdict.kind is not VerdictKind.GROUP:
         return {}
-    effects_of_hypotheses = {}
-    for hypothesis in reversed(verdict.hypotheses):  # the first of several counts
-        effects_of_hypotheses[" + ".join(hypothesis.identifiers)] = hypothesis.effects
+    # `verdict.group` identifies a member of several effects by "first + second".
+    effects_by_identifier: dict[str, tuple[NamedEffect, ...]] = {}
+    for hypothesis in verdict.hypotheses:  # the most probable first
+        identifier = " + ".join(hypothesis.identifiers)
+        effects_by_identifier.setdefault(identifier, hypothesis.effects)
     members = {}
-    for member in verdict.group:
-        if member in effects_of_hypotheses:
-            effects = effects_of_hypotheses[member]
+    for identifier in verdict.group:
+        if identifier in effects_by_identifier:
+            effects = effects_by_identifier[identifier]
         else:
-            effects = tuple(effect for effect in verdict.effects if effect.identifier == member)
-        members[effects_text(effects) or member] = effects
+            effects = tuple(effect for effect in verdict.effects if effect.identifier == identifier)
+        title = effects_text(effects) or identifier
+        members[title] = effects
     return members
 
 

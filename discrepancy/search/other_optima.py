@@ -19,24 +19,27 @@ from discrepancy.search_settings import SEARCH
 def canonical_relatives(
     leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
-    """Return the hypotheses of one effect with the family and place of a leading effect.
+    """Return the hypotheses that a fit from other starting magnitudes may improve.
 
-    They are fitted again from other magnitudes, so only effects with a magnitude are returned, and
-    of these only the ones with a canonical shape.
+    Such a hypothesis consists of one effect. The effect has the same family (such as friction) and
+    the same place as the leading effect, which fits best so far; it may be the leading effect
+    itself. It has a magnitude, from which the fit can start. The shape of its law is the canonical
+    one of the catalogue, as its shape parameters are not fitted.
 
     Parameters
     ----------
     leading : EffectTerm
         The leading effect at its place.
     hypotheses : iterable of ForceHypothesis
-        The sets of effects that were fitted to the missing force.
+        All hypotheses: sets of effects that were fitted to the missing force.
     """
     relatives = []
     for hypothesis in hypotheses:
         if len(hypothesis.candidate.terms) != 1:
             continue
         (term,) = hypothesis.candidate.terms
-        is_related = (term.effect.family, term.place) == (leading.effect.family, leading.place)
+        has_same_family = term.effect.family == leading.effect.family
+        is_related = has_same_family and term.place == leading.place
         has_magnitude = any(parameter.magnitude for parameter in term.parameters)
         if is_related and has_magnitude and not term.free_shape:
             relatives.append(hypothesis)

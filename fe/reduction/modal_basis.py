@@ -156,33 +156,37 @@ def _refine_states(
 def _davidson_corrections(
     terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the directions that improve the modes of S states, and the sizes of their residuals.
+    """Return vectors that improve a basis for the modes of S states, and the relative residuals.
 
-    A mode phi in the span of the working basis leaves the residual r = (K - omega^2 M) phi.
-    Davidson's method adds the preconditioned residual X^-1 r to the basis; here the preconditioner
-    is the factorised nominal stiffness X, and directions are kept whitened, as X^-1/2 r.
+    The M modes of each state are computed in the working basis, a few vectors of displacements. A
+    mode phi computed in this way leaves the residual r = (K - omega^2 M) phi. Davidson's method
+    adds X^-1 r to the basis, where X approximates K; here X is the stiffness of a reference state,
+    which is factorised once. The vectors are returned in whitened coordinates, as X^-1/2 r, in
+    which their Euclidean norm is the energy norm of X^-1 r.
 
     Returns
     -------
     corrections : (n, S M) array
-        The whitened residuals, the modes of one state side by side.
+        The whitened residuals, one column for each mode. The modes of one state stand side by side.
     sizes : (S M,) array
-        The square root of (r, X^-1 r) / (phi, K phi), where phi is mass-normalised.
+        The relative size of each residual: the square root of (r, X^-1 r) / (phi, K phi).
     """
-    # the modes in the working basis, of all states side by side
+    # natural frequencies and modes in the working basis; all states side by side
     modes = [
         projected_modes(working.stiffness, working.mass, state, mode_count) for state in states
     ]
-    squares = np.concatenate([mode_squares for mode_squares, _ in modes])
+    squared_frequencies = np.concatenate([squares for squares, _ in modes])
     projected_shapes = np.concatenate([mode_shapes for _, mode_shapes in modes], axis=1)
     shapes = working.displacements @ projected_shapes
-    # coefficients of the affine terms of K and M, a column for each mode
+    # coefficients of the affine terms of K (T, S M) and of M, one column for each mode
     stiffness = np.repeat([state.stiffness for state in states], mode_count, axis=0).T
     mass = np.repeat([state.mass for state in states], mode_count, axis=0).T
     residuals = affine_product(terms.stiffness_terms, stiffness, shapes)
-    residuals -= affine_product(terms.structure.mass_terms, mass * squares, shapes)
+    residuals -= affine_product(terms.structure.mass_terms, mass * squared_frequencies, shapes)
     corrections = working.factors.whitened(residuals)
-    return corrections, np.linalg.norm(corrections, axis=0) / np.sqrt(squares)
+    # modes are mass-normalised, so (phi, K phi) is the squared frequency
+    sizes = np.linalg.norm(corrections, axis=0) / np.sqrt(squared_frequencies)
+    return corrections, sizes
 
 
 def _compressed_directions(

@@ -227,19 +227,29 @@ class ReductionTerms:
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:
-        """Return the states of each anchor, as coefficients (T,) of the stiffness terms.
+        """Return the anchors: groups of states at which dual solutions are computed.
 
-        An anchor is a group of states whose dual solutions are combined to those of nearby states.
-        With few regions, the range of losses is divided into a grid, and each of its cells has an
-        anchor of one state; the loss of the last region changes first. With many regions there is a
-        single anchor, whose states are the corners of the box of parameters and losses.
+        The error bound of an output needs the output's dual solution. At any state it is
+        approximated by a combination of the dual solutions at the states of one anchor. A state
+        consists of the parameters of the structure and of the stiffness losses of its K regions.
+
+        With few regions, the range of each loss is halved. Each of the 2^K combinations of halves
+        has an anchor of one state, in the middle of these halves. With many regions there is a
+        single anchor, whose states are the corners of the box of all parameters and losses.
+
+        Returns
+        -------
+        list of list of (T,) array
+            For each anchor its states, each given by the coefficients of the T stiffness terms. If
+            there are several anchors, the loss of the last region changes fastest.
         """
-        if not self.splits.size:
+        has_many_regions = self.splits.size == 0
+        if has_many_regions:
             corner_states = self.states(cube_corners(self.varied))
             return [[self.theta(state) for state in corner_states]]
         anchors = []
-        losses_of_regions = self.losses_at(0.25, 0.75).T
-        for losses in itertools.product(*losses_of_regions):
+        middles_of_halves = self.losses_at(0.25, 0.75).T  # (K, 2)
+        for losses in itertools.product(*middles_of_halves):
             state = (*self.middle, *losses)
             anchors.append([self.theta(state)])
         return anchors

@@ -139,26 +139,28 @@ class ReducedModel(ReducedArrays):
         return vector
 
     def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
-        """Return the values of all inputs for B cases; inputs that are not given are nominal.
+        """Return the values of all V inputs of the model in B cases, as one row for each case.
 
         Parameters
         ----------
         columns : mapping of str to (B,) array_like or float
-            Values by the name of the input.
+            Values by the name of the input. A single number holds in all cases. Inputs that are
+            left out have their nominal values.
 
         Returns
         -------
         (B, V) array
-            The values in the order of `input_names`.
+            The values of the inputs, in the order of `input_names`.
 
         Raises
         ------
         OutsideModelError
-            If a name is unknown.
+            If a name is not that of an input.
         """
         arrays = [np.asarray(column) for column in columns.values()]
-        one_case, *broadcast = np.broadcast_arrays(np.zeros(1), *arrays)
-        vectors = np.tile(self.nominal, (len(one_case), 1))
+        # With an array of length one among them, single numbers alone make one case.
+        zeros_of_cases, *broadcast = np.broadcast_arrays(np.zeros(1), *arrays)
+        vectors = np.tile(self.nominal, (len(zeros_of_cases), 1))
         for name, array in zip(columns, broadcast, strict=True):
             vectors[:, self._input_number(name)] = array
         return vectors

@@ -289,37 +289,39 @@ class SensorLag(Sensor):
 
 
 def interpolated_by_cubics(
-    time: FloatArray, values: FloatArray, rates: FloatArray, moments: FloatArray
+    time: FloatArray, values: FloatArray, rates: FloatArray, new_time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return columns and their rates at other times, by cubic Hermite interpolation.
+    """Interpolate signals and their time derivatives by cubic Hermite polynomials.
 
-    The cubic of an interval has the given values and rates at both ends of the interval.
+    The cubic between two samples has the given values and time derivatives at both samples.
 
     Parameters
     ----------
     time : (N,) array
         Increasing times [s], at least two.
     values, rates : (N, C) array
-        The columns at these times, and their time derivatives.
-    moments : (M,) array
-        The times of interpolation [s]; outside of the record the first or the last cubic is
-        continued.
+        C signals at these times, and their time derivatives.
+    new_time : (M,) array
+        The times at which the signals are wanted [s]. Before the first sample the first cubic is
+        continued, after the last sample the last cubic.
 
     Returns
     -------
     values, rates : (M, C) array
-        The columns and their time derivatives at `moments`.
+        The signals and their time derivatives at `new_time`.
     """
     last_interval = len(time) - 2
-    interval = np.clip(np.searchsorted(time, moments, side="right") - 1, 0, last_interval)
+    interval = np.clip(np.searchsorted(time, new_time, side="right") - 1, 0, last_interval)
     length = (time[interval + 1] - time[interval])[:, np.newaxis]
-    s = (moments - time[interval])[:, np.newaxis] / length
+    s = (new_time - time[interval])[:, np.newaxis] / length
     begin, end = values[interval], values[interval + 1]
     begin_rate, end_rate = rates[interval], rates[interval + 1]
-    # Hermite basis in the fraction s of the interval: (1 + 2 s) (1 - s)^2, s^2 (3 - 2 s),
-    # s (1 - s)^2 and -s^2 (1 - s), the last two times the length; then its time derivative
+    # The Hermite basis in the fraction s of the interval is (1 + 2 s) (1 - s)^2 and s^2 (3 - 2 s)
+    # for the values, and s (1 - s)^2 and -s^2 (1 - s) times the length for the rates.
     interpolated = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * begin + s**2 * (3.0 - 2.0 * s) * end
     interpolated += length * s * (1.0 - s) * ((1.0 - s) * begin_rate - s * end_rate)
+    # The time derivative of the basis is that in s, divided by the length: +-6 s (1 - s) / length
+    # for the values, and (1 - s) (1 - 3 s) and s (3 s - 2) for the rates.
     interpolated_rates = 6.0 * s * (1.0 - s) * (end - begin) / length
     interpolated_rates += (1.0 - s) * (1.0 - 3.0 * s) * begin_rate + s * (3.0 * s - 2.0) * end_rate
     return interpolated, interpolated_rates

@@ -90,17 +90,22 @@ class _Block(NamedTuple):
 
 
 def read_abaqus(path: Path) -> Deck:
-    """Read the mesh of a deck; everything else in it (materials, steps, loads) is passed over.
+    """Read the mesh in an input file of Abaqus or CalculiX: nodes, elements, surfaces and sets.
+
+    The file consists of blocks: a keyword such as `*NODE`, its parameters, and lines of data.
+    Blocks that are not part of the mesh, such as materials, steps and loads, are ignored.
 
     Raises
     ------
     MeshError
-        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
+        If the file cannot be read, or if it has a keyword or a parameter without which the mesh
+        would be another one. The message names the line.
     """
     words = words_of("abaqus")
     deck = Deck(path, words)
-    coordinates = GLOBAL
+    coordinates = GLOBAL  # a *SYSTEM holds for the nodes after it
     for block in _blocks(path):
+        # Only the line of a section is kept, for messages on its set; its data are ignored below.
         if block.keyword.endswith(" SECTION"):
             deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
         if block.keyword not in words.read:
@@ -121,7 +126,7 @@ def read_abaqus(path: Path) -> Deck:
             coordinates = _coordinate_system(block)
         elif block.keyword == "SURFACE":
             _add_surface(deck, block)
-        else:
+        else:  # *NSET or *ELSET
             _add_members(deck, block)
     return deck
 

@@ -160,7 +160,7 @@ class AffineStructure:
         stiffness_loss : mapping of str to float, or iterable of float
             Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
         """
-        factors = _changed_factors(self.parameters, parameters, "parameter")
+        factors = _values_with_changes(self.parameters, parameters, "parameter")
         losses = losses_of(stiffness_loss, self.regions)
         loss_of_region = {None: 0.0} | dict(zip(self.regions, losses, strict=True))
         return np.array(
@@ -185,7 +185,7 @@ class AffineStructure:
         masses : mapping of str to float, optional
             Free masses that differ from their nominal values [kg].
         """
-        factors = _changed_factors(self.masses, masses, "free mass")
+        factors = _values_with_changes(self.masses, masses, "free mass")
         return affine_sum([*factors.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
@@ -217,7 +217,7 @@ class AffineStructure:
             Free masses that differ from their nominal values [kg].
         """
         control_value = self._nominal_control(name) if value is None else value
-        kilograms = _changed_factors(self.masses, masses, "free mass")
+        kilograms = _values_with_changes(self.masses, masses, "free mass")
         total: FloatArray = np.zeros(self.unknowns)
         for term in self.load_terms:
             if term.load == name:
@@ -278,24 +278,27 @@ class AffineStructure:
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-def _changed_factors(
+def _values_with_changes(
     nominal: dict[str, float], changed: Values | None, kind: str
 ) -> dict[str | None, float]:
-    """Return the factors of terms by name: one for None, then nominal values or changed ones.
+    """Return the values of all parameters or masses, of which some differ from their nominal value.
+
+    A term of the stiffness or the mass matrix is multiplied by the value that it names. A term that
+    names none has the name None, so the value of None is 1.0.
 
     Parameters
     ----------
     nominal : dict of str to float
-        Nominal values.
+        The nominal values by name.
     changed : mapping of str to float, optional
-        Values that differ.
+        The values that differ from the nominal ones, by name.
     kind : str
-        What the values are of, for sentences.
+        What is named in error messages: "parameter" or "free mass".
 
     Raises
     ------
     InvalidStateError
-        If a changed value has a name that the structure does not have.
+        If a name in `changed` is not a name in `nominal`.
     """
     changes = dict(changed or {})
     unknown_names = set(changes) - set(nominal)
@@ -304,9 +307,9 @@ def _changed_factors(
             f"The structure has no {kind} named {min(unknown_names)!r}; there are "
             f"{comma_list(nominal)}."
         )
-    factors: dict[str | None, float] = {None: 1.0}
-    factors.update(nominal | changes)
-    return factors
+    values: dict[str | None, float] = {None: 1.0}
+    values.update(nominal | changes)
+    return values
 
 
 @dataclass(frozen=True)

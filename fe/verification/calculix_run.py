@@ -41,7 +41,7 @@ def required_calculix() -> str:
 
 
 def read_tables(text: str) -> dict[str, list[FloatArray]]:
-    """Read the tables of nodes and integration points in a `.dat` file.
+    """Read the tables of nodes and integration points in a `.dat` file of CalculiX.
 
     Parameters
     ----------

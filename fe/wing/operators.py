@@ -196,23 +196,27 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
 
 
 def lift_load(mesh: WingMesh) -> FloatArray:
-    """Return the aerodynamic load (full,) [N] at load factor 1, upward and forward.
+    """Return the aerodynamic load of a wing at load factor 1, upward and forward, without inertia.
 
-    Half of it acts on each skin.
+    Half of the load acts on each skin, on the outer faces of its cells. Along the span it follows
+    the distribution of the design. Along the chord it is proportional to (1 - xi)^p, where xi is
+    the fraction of the chord from the leading edge and p the exponent of the design. Its sum over
+    all nodes is exactly the force of the design, divided by the load factor of that force.
 
-    The load follows the design's distribution along the span, and (1 - xi)^p along the chord with
-    the design's exponent p. Each skin cell is loaded on its outer face. The sums are exactly those
-    of the design, without the inertia.
+    Returns
+    -------
+    (3 nodes,) array
+        The forces x, y, z of each node [N]; x points aft, y along the span, z up.
     """
     lift = mesh.design.lift
-    load = np.zeros(len(mesh.points))
+    distribution = np.zeros(len(mesh.points))
     for upper in (True, False):
-        _add_skin_pressure(mesh, load, upper=upper)
-    load /= load.sum() * lift.load_factor
-    all_components = np.zeros(mesh.unknowns)
-    all_components[2::3] = lift.force * load
-    all_components[0::3] = -lift.forward_force * load
-    return all_components
+        _add_skin_pressure(mesh, distribution, upper=upper)
+    distribution /= distribution.sum() * lift.load_factor
+    load = np.zeros(mesh.unknowns)
+    load[2::3] = lift.force * distribution
+    load[0::3] = -lift.forward_force * distribution
+    return load
 
 
 def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None:
@@ -291,7 +295,7 @@ def assemble(source: WingDesign | Path | str, memory_limit: float | None = None)
 
 
 def _assemble_wing(design: WingDesign) -> AffineOperators:
-    """Mesh a wing design and assemble its affine operators.
+    """Mesh a wing design and assemble its matrices as sums of terms, one for each parameter.
 
     Parameters
     ----------
@@ -307,17 +311,19 @@ def _assemble_wing(design: WingDesign) -> AffineOperators:
     body = wing_body(mesh)
     span = design.planform.semi_span
     tip_load = design.tip_load
+    # The test load acts near the tip; the displacement is read at the tip itself.
     test_point = section_displacement(mesh, span - tip_load.distance_from_tip, tip_load.chord)
     tip = section_displacement(mesh, span, tip_load.chord)
     structure_design = wing_structure(design.regions, len(design.gauges.positions))
-    fields = body.affine_fields(
+    # mass terms, load terms, output rows and the reduction to free unknowns
+    affine_fields = body.affine_fields(
         structure_design,
         loads=(turn_load(body), upward(test_point)),
         outputs=outputs(gauge_output(mesh), upward(tip)),
     )
     return AffineOperators(
         design=structure_design,
-        **fields,
+        **affine_fields,
         stiffness_terms=body.stiffness_terms,
         body=body,
         design_hash=design.hash,

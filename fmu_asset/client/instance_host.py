@@ -341,23 +341,24 @@ def worker_limits(
     load_timeout: float | None,
     memory_limit: float | None,
 ) -> WorkerLimits:
-    """Return the limits of a worker.
+    """Return the limits of time and memory of a worker, the process in which an FMU runs.
 
-    A limit is that of the caller; without one that of the binding; without that the default.
+    A limit that the caller gives takes precedence over the limit in the binding. If neither gives
+    a limit, the default holds.
 
     Parameters
     ----------
     binding : Binding
-        The binding.
+        The binding, whose table `[limits]` may give limits.
     step_timeout, load_timeout : float or None
-        Wall-clock limits of the caller [s].
+        The wall-clock limits of the caller for a step and for loading the FMU [s].
     memory_limit : float or None
-        Memory limit of the caller [MiB].
+        The memory limit of the caller [MiB].
 
     Raises
     ------
     FmuInputError
-        If one is not positive.
+        If a limit is not positive.
     """
     limits = binding.limits.model_dump()
     limits_of_caller = {

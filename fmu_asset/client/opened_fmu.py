@@ -137,19 +137,26 @@ class OpenedFmu:
         return None if worker is None else worker.memory
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
-        """Return the range of an input in the binding's unit, within the limits of FMU and binding.
+        """Return the least and the largest value of an input, in the unit of the binding.
+
+        The binding, a file, connects names and units of the twin with variables of the FMU. If both
+        binding and FMU limit the input, both limits are observed.
 
         Parameters
         ----------
-        role, name : str
-            The role and the name in the binding.
+        role : str
+            The role of the input in the binding, such as "control" or "load".
+        name : str
+            The name of the input in the binding.
 
         Raises
         ------
         BindingError
             If the binding has no such input.
         """
+        # A slot holds where and in which unit the FMU expects the input, and its limits there.
         slot = self._exchange.slot(role, name)
+        # A negative factor of the conversion exchanges the limits, so they are sorted.
         low, high = sorted(slot.conversion.from_fmu(limit) for limit in (slot.low, slot.high))
         return low, high
 
@@ -214,8 +221,8 @@ class OpenedFmu:
     def renew(self, **inputs: Unpack[Inputs]) -> None:
         """Replace the FMU's instance by a new one in the same process, and start it.
 
-        `reset` uses the FMU's own function to reset. This method does not, for runs in which that
-        function must have no part.
+        The method `reset` also starts the FMU again, but by the FMU's own function for this. Call
+        `renew` where that function is not trusted.
 
         Parameters
         ----------

@@ -140,23 +140,26 @@ class PatchFile:
     def _with_output(
         self, primitive: Primitive, outputs: Sequence[tuple[str, str]], effect_label: str
     ) -> Primitive:
-        """Return a primitive with its channel replaced by the name of an output of the FMU.
+        """Return a primitive of a patch with its channel replaced by an output of the FMU.
 
-        A primitive for every channel is returned unchanged.
+        A patch consists of primitives: elementary changes of a model or of one of its sensors. It
+        names the channels of a measurement; `self.channels` maps them to outputs of the FMU. A
+        primitive that acts on every channel is returned unchanged.
 
         Parameters
         ----------
         primitive : Primitive
-            An elementary change of the model, or of a sensor.
+            The primitive.
         outputs : sequence of (str, str)
             Name and quantity of each output of the FMU.
         effect_label : str
-            The name of the effect in messages.
+            The name in messages of the effect to which the primitive belongs.
 
         Raises
         ------
         PatchFileError
-            If there is no such output, or the primitive has no meaning in an FMU.
+            If the FMU has no such output, if the primitive cannot act on the quantity of the
+            output, or if it changes something that an FMU does not simulate.
         """
         label = f"{effect_label} has the primitive {primitive.kind!r}"
         _check_meaning_in_fmu(primitive, label)
@@ -169,9 +172,11 @@ class PatchFile:
                     "strains and displacements."
                 )
             return primitive
+        # A channel that is not in the map has the name of an output.
         output = self.channels.get(channel, channel)
         primitive = replace(primitive, channel=output)  # type: ignore[call-arg]
         try:
+            # The check takes a whole patch, so the primitive is put into one of its own.
             check_channels(ModelPatch((primitive,)), outputs)
         except InvalidPatchError as error:
             raise PatchFileError(

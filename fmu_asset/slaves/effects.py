@@ -89,19 +89,24 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
-    """Return the unit of a number of a primitive, in the spelling of FMI; "1" if it has none.
+    """Return the unit of a parameter of a primitive, in the spelling of FMI, such as "N.s".
+
+    A primitive is an elementary change of a model or of a sensor. The unit is "1" if the parameter
+    has no unit.
 
     Parameters
     ----------
     primitive : mapping
-        The primitive. The units of some of its numbers depend on its channel or its port.
+        The primitive as a table: its kind, its channel or port, and its parameters.
     key : str
-        The key of the number.
+        The key of the parameter.
     """
     unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
-    # A channel reads a displacement [m] or a strain [1]. PER_RELEASE is that unit divided by the
-    # release amplitude, the displacement [m] from which a ring-down starts.
+    # Two units stand for others. CHANNEL_UNIT is that of the channel, which reads a displacement
+    # [m] or a strain [1]. PER_RELEASE is that unit divided by the release amplitude, the
+    # displacement [m] from which a ring-down starts.
     if unit in (CHANNEL_UNIT, PER_RELEASE):
+        # A channel is known as a displacement by its name; `EVERY_CHANNEL` by its quantity.
         is_displacement = (
             str(primitive["channel"]).endswith("displacement")
             or primitive.get("quantity") == "displacement"

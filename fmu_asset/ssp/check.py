@@ -129,7 +129,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
     names = []
     for index, name in enumerate(wiring.left_out):
         if index < _MOST_HINTS:
-            names.append(_with_hint(name, settable_names, list(wiring.declared)))
+            names.append(_name_with_hint(name, settable_names, list(wiring.declared)))
         else:
             names.append(name)
     return (
@@ -149,8 +149,19 @@ def _settable_names(wiring: Wiring) -> list[str]:
     return names
 
 
-def _with_hint(name: str, settable_names: list[str], components: list[str]) -> str:
-    """Return the name of an unused parameter, with a similar name of its component, if any."""
+def _name_with_hint(name: str, settable_names: list[str], components: list[str]) -> str:
+    """Return the name of a parameter that nothing takes, with a hint at the probable mistake.
+
+    Parameters
+    ----------
+    name : str
+        The name, such as "wing.mass" for a parameter of the component "wing".
+    settable_names : list of str
+        The names of all parameters and inputs that can be set.
+    components : list of str
+        The names of the components.
+    """
+    # names are compared with those of the same component, without its prefix
     prefixes = [f"{component}." for component in components if name.startswith(f"{component}.")]
     prefix = max(prefixes, key=len, default="")
     candidates = [
@@ -164,6 +175,7 @@ def _with_hint(name: str, settable_names: list[str], components: list[str]) -> s
     if not similar:
         return name
     correct_name = prefix + similar[0]
+    # A mapping of names may ask for the value of a parameter that the set of values does not have.
     if correct_name == name:
         return f"{name} (its set lacks the value)"
     return f"{name} (did you mean {correct_name!r}?)"

@@ -101,7 +101,7 @@ class WorkerLimits(Section):
         return Grants(self.read, self.write, self.ports, self.programs)
 
 
-class _AnswerHead(NamedTuple):
+class _AnswerHeader(NamedTuple):
     """The header of an answer: its kind, and the length of its payload [bytes]."""
 
     kind: int
@@ -176,10 +176,11 @@ class WorkerInstance(Instance):
         self.lost = False
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make many steps in one call; each of them may take the time limit of a step.
+        """Make N steps of the FMU in one call of its worker process.
 
-        The worker sends the replies in parts, so that the time limit holds for each part, and the
-        progress can be reported.
+        The worker sends the replies in parts, each of one or more whole steps. So the progress can
+        be reported, and the time limit of a step holds for each wait between two parts, not for
+        the whole call.
 
         Parameters
         ----------
@@ -197,12 +198,14 @@ class WorkerInstance(Instance):
         has_more = True
         while has_more:
             header = self._wait_for_answer(len(reply_bytes) - filled_bytes, may_be_part=True)
+            # A worker sends whole steps only; otherwise it has failed, and is given up.
             if header.length % bytes_per_step:
                 raise self._death_error()
             self._read_into(reply_bytes[filled_bytes : filled_bytes + header.length])
             filled_bytes += header.length
             has_more = header.kind == Answer.PART
-            # Until the last part has arrived, no other question may be asked.
+            # The instance counts as lost until the last part has arrived: an exception in between,
+            # such as an interruption, leaves parts unread, so no other question may be asked.
             self.lost = has_more
             report(filled_bytes // bytes_per_step)
 
@@ -333,34 +336,38 @@ class WorkerInstance(Instance):
         self.lost = False
         return bytes(answer)
 
-    def _wait_for_answer(self, largest: int, *, may_be_part: bool = False) -> _AnswerHead:
-        """Return the header of the answer to the last question.
+    def _wait_for_answer(self, longest_result: int, *, may_be_part: bool = False) -> _AnswerHeader:
+        """Wait for the answer of the worker to the last question, and return its header.
+
+        The payload, which follows the header, is left for the caller to read.
 
         Parameters
         ----------
-        largest : int
-            The longest payload that this answer can have [bytes].
+        longest_result : int
+            The longest payload that a result, or a part of it, can have [bytes].
         may_be_part : bool
-            Whether the answer may come in parts, the last of which is a result.
+            Whether the worker may answer in parts. The last one is marked as a result.
 
         Raises
         ------
         FmuError
-            The error that the worker reports, if the call failed there.
+            If the call failed in the worker; the error is the one that the worker reports.
         FmuWorkerError
-            If the header is none that the worker sends, so that it must have been overwritten.
+            If the worker is dead, or if the header is not valid: the FMU has then overwritten the
+            memory or the pipe of the worker.
         """
         poll_for_message(self._poll)
+        # A worker that answers in parts collects steps for a report period before it sends a part.
         self._read_into(self._header, grace=REPORT_PERIOD if may_be_part else 0.0)
         kind, has_log, question_number, length = HEADER.unpack(self._header)
         is_known = kind in (Answer.RESULT, Answer.FAILURE) or (may_be_part and kind == Answer.PART)
-        longest = LARGEST_MESSAGE if kind == Answer.FAILURE else largest
-        if not is_known or question_number != self._question_number or length > longest:
+        length_limit = LARGEST_MESSAGE if kind == Answer.FAILURE else longest_result
+        if not is_known or question_number != self._question_number or length > length_limit:
             raise self._death_error()
         self._has_log = self._has_log or has_log != 0
         if kind == Answer.FAILURE:
             self._raise_failure(length)
-        return _AnswerHead(kind, length)
+        return _AnswerHeader(kind, length)
 
     def _raise_failure(self, length: int) -> None:
         """Read the payload of a failure, which has a length [bytes], and raise the error in it."""

@@ -290,39 +290,43 @@ def check_installed(*packages: str) -> None:
 
 
 def open_group(folder: Path, group: str) -> "xr.DataTree":
-    """Open a group of the store, whose arrays are read from disk at first use.
+    """Open a group of assets in the store of a fleet; each array is read when it is first used.
 
-    A store of an earlier version is read in the present layout.
+    If an earlier version of the program wrote the store, the group is converted to the present
+    names and shapes of its arrays.
 
     Parameters
     ----------
     folder : Path
-        The folder of the fleet.
+        The folder of the fleet, which holds the store.
     group : str
         The name of the group.
 
     Raises
     ------
     FleetError
-        If there is no such group, if it lacks variables, or if zarr is not installed.
+        If the store has no such group, if an array is missing in the group, or if zarr is not
+        installed.
     """
     check_installed("zarr")
     import xarray as xr
 
-    before = f"{folder} holds no group {group} of a fleet ("
-    with FleetError.instead_of(OSError, KeyError, ValueError, before=before, after=")."):
+    # an error of zarr becomes a `FleetError`, whose message quotes it between two texts
+    message_start = f"{folder} holds no group {group} of a fleet ("
+    with FleetError.instead_of(OSError, KeyError, ValueError, before=message_start, after=")."):
         tree: xr.DataTree = xr.open_datatree(
             folder / STORE_NAME, engine="zarr", group=group, chunks=None, consolidated=False
         )
-    former_group = tree.to_dataset()
-    if is_former_layout(former_group):
-        warn_of_former_names(f"{folder / STORE_NAME}", former_names_used(former_group))
+    stored_group = tree.to_dataset()
+    if is_former_layout(stored_group):
+        warn_of_former_names(f"{folder / STORE_NAME}", former_names_used(stored_group))
         record = _group_record(folder, group)
         scenario = Scenario.model_validate(record["scenarios"][0])
         names = [name for name, _seed, _scenario_number in record["members"]]
-        tree = in_present_layout(former_group, scenario, names)
-    paths = {path for path in SCHEMA["fleet"] if "{" not in path}
-    missing = [path for path in sorted(paths) if path not in _paths_of(tree)]
+        tree = in_present_layout(stored_group, scenario, names)
+    # A path with braces is a template, such as "{input}", whose arrays differ between groups.
+    required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
+    missing = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
     if missing:
         raise FleetError(
             f"{folder} was flown by another version of this program and lacks "

@@ -208,27 +208,39 @@ class GaugeRegression:
         return result
 
     def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
-        """Return the expected products that an observation adds to the sums: (K, G, 6).
+        """Return what an observation adds to the six sums of the regression of each gauge.
 
-        The expectation is over the state, given the hypothesis.
+        The regression learns offset and gain of a gauge from the sums over observations of the
+        products aa, ac, cc, ax, cx and xx: a and c are the changes of the gauge's reading by one
+        prior standard deviation of offset and of gain, and x is its residual, all divided by the
+        standard deviation of the noise. As the state is unknown, the expectation of each product
+        over the S states is returned.
 
         Parameters
         ----------
         readings : GaugeReadings
-            The observation and its predictions.
+            The observation of G gauges, and its predictions in each state.
         log_weight : (K, S) array
-            The log probability of each state given the hypothesis, up to a constant of the
-            hypothesis.
+            The log probability of each state under each of K hypotheses. A constant may be added
+            to each row.
+
+        Returns
+        -------
+        (K, G, 6) array
+            The expected products, in the order of the fields of `RegressionSums`.
         """
-        sums = np.zeros((SUM_COUNT, len(readings.draw), len(readings.observation)))
+        hypothesis_count = len(readings.draw)
+        gauge_count = len(readings.observation)
+        products = np.zeros((SUM_COUNT, hypothesis_count, gauge_count))
+        # The compiled function fills `products` in place, through a view of each of its six parts.
         _add_expected_products(
             readings,
             self.offset_deviation,
             self.gain_deviation,
             log_weight,
-            RegressionSums._make(sums),
+            RegressionSums._make(products),
         )
-        return np.ascontiguousarray(np.moveaxis(sums, 0, -1))
+        return np.ascontiguousarray(np.moveaxis(products, 0, -1))
 
 
 @compiled

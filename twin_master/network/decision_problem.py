@@ -64,21 +64,31 @@ class DecisionProblem:
         return self.transition.forward(control, likelihood * belief)
 
     def expected_vector(self, control: int, chosen: Index, vectors: Float) -> Float:
-        """Return the expected return after a step, given the plan that follows: (S,).
+        """Return the expected return after a step, by the state before the step.
+
+        The observation of the step decides which plan is followed after it. The reward of the step
+        itself is not included.
 
         Parameters
         ----------
         control : int
             The control of the step.
         chosen : (K,) array
-            The index of the plan that follows each observation.
+            For each of K observations, the index of the plan that is followed after it.
         vectors : (N, S) array
-            The return of each of N plans from each state.
+            The expected return of each of N plans, if it starts from each of S states.
+
+        Returns
+        -------
+        (S,) array
+            The expected return after the step, for each state before it.
         """
-        likelihood = self.likelihood[control]
+        likelihood = self.likelihood[control]  # (K, S), p(observation | state)
         if self.moves_first:
-            after_observation = np.einsum("ks,ks->s", likelihood, vectors[chosen])
-            return self.transition.expected_value(control, after_observation)
+            # The observation depends on the state after the transition: take the expectation over
+            # the observation in each such state, then over the transition.
+            after_transition = np.einsum("ks,ks->s", likelihood, vectors[chosen])
+            return self.transition.expected_value(control, after_transition)
         # The observation depends on the state before the transition: sum over the plans of the
         # probability that the plan is chosen times its expected return.
         result: Float = np.zeros(len(self.prior))

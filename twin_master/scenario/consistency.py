@@ -125,21 +125,25 @@ class ScenarioTables(Section):
 
     @property
     def readings(self) -> tuple[InspectionReading, ...]:
-        """The readings of all inspections.
+        """The quantities that inspections read, in the order of the actions of the scenario.
 
-        They follow the values of the sensors in the row of a step, and are NaN in a step without
-        the inspection.
+        In the record of a mission, the row of each step holds the values of the sensors and then
+        one value for each of these readings. It is NaN if the step is without the inspection.
         """
-        readings = []
+        all_readings = []
+        # `self.action` holds all tables `[[action]]`; each action is also a control of its name.
         for action in self.action:
             control_index = self.control_names.index(action.name)
-            for inspected in action.readings:
-                state_index = self.state_names.index(inspected.state)
-                reading = InspectionReading(
-                    control_index, state_index, inspected.name, inspected.standard_deviation
+            for reading in action.readings:
+                all_readings.append(
+                    InspectionReading(
+                        control_index=control_index,
+                        state_index=self.state_names.index(reading.state),
+                        name=reading.name,
+                        standard_deviation=reading.standard_deviation,
+                    )
                 )
-                readings.append(reading)
-        return tuple(readings)
+        return tuple(all_readings)
 
     def _control_faults(self) -> Iterator[Fault]:
         """Yield (is present, message) of each possible fault: states and controls."""
