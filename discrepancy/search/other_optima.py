@@ -19,26 +19,27 @@ from discrepancy.search_settings import SEARCH
 def canonical_relatives(
     leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
-    """Return the hypotheses of one effect with the family and place of a leading effect.
+    """Return the hypotheses that consist of one effect of the same family and place as another.
 
-    They are fitted again from other magnitudes, so only effects with a magnitude are returned, and
-    of these only the ones with a canonical shape.
+    The effect must have a parameter that is its magnitude, such as the force of dry friction. Its
+    law must have the canonical shape: its dependence on position or speed is given, not fitted.
 
     Parameters
     ----------
     leading : EffectTerm
-        The leading effect at its place.
+        The effect, at its place, whose family and place are required.
     hypotheses : iterable of ForceHypothesis
-        The sets of effects that were fitted to the missing force.
+        The sets of effects among which to select.
     """
     relatives = []
     for hypothesis in hypotheses:
         if len(hypothesis.candidate.terms) != 1:
             continue
         (term,) = hypothesis.candidate.terms
-        is_related = (term.effect.family, term.place) == (leading.effect.family, leading.place)
+        has_same_family = term.effect.family == leading.effect.family
+        has_same_place = term.place == leading.place
         has_magnitude = any(parameter.magnitude for parameter in term.parameters)
-        if is_related and has_magnitude and not term.free_shape:
+        if has_same_family and has_same_place and has_magnitude and not term.free_shape:
             relatives.append(hypothesis)
     return relatives
 
