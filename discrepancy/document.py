@@ -214,28 +214,35 @@ class Origin:
 
 
 def document_schema(kind: type, schema: str) -> JsonSchema:
-    """Return the JSON Schema of a document: its record with the entries of its origin beside it.
+    """Return the JSON Schema of a document, such as a verdict file.
 
-    Every key of a document is always there.
+    A document is the JSON text of a record with an attribute `origin`. The attributes of the origin
+    are keys of the document itself, beside those of the record. The schema requires all keys and
+    allows no others, as a document is always written with every key.
 
     Parameters
     ----------
     kind : type
-        Class of the record, with an entry `origin`.
+        Class of the record.
     schema : str
-        Name of the schema, the value of the key `schema`.
+        Name of the schema, which a document states under its key `schema`.
     """
-    content = format_schema(kind, schema)
-    definitions = content["$defs"]
-    keys_of_origin = definitions.pop("Origin")["properties"]
-    own_keys = {key: entry for key, entry in content["properties"].items() if key != "origin"}
-    for table in definitions.values():
-        if "properties" in table:
-            table |= {"required": list(table["properties"]), "additionalProperties": False}
+    record_schema = format_schema(kind, schema)
+    # nested objects: all keys are required
+    definitions = record_schema["$defs"]
+    origin_properties = definitions.pop("Origin")["properties"]
+    for definition in definitions.values():
+        if "properties" in definition:
+            definition["required"] = list(definition["properties"])
+            definition["additionalProperties"] = False
+    # the document: the name of the schema, the keys of the origin, the other keys of the record
+    record_properties = {
+        key: entry for key, entry in record_schema["properties"].items() if key != "origin"
+    }
     name_of_schema = {"const": schema, "description": "Name and version of the format."}
-    properties = {"schema": name_of_schema, **keys_of_origin, **own_keys}
+    properties = {"schema": name_of_schema, **origin_properties, **record_properties}
     return {
-        **content,
+        **record_schema,
         "properties": properties,
         "required": list(properties),
         "additionalProperties": False,

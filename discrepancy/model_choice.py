@@ -177,22 +177,31 @@ def load_model(name: str | Path | None = None, progress: Progress | None = None)
 
 
 def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> ModelChoice:
-    """Return the model that a verdict or a patch was made for, after a check that it is unchanged.
+    """Return the model from which a verdict or a patch was computed.
+
+    The model must be unchanged since then: its hash is compared with the recorded one.
 
     Parameters
     ----------
     origin : Origin
-        Origin of the verdict or patch.
+        The record, in the verdict or patch, of the model and the data from which it was computed.
     file : Path
-        Its file. If the model's file was moved, it is searched in the folder of this file.
+        The file of the verdict or patch. If the file of the model is no longer at its recorded
+        path, this function looks for it in the folder of `file`.
     progress : Progress, optional
-        Where the modelling reports.
+        The display of progress while the model is built.
 
     Raises
     ------
-    ModelError, VerdictFileError, CampaignFileError
-        If the model is gone, has changed since, or is not known.
+    ModelError
+        If the file of the model is not found, cannot be used, or has changed.
+    VerdictFileError
+        If `file` does not record where its model is, or if the model is a patch that cannot be
+        read.
+    CampaignFileError
+        If the model belongs to a run folder that cannot be used.
     """
+    # None in a file of a version that did not record the model; empty for the shipped wing
     if origin.model_file is None:
         raise VerdictFileError(
             f"{file} was left by an earlier version, which did not record where its model is: run "
@@ -206,11 +215,12 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
                 f"The model {origin.model_file}, on which {file} rests, is gone: put it back "
                 f"there, or beside {Path(file).name}."
             )
-    choice = choose_model(model_file if origin.model_file else None, progress)
+    is_shipped_wing = not origin.model_file
+    choice = choose_model(None if is_shipped_wing else model_file, progress)
     if choice.source_hash != origin.model_hash:
-        model = choice.file or "of the shipped wing"
+        model_name = choice.file or "of the shipped wing"
         raise ModelError(
-            f"The model {model} has changed since {file} was written (SHA-256 "
+            f"The model {model_name} has changed since {file} was written (SHA-256 "
             f"{choice.source_hash:.12}, not {origin.model_hash:.12}): run `uav-twin discrepancy "
             "run` again."
         )

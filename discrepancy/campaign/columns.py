@@ -172,21 +172,27 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
 
 
 def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> float | str:
-    """Return the standard deviation of a column's zero in SI, or "free", from the option `--zero`.
+    """Return the standard deviation of the zero offset of a sensor, given the option `--zero`.
 
     Parameters
     ----------
     column : LaboratoryColumn
-        A column whose unit and quantity are known.
+        The column with the readings of the sensor, whose unit and quantity are known.
     answer : str
-        The option: `0.1mm`, `1%` of the largest reading, `exact` or `free`.
+        The value of the option: a standard deviation such as `0.1mm`, a percentage of the largest
+        reading such as `1%`, `exact` (there is no offset) or `free` (nothing is known of it).
     largest : float
         Largest reading of the column [SI].
+
+    Returns
+    -------
+    float or str
+        The standard deviation in SI, 0 for `exact`; or the text "free".
 
     Raises
     ------
     CampaignFileError
-        If the option is none of these.
+        If the value of the option has none of these forms.
     """
     if answer == FREE:
         return FREE
@@ -203,9 +209,11 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
     if unit == "%":
         to_si = factor_to_si(column.quantity, column.read_in)
         deviation = float(amount_text) / 100.0 * largest / to_si
-        # two digits in the unit that the user reads
-        return float(f"{deviation:.2g}") * to_si
+        # rounded to two digits in the unit of the readings, as the user sees it in that unit
+        rounded_deviation = float(f"{deviation:.2g}")
+        return rounded_deviation * to_si
     try:
+        # a number without a unit is in the unit of the readings
         return float(amount_text) * factor_to_si(column.quantity, unit or column.read_in)
     except ValueError as cause:
         raise CampaignFileError(f"--zero of {column.head!r}: {cause}.") from None

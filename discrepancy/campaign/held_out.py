@@ -16,47 +16,48 @@ LEAST_LEVELS = 6
 
 
 def choose_held_out(campaign: Campaign) -> Campaign:
-    """Return the campaign with trials held out for proof; unchanged if it holds some out already.
+    """Return the campaign with some trials held out: the proof uses them, and the fit does not.
 
-    The rule is deterministic, and applied to each kind of trial:
+    A campaign in which trials are held out already is returned unchanged. Otherwise the trials of
+    each kind (static, flight, ring-down and so on) are chosen by two rules without randomness:
 
-    1. Of three or more trials, a quarter (rounded, at least one) is held out. Candidates are
-       ordered by their level (release displacement, largest force or load factor): those between
-       the extreme levels come first, from the middle outwards, because a model is to be proved
-       between levels and not beyond them; of equal levels the later trial comes first. A trial is
-       held out only if its channels, its run and its load place still occur in the trials that
-       remain for the fit.
-    2. If that holds out no static or flight trial, every third interior load level of each such
-       trial with at least six levels is held out as a trial of its own. The load must rise or fall
-       throughout, because a load cycle has to stay whole.
+    1. `_choose_trials` holds out a quarter of the trials of the kind, if there are at least three.
+       It prefers trials at middle levels of load, because a model is to be proved between the
+       levels of the fit and not beyond them.
+    2. If rule 1 holds out no trial of the kind, and the kind is static or flight, then
+       `_split_by_levels` splits each trial of the kind that has enough load levels: some of its
+       levels become a second trial, which is held out.
 
     Returns
     -------
     Campaign
-        The campaign with a remark on what is held out, or on why nothing is.
+        The campaign with marked trials, and a remark on which trials are held out, or why none is.
     """
     if campaign.held_out:
         return campaign
     names = {trial.name for trial in campaign.trials}
-    held_out: set[str] = set()
-    split: dict[str, tuple[Trial, Trial]] = {}
+    names_held_out: set[str] = set()
+    split_trials: dict[str, tuple[Trial, Trial]] = {}  # fitted and held-out part, by trial name
     for kind in TrialKind:
-        trials = [trial for trial in campaign.trials if trial.kind is kind]
-        spared = _choose_trials(trials, campaign, held_out)
-        held_out |= spared
-        if not spared and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
-            for trial in trials:
+        trials_of_kind = [trial for trial in campaign.trials if trial.kind is kind]
+        # rule 1; the kinds before this one may have used up a channel that must stay in the fit
+        names_of_kind = _choose_trials(trials_of_kind, campaign, names_held_out)
+        names_held_out |= names_of_kind
+        # rule 2
+        if not names_of_kind and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
+            for trial in trials_of_kind:
                 fitted_and_held_out = _split_by_levels(trial, names)
                 if fitted_and_held_out is not None:
-                    split[trial.name] = fitted_and_held_out
-    trials_marked: list[Trial] = []
+                    split_trials[trial.name] = fitted_and_held_out
+    # mark the trials, in the order of the campaign
+    marked_trials: list[Trial] = []
     for trial in campaign.trials:
-        if trial.name in split:
-            trials_marked += split[trial.name]
+        if trial.name in split_trials:
+            marked_trials += split_trials[trial.name]
         else:
-            trials_marked.append(replace(trial, held_out=trial.name in held_out))
-    remark = _held_out_remark(trials_marked)
-    return replace(campaign, trials=tuple(trials_marked), remarks=(*campaign.remarks, remark))
+            marked_trials.append(replace(trial, held_out=trial.name in names_held_out))
+    remark = _held_out_remark(marked_trials)
+    return replace(campaign, trials=tuple(marked_trials), remarks=(*campaign.remarks, remark))
 
 
 def _held_out_remark(trials: Sequence[Trial]) -> str:
@@ -70,11 +71,14 @@ def _held_out_remark(trials: Sequence[Trial]) -> str:
     )
 
 
-def _choose_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
+def _choose_trials(
+    trials: Sequence[Trial], campaign: Campaign, held_out_before: set[str]
+) -> set[str]:
     """Choose the trials of one kind to hold out, and return their names.
 
-    At most a quarter are chosen, in the order of `_order_of_candidates`, and only trials whose
-    channels, run and load place still occur in trials that remain for the fit.
+    Of three or more trials, at most a quarter (rounded, but at least one) is chosen; of fewer, none
+    is. Trials at middle load levels come first, see `_order_of_candidates`. A trial is chosen only
+    if its channels, its run and its load place still occur in trials that remain for the fit.
 
     Parameters
     ----------
@@ -82,26 +86,29 @@ def _choose_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[st
         All trials of the kind.
     campaign : Campaign
         The whole campaign.
-    held_out : set of str
-        Names of trials of other kinds that are held out already.
+    held_out_before : set of str
+        Names of the trials of other kinds that are held out already.
     """
     if len(trials) < LEAST_TRIALS:
         return set()
     count = max(1, round(HELD_OUT_SHARE * len(trials)))
-    spared: set[str] = set()
+    chosen_names: set[str] = set()
     for index in _order_of_candidates(trials):
-        if len(spared) == count:
+        if len(chosen_names) == count:
             break
         candidate = trials[index]
-        remaining = [trial for trial in trials if trial.name not in spared | {candidate.name}]
-        of_other_kinds = [
+        # the trials that would remain for the fit without the candidate
+        remaining_of_kind = [
+            trial for trial in trials if trial.name not in chosen_names | {candidate.name}
+        ]
+        remaining_of_other_kinds = [
             trial
             for trial in campaign.trials
-            if trial.kind is not candidate.kind and trial.name not in held_out
+            if trial.kind is not candidate.kind and trial.name not in held_out_before
         ]
-        if _stays_covered(candidate, remaining, of_other_kinds):
-            spared.add(candidate.name)
-    return spared
+        if _stays_covered(candidate, remaining_of_kind, remaining_of_other_kinds):
+            chosen_names.add(candidate.name)
+    return chosen_names
 
 
 def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:

@@ -159,7 +159,16 @@ class LaboratoryImport:
         return self._questionnaire.ask("decimal", sheet.name, expected, (".", ","))
 
     def _sampling_interval(self, sheet: Sheet) -> float | None:
-        """Return the sampling interval [s] of a table without times; None if it needs none."""
+        """Return the sampling interval of a table [s], given the answer of the user.
+
+        The result is None if the table has a column of times, is not recorded in time, or if the
+        user has not answered yet.
+
+        Raises
+        ------
+        CampaignFileError
+            If the user states an interval for a table with a column of times.
+        """
         columns = [column for column in self.columns if column.sheet is sheet]
         if any(column.role == "time" for column in columns):
             if self._questionnaire.stated_answer("interval", sheet.name) is not None:

@@ -19,9 +19,10 @@ LARGEST_DRIFT_SHARE = 0.6
 LARGEST_LINE_SHARE = 0.05
 """Largest fraction of the variance that a line at the model's frequency may take."""
 LEAST_PERIODS = 8.0
-"""Fewest periods in a noise record in which a line is searched."""
+"""Fewest periods of a vibration in a noise record that is tested for it."""
 RELATIVE_HALF_BAND = 0.1
-"""Half width of the band around the model's frequency in which a line is searched, relative."""
+"""Half width of the band around the model's frequency in which a line is looked for, divided by
+that frequency."""
 _LEVEL = 1e-5
 """Level of the F test between quarters of a noise record."""
 
@@ -36,7 +37,7 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
     campaign : Campaign
         The campaign.
     frequency : float, optional
-        Frequency of a mode [Hz] at which a vibration is searched; see `disturbance_phrase`.
+        Frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
     """
     for name, channel in campaign.channels.items():
         if channel.noise is None:
@@ -53,25 +54,25 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
 
 
 def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> str | None:
-    """Return what a noise record contains besides stationary noise.
+    """Return a phrase on what a noise record contains besides stationary noise.
 
-    Without a frequency two contents are searched. One is a drift: a cubic in time that has more
-    than `LARGEST_DRIFT_SHARE` of the variance. The other is an unsteady scatter: two quarters of
-    the record whose standard deviations differ by at least a factor of two, and significantly by an
-    F test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
-    frequency that has more than 5 % of the variance. Lines at mains frequencies do not count.
+    Without a frequency, the record is tested for a drift (a cubic polynomial in time that has more
+    than `LARGEST_DRIFT_SHARE` of the variance), then for a scatter that changes within the record
+    (`_unsteady_scatter_phrase`). With a frequency, it is tested only for a vibration at that
+    frequency (`_vibration_phrase`). Lines at mains frequencies are removed before.
 
     Parameters
     ----------
     record : NoiseRecord
-        The noise record.
+        The noise record, taken while nothing should move.
     frequency : float, optional
-        Frequency of a mode [Hz].
+        Frequency of a mode of the structure [Hz].
 
     Returns
     -------
     str or None
-        Verb phrase for a message, such as "drifts by ..."; None if there is only stationary noise.
+        Verb phrase for a message, such as "drifts by ...". None if nothing else was found, or if
+        the record has too few samples for the tests.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
@@ -88,6 +89,9 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
 
 def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -> str | None:
     """Return the phrase about a vibration at a mode's frequency in a noise record, or None.
+
+    A vibration is a spectral line within `RELATIVE_HALF_BAND` of the frequency that has more than
+    `LARGEST_LINE_SHARE` of the variance.
 
     Parameters
     ----------
@@ -112,6 +116,9 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
 
 def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | None:
     """Return the phrase about the quarter of a noise record that scatters most; None if all agree.
+
+    Two quarters do not agree if their scatters differ by at least the factor
+    `LARGEST_SCATTER_RATIO`, and significantly by an F test at the level `_LEVEL`.
 
     Parameters
     ----------

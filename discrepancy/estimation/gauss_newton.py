@@ -146,9 +146,9 @@ class Linearisation:
         Returns
         -------
         solution : Solution
-            The shared unknowns, then those of effects.
+            The K unknowns that all trials share, then the E unknowns of the effects.
         local : list of (L,) array
-            The unknowns of each trial alone.
+            The local unknowns of each trial: those that occur in this trial only.
         """
         # normal equations of the shared and effect unknowns, summed over the trials
         sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
@@ -163,7 +163,10 @@ class Linearisation:
         regression = Regression(sum_of_products, half_log_determinant)
         all_unknowns = range(len(self.prior_precision))
         solution = regression.solve(all_unknowns, self.prior_precision)
-        local = [self._local_unknowns(linear_trial, solution.mean) for linear_trial in self.trials]
+        local = [
+            self._most_probable_local_unknowns(linear_trial, solution.mean)
+            for linear_trial in self.trials
+        ]
         return solution, local
 
     def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
@@ -171,28 +174,31 @@ class Linearisation:
         trials = tuple(replace(trial, processes=processes) for trial in self.trials)
         return Linearisation(trials, self.prior_precision)
 
-    def _local_unknowns(
+    def _most_probable_local_unknowns(
         self, linear_trial: LinearisedTrial, shared_and_effect: FloatArray
     ) -> FloatArray:
-        """Return the most probable unknowns (L,) of a trial alone, given the others.
+        """Return the most probable values (L,) of the local unknowns of one trial.
+
+        Local unknowns occur in one trial only, such as its initial state. All other unknowns of the
+        trial are fixed at given values.
 
         Parameters
         ----------
         linear_trial : LinearisedTrial
             The trial.
         shared_and_effect : (K + E,) array
-            The values of the shared unknowns, and of those of effects.
+            The values of the K unknowns that all trials share, then of the E unknowns of effects.
         """
-        # the rows of the local unknowns in the normal equations, with the others on the right side
+        # Inner products of the whitened residual (index 0) and its derivatives by the shared and
+        # effect unknowns, then by the local unknowns.
         products, _ = linear_trial.whitened_products
-        first_local = 1 + len(shared_and_effect)
-        precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
-        right_side = (
-            products[first_local:, 0] - products[first_local:, 1:first_local] @ shared_and_effect
-        )
-        return np.linalg.solve(
-            products[first_local:, first_local:] + np.diag(precision), right_side
-        )
+        local = slice(1 + len(shared_and_effect), None)
+        fixed = slice(1, 1 + len(shared_and_effect))
+        # normal equations of the local unknowns, with the fixed unknowns on the right side
+        prior_precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
+        normal_matrix = products[local, local] + np.diag(prior_precision)
+        right_side = products[local, 0] - products[local, fixed] @ shared_and_effect
+        return np.linalg.solve(normal_matrix, right_side)
 
 
 @dataclass(frozen=True, eq=False)

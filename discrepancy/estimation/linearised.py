@@ -399,49 +399,62 @@ class LinearisedTrial:
     # ------------------------------------------------------------ readings
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
-        """Return the observation equation columns @ weights = rows @ state + noise of the filter.
+        """Return the two matrices of the observation equation of the Kalman filter.
 
-        All values are divided by the standard deviation of the white part of the noise.
+        The residual is the reading minus the prediction of the model, and depends on the unknowns
+        u. The filter explains the residual by its state, which contains the missing forces, the
+        coloured noise, and the change of the structure's motion by forces:
+
+            coefficients @ (1, u) = output_rows @ state + noise.
+
+        The white part of the noise has variance one, since both sides are divided by its standard
+        deviation.
 
         Returns
         -------
-        rows : (N, C, n) array
-            The derivatives of the readings by the scaled state.
-        columns : (N, C, W) array
-            The coefficients of the residual in the weights (1, unknowns): first the residual at
-            zero unknowns, then minus the derivatives of the readings by the unknowns. They are zero
-            if a reading does not count.
+        output_rows : (N, C, n) array
+            The derivatives of the readings by the state, for N samples, C channels and n states.
+        coefficients : (N, C, W) array
+            First the residual at zero unknowns, then its derivatives by the W - 1 unknowns. All are
+            zero for a reading that does not count.
         """
         trial = self.trial
-        substeps = trial.substeps
-        samples, channels = trial.residual.shape
-        rows = np.repeat(self.force_filter.state_space.output_rows[None], samples, axis=0)
-        columns = np.zeros((samples, channels, self.weight_count))
-        # Errors of sensors: a change c0 + d (u - u0) of the readings reduces the residual. Its
-        # coefficients are -d for the unknown u, and -c0 + d u0 for the constant.
-        columns[:, :, 0] = trial.residual - self.sensor_errors.change
+        sample_count, channel_count = trial.residual.shape
+        output_rows = np.repeat(
+            self.force_filter.state_space.output_rows[None], sample_count, axis=0
+        )
+        coefficients = np.zeros((sample_count, channel_count, self.weight_count))
+        # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
+        # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
+        coefficients[:, :, 0] = trial.residual - self.sensor_errors.change
         for unknown, derivative in self.sensor_errors.by_unknown.items():
-            columns[:, :, 1 + unknown] -= derivative
-            columns[:, :, 0] += self._value_of_unknown(unknown) * derivative
-        # response of the model, whose residual is at zero unknowns already
+            coefficients[:, :, 1 + unknown] -= derivative
+            coefficients[:, :, 0] += self._value_of_unknown(unknown) * derivative
+        # The response of the model needs no constant, as `trial.residual` is at zero unknowns. The
+        # unknowns of this trial follow the shared ones here; in u those of effects are between.
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
         for unknown, derivative in enumerate(derivatives):
-            columns[:, :, self.weight_index(unknown)] -= derivative
-        # output of the added state, linear about `linearisation_point`
+            coefficients[:, :, self.weight_index(unknown)] -= derivative
+        # parameters and gains change the readings of a fixed state by d (u - u0)
         for unknown, derivative in self._readings_by_shared_unknowns().items():
-            columns[:, :, 1 + unknown] -= derivative
-            columns[:, :, 0] += trial.linearisation_point[unknown] * derivative
-        columns *= self.force_filter.white_noise_scale[:, None]
-        # an acceleration shows the forces of laws directly, with the sign of - e_p G_p
-        for row, port in enumerate(self.law_ports):
-            through = (
+            coefficients[:, :, 1 + unknown] -= derivative
+            coefficients[:, :, 0] += trial.linearisation_point[unknown] * derivative
+        coefficients *= self.force_filter.white_noise_scale[:, None]
+        # A force at a port changes some readings at once, such as accelerations: by -e per unit of
+        # force, with e in `direct_reading`. The force of the hypothesis' laws at the port is
+        # force_by_weight @ (1, u) + force_by_state @ state. Its first term is brought to the left
+        # side of the observation equation, which turns the sign.
+        for law_index, port in enumerate(self.law_ports):
+            direct_reading = (
                 trial.system.through[port] / trial.deviation * self.force_filter.white_noise_scale
             )
-            if not np.any(through):
+            if not np.any(direct_reading):
                 continue
-            rows = rows - through[:, None] * self.force_by_state[::substeps, row][:, None, :]
-            columns += self.force_by_weight[::substeps, row, None, :] * through[:, None]
-        return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
+            force_by_state = self.force_by_state[:: trial.substeps, law_index]
+            force_by_weight = self.force_by_weight[:: trial.substeps, law_index]
+            output_rows = output_rows - direct_reading[:, None] * force_by_state[:, None, :]
+            coefficients += force_by_weight[:, None, :] * direct_reading[:, None]
+        return np.ascontiguousarray(output_rows), coefficients * trial.used[:, :, None]
 
     def _readings_by_shared_unknowns(self) -> dict[int, FloatArray]:
         """Return the derivatives (N, C) of the readings by shared unknowns at a fixed added state.

@@ -321,23 +321,26 @@ def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
 def hypothesis_of_estimate(
     search: ForceSearch, candidate: Candidate, trials: LinearTrials, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
-    """Return an estimate as a hypothesis of the search, to which further effects may be added.
+    """Convert an estimate of a set of effects to a hypothesis of the search for effects.
+
+    The search can then add further effects to the hypothesis.
 
     Parameters
     ----------
     search : ForceSearch
-        The search for the missing force.
+        The search for effects that explain the missing force.
     candidate : Candidate
-        The effects.
+        The set of effects.
     trials : LinearTrials
-        The trials in which they were estimated.
+        The trials from which the effects were estimated.
     estimate : MotionEstimate
-        The estimate.
+        The result of the estimation: values of the effects' parameters (`effect`) and of the
+        unknowns of all trials (`shared`) and of single trials (`local`), and smoothed motions.
 
     Returns
     -------
     ForceHypothesis or None
-        The hypothesis; None if its effects cannot act along the estimated motion.
+        The hypothesis; None if an effect cannot be computed along the estimated motions.
     """
     motions = [
         _trial_motion(trial, smoothed)
@@ -346,14 +349,19 @@ def hypothesis_of_estimate(
     linear_trials = search.linearise_effects(trials, motions, candidate, estimate.effect)
     if linear_trials is None:
         return None
-    mean = np.concatenate((estimate.shared, estimate.effect))
+    # the search orders the unknowns: those of all trials, then those of the effects
+    solution = Solution(
+        log_evidence=estimate.log_evidence,
+        mean=np.concatenate((estimate.shared, estimate.effect)),
+        covariance=estimate.covariance,
+    )
     return ForceHypothesis(
         candidate=candidate,
         effect=estimate.effect,
         processes=estimate.processes,
         log_evidence=estimate.log_evidence,
         linear_trials=linear_trials,
-        solution=Solution(estimate.log_evidence, mean, estimate.covariance),
+        solution=solution,
         local=estimate.local,
         motions=motions,
         speed_window=estimate.speed_window,

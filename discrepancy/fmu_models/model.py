@@ -339,45 +339,67 @@ class FmuModel(DescribedModel):
     def _ported_system(
         self, trial: Trial, outputs: Outputs, parameters: FloatArray
     ) -> PortedSystem:
-        """Return the linear system from missing forces to outputs, in the prior mean's coordinates.
+        """Return the linear system from missing forces at the ports to the outputs.
+
+        The system is identified from simulated responses of the FMU to a force at each port. The
+        coordinates of an identified state are arbitrary. So the state is returned in the
+        coordinates of the system at the prior mean of the parameters, and systems at different
+        values of the parameters can be compared.
+
+        Parameters
+        ----------
+        trial : Trial
+            The trial whose operating point is taken.
+        outputs : Outputs
+            The C outputs of the FMU that channels measure.
+        parameters : (P,) array
+            Values of the calibrated parameters.
 
         Raises
         ------
         ModelError
-            If the FMU is not linear, or no system can be identified from its responses to forces at
-            the ports.
+            If the FMU is not linear, if no system can be identified, or if the speed of a port
+            jumps with a force.
         """
         mean_system = self._system_with_parameters(trial, self.prior_mean())
         system = self._system_with_parameters(trial, parameters)
-        displacement_columns = self.fmu.displacement_columns
-        is_usable = (
-            mean_system is not None
-            and system is not None
-            and len(mean_system.input_matrix) == len(system.input_matrix)
-            and not system.has_jumping_speed(
-                np.array(displacement_columns, dtype=np.int64), np.arange(len(displacement_columns))
-            )
-        )
-        if mean_system is None or system is None or not is_usable:
+        # coordinates can be compared only between systems of the same number of states
+        if (
+            mean_system is None
+            or system is None
+            or len(mean_system.input_matrix) != len(system.input_matrix)
+            or self._has_jumping_port_speed(system)
+        ):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how "
                 "its ports move; it is not linear, or they are too few or too rough, or speeds "
                 "jump with forces."
             )
         system = system.in_coordinates_of(mean_system)
-        positions, _ = system.output_rows(displacement_columns, 0)
-        speeds, _ = system.output_rows(displacement_columns, 1)
-        columns = self._output_columns(outputs)
-        rows, direct = system.output_rows(columns.columns, columns.derivatives)
+        # rows that give positions and speeds (derivatives of order 0 and 1) of the ports
+        port_displacements = self.fmu.displacement_columns
+        positions_by_state, _ = system.output_rows(port_displacements, 0)
+        speeds_by_state, _ = system.output_rows(port_displacements, 1)
+        # rows that give the outputs
+        output_columns = self._output_columns(outputs)
+        outputs_by_state, outputs_by_force = system.output_rows(
+            output_columns.columns, output_columns.derivatives
+        )
         return PortedSystem(
             generator=system.state_matrix,
             ports=self.ports,
             actions=system.input_matrix.T,
-            positions=positions,
-            speeds=speeds,
-            outputs=rows,
-            through=direct.T,
+            positions=positions_by_state,
+            speeds=speeds_by_state,
+            outputs=outputs_by_state,
+            through=outputs_by_force.T,
         )
+
+    def _has_jumping_port_speed(self, system: FmuStateSpace) -> bool:
+        """Return whether the speed of a port jumps with the force there, as no mass resists it."""
+        port_displacements = np.array(self.fmu.displacement_columns, dtype=np.int64)
+        port_forces = np.arange(len(port_displacements))
+        return system.has_jumping_speed(port_displacements, port_forces)
 
     def _system_with_parameters(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
         """Return the linear system at values of the parameters; None if the FMU is not linear."""

@@ -349,19 +349,31 @@ def _estimate(
 def calibrated_parameters(
     problem: Problem, hypothesis: ComparedHypothesis
 ) -> tuple[CalibratedParameter, ...]:
-    """Return the calibrated parameters of the model in a hypothesis, within their ranges."""
+    """Return the values and standard deviations of the model's parameters under a hypothesis.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model, whose parameters were calibrated together with the effects.
+    hypothesis : ComparedHypothesis
+        The hypothesis with the posterior of its scaled unknowns. The first of them are those of the
+        parameters.
+    """
     layout = problem.shared
+    # physical values, limited to the ranges of the parameters
     values = layout.parameters(hypothesis.shared)
-    variances = np.diag(hypothesis.covariance)[: layout.parameter_count]
-    deviations = layout.scale[: layout.parameter_count] * np.sqrt(np.maximum(variances, 0.0))
-    parameters = []
+    # standard deviations: a scaled unknown is multiplied by its scale
+    scaled_variances = np.diag(hypothesis.covariance)[: layout.parameter_count]
+    scaled_deviations = np.sqrt(np.maximum(scaled_variances, 0.0))
+    deviations = layout.scale[: layout.parameter_count] * scaled_deviations
+    calibrated = []
     for parameter, value, deviation in zip(
         problem.model.parameters, values, deviations, strict=True
     ):
-        parameters.append(
+        calibrated.append(
             CalibratedParameter(parameter.name, float(value), float(deviation), parameter.unit)
         )
-    return tuple(parameters)
+    return tuple(calibrated)
 
 
 # ---------------------------------------------------------------- words

@@ -369,11 +369,13 @@ def _cells_of_trial(
             functions = {"mean": np.ones((count, 1))}
             if span.axis == "whole":
                 functions = dependence_functions(fitted, column)
-            for name, columns in functions.items():
-                cell_of_function = replace(cell, statistic=name)
-                yield from _dependence_cells(
-                    fitted, column, span.used, columns, cell_of_function, noise_freedom
+            for name, function_values in functions.items():
+                untested_cell = replace(cell, statistic=name)
+                tested_cell = _test_dependence(
+                    fitted, column, span.used, function_values, untested_cell, noise_freedom
                 )
+                if tested_cell is not None:
+                    yield tested_cell
             yield from _variance_cells(fitted, column, span.used, cell, noise_freedom)
         if trial.is_dynamic and used.all():
             yield from _frequency_cells(white[:, column], trial.interval, template, noise_freedom)
@@ -442,47 +444,61 @@ def _spans_of_bins(
             yield _Span(axis, low, high, used & (bin_of_sample == bin_index))
 
 
-def _dependence_cells(
+def _test_dependence(
     fitted: FittedTrial,
     column: int,
     used: BoolArray,
-    columns: FloatArray,
+    function_values: FloatArray,
     cell: Cell,
     noise_freedom: float,
-) -> Iterator[Cell]:
-    """Yield the cell of a function that residuals may depend on, unless the fit absorbed it.
-
-    Its value is the correlation coefficient of residuals and function, or the mean residual.
+) -> Cell | None:
+    """Test whether the residuals of a channel depend on a function, such as the speed.
 
     Parameters
     ----------
     fitted : FittedTrial
-        The trial.
+        The trial with the residuals of its N samples.
     column : int
-        Column of the channel.
+        Index of the channel.
     used : (N,) ndarray of bool
-        The n samples of the cell.
-    columns : (n, k) ndarray
-        Values of the function.
+        Mask of the n samples that are tested.
+    function_values : (n, k) ndarray
+        Values of the function at these samples. Most functions have k = 1 component; a harmonic has
+        two, its cosine and its sine. A constant function tests the mean of the residuals.
     cell : Cell
-        The cell, still without value and p-value.
+        The entry of the map for the result, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if it has none.
+        Degrees of freedom of the channel's noise record; 0 if there is no record, and the noise
+        variance is then taken as exact.
+
+    Returns
+    -------
+    Cell or None
+        The cell with the p-value of the test. Its value is the correlation coefficient of residuals
+        and function; for a constant function, the mean residual. None if the fit has already
+        removed a component of the function from the residuals, if a component is zero everywhere,
+        or if there are as many components as samples.
     """
-    equations = normal_equations_of(columns, ((fitted, used),), column)
+    equations = normal_equations_of(function_values, ((fitted, used),), column)
     if equations is None:
-        return
-    statistic, count = explained_sum_of_squares((equations,))
-    if count < columns.shape[1]:
-        return
+        return None
+    explained_squares, component_count = explained_sum_of_squares((equations,))
+    if component_count < function_values.shape[1]:
+        return None
     residual = fitted.standardised[used, column]
-    value = float(np.mean(residual))
-    if cell.statistic != "mean":
-        # the functions have unit norm, thus b . r / |r| is the correlation
-        correlations = equations.projection / (float(np.linalg.norm(residual)) or 1.0)
-        value = float(correlations[0] if count == 1 else np.linalg.norm(correlations))
-    p_value = variance_p_value(statistic / count, count, noise_freedom or np.inf)
-    yield replace(cell, value=value, p_value=p_value)
+    if cell.statistic == "mean":
+        value = float(np.mean(residual))
+    else:
+        # `normal_equations_of` scales each component b to unit norm, so that the correlation of b
+        # and the residual r is b . r / |r|
+        residual_norm = float(np.linalg.norm(residual)) or 1.0  # 1: no division by zero
+        correlations = equations.projection / residual_norm
+        # one component keeps its sign
+        value = float(correlations[0] if component_count == 1 else np.linalg.norm(correlations))
+    record_freedom = np.inf if noise_freedom == 0.0 else noise_freedom
+    mean_square = explained_squares / component_count
+    p_value = variance_p_value(mean_square, component_count, record_freedom)
+    return replace(cell, value=value, p_value=p_value)
 
 
 def _variance_cells(

@@ -314,30 +314,37 @@ class ForceFilter:
         return at_end.products[0], at_end.half_log_determinants[0] - log_scale
 
     def smooth(self, readings: FloatArray) -> SmoothedForces:
-        """Return the added state and the missing forces given all readings.
+        """Return the smoothed missing forces, and the change of the state that they cause.
+
+        Both are estimated from all readings of the trial, by a Kalman filter forwards in time and
+        de Jong's smoother backwards in time.
 
         Parameters
         ----------
         readings : (N, C) array
-            The residuals that the missing forces are to explain, divided by the noise deviations.
+            The residuals of N samples and C channels: readings minus the prediction without missing
+            forces, divided by the standard deviations of the noise.
         """
         record_filter = self.record_filter(readings[None])
         _, step_of_sample = self.trial.intervals
-        begin = record_filter.initial_state(self.state_space.initial_covariance)
-        # the state before sample k + 1 is that after the readings of sample k
-        after_every_sample = np.arange(1, len(readings) + 1)
+        initial_state = record_filter.initial_state(self.state_space.initial_covariance)
+        # The state after the readings of each sample k = 0 .. N - 1 is wanted. `filter_forward`
+        # calls it the state before sample k + 1.
+        next_samples = np.arange(1, len(readings) + 1)
+        # forwards in time
         covariances, means, whitened, _, gains, variances = filter_forward(
-            record_filter.transitions,
-            record_filter.noises,
-            step_of_sample,
-            record_filter.output_rows,
-            record_filter.used,
-            record_filter.columns,
-            0,
-            begin.covariance,
-            begin.mean,
-            after_every_sample,
+            transitions=record_filter.transitions,
+            noises=record_filter.noises,
+            step_of_sample=step_of_sample,
+            output_rows=record_filter.output_rows,
+            used=record_filter.used,
+            columns=record_filter.columns,
+            first=0,
+            covariance=initial_state.covariance,
+            mean=initial_state.mean,
+            query_samples=next_samples,
         )
+        # backwards in time
         corrections, informations = smoother_corrections(
             record_filter.transitions,
             step_of_sample,
@@ -348,13 +355,18 @@ class ForceFilter:
             variances,
         )
         states = self._states_at_fine_stamps(means, covariances, corrections)
-        # de Jong's smoother: the covariance given all readings, see `smoother_corrections`
+        # covariance of the state given all readings, see `smoother_corrections`
         posterior = covariances - covariances @ informations @ covariances
-        units_of_forces = np.array([process.standard_deviation for _, process in self.processes])
+        # the rows are the deviations of all forces, then those of the speeds of their ports
         force_deviations, speed_deviations = np.split(self._deviations(posterior), 2)
+        # the filter's states are scaled: those of the structure come first, in `state_units`; a
+        # force is in units of its standard deviation
+        structure_states = states[:, : len(self.state_units)]
+        force_states = states[:, self.force_state_indices]
+        units_of_forces = np.array([process.standard_deviation for _, process in self.processes])
         return SmoothedForces(
-            added_state=states[:, : len(self.state_units)] * self.state_units,
-            forces=states[:, self.force_state_indices].T * units_of_forces[:, None],
+            added_state=structure_states * self.state_units,
+            forces=force_states.T * units_of_forces[:, None],
             force_deviations=force_deviations,
             speed_deviations=speed_deviations,
         )

@@ -304,7 +304,7 @@ class LinearTrials:
         for trial_index, force_filter in enumerate(self.force_filters(processes)):
             rows = self.regression_rows[trial_index]
             unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
-            local = _local_unknowns(force_filter, unexplained)
+            local = _most_probable_local_unknowns(force_filter, unexplained)
             unexplained = unexplained - np.tensordot(local, force_filter.trial.local_derivatives, 1)
             smoothed = force_filter.smooth(unexplained)
             motions.append(self._trial_motion(trial_index, processes, smoothed, solution, local))
@@ -389,19 +389,27 @@ def _columns_along_motion(trial: PortedTrial, motion: TrialMotion) -> dict[int, 
     return columns
 
 
-def _local_unknowns(force_filter: ForceFilter, unexplained: FloatArray) -> FloatArray:
-    """Return the most probable unknowns (L,) of a trial alone, given all others.
+def _most_probable_local_unknowns(force_filter: ForceFilter, residual: FloatArray) -> FloatArray:
+    """Return the most probable values (L,) of the local unknowns of one trial.
+
+    Local unknowns occur in one trial only, such as its initial state. All other unknowns are fixed.
+    The values x solve the normal equations (D^T D + prior precision) x = D^T r. Here r is the
+    whitened residual at x = 0, and D the whitened derivatives of the prediction by x.
 
     Parameters
     ----------
     force_filter : ForceFilter
-        The filter of the trial.
-    unexplained : (N, C) array
-        The residuals at the values of the other unknowns.
+        The filter of the trial. It whitens a record: it subtracts from each reading what the
+        earlier readings predict, and divides the difference by its standard deviation.
+    residual : (N, C) array
+        The readings of N samples and C channels minus the prediction at x = 0, divided by the noise
+        deviations.
     """
     trial = force_filter.trial
-    products, _ = force_filter.whitened_products(
-        np.concatenate((unexplained[None], trial.local_derivatives))
-    )
+    residual_and_derivatives = np.concatenate((residual[None], trial.local_derivatives))
+    # inner products (1 + L, 1 + L): the first row and column belong to the residual
+    products, _ = force_filter.whitened_products(residual_and_derivatives)
+    normal_matrix = products[1:, 1:]
+    right_side = products[1:, 0]
     prior_precision = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
-    return np.linalg.solve(products[1:, 1:] + prior_precision, products[1:, 0])
+    return np.linalg.solve(normal_matrix + prior_precision, right_side)

@@ -285,21 +285,34 @@ class PortedTrial:
     def port_motion(
         self, unknowns: FloatArray, added_state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (F, P) of the ports [m or rad, and per s].
+        """Return the motion of the P ports at the F fine stamps.
+
+        The motion is the sum of two: that of the model's own response, which is linear in the
+        unknowns, and that of the state by which forces at ports change the response.
 
         Parameters
         ----------
         unknowns : (K + L,) array
-            The values of the shared unknowns, then of those of this trial alone.
+            The values of the K unknowns that all trials share, then of the L of this trial alone.
         added_state : (F, n) array
-            The state that forces at ports add.
+            The change of the state by forces at ports.
+
+        Returns
+        -------
+        positions : (F, P) array
+            The positions of the ports [m or rad].
+        speeds : (F, P) array
+            The speeds of the ports [m/s or rad/s].
         """
+        # model's own response: positions first, then speeds
         motion = np.stack((self.port_positions, self.port_speeds))
-        for k, derivative in self.port_motion_derivatives.items():
-            motion += (unknowns[k] - self.linearisation_point[k]) * derivative
-        return motion[0] + added_state @ self.system.positions.T, motion[
-            1
-        ] + added_state @ self.system.speeds.T
+        for unknown, derivative in self.port_motion_derivatives.items():
+            motion += (unknowns[unknown] - self.linearisation_point[unknown]) * derivative
+        response_positions, response_speeds = motion
+        # motion of the ports by the added state
+        added_positions = added_state @ self.system.positions.T
+        added_speeds = added_state @ self.system.speeds.T
+        return response_positions + added_positions, response_speeds + added_speeds
 
     def state_under_force(self, port: int, force: FloatArray) -> FloatArray:
         """Return the state (F, n) that a force at a port adds to the response of the model.

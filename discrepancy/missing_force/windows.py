@@ -284,31 +284,51 @@ def _port_or_channel_error(
                 for motion in linear_trials.motions
             ],
         )
-        evidence, processes = _best_channel_error(with_channel_error, longest_duration)
+        evidence, processes = _most_probable_channel_error(with_channel_error, longest_duration)
         if evidence > best_hypothesis.log_evidence:
             best_port = 0
             best_hypothesis = fit_missing_forces(with_channel_error, processes, processes)
     return best_port, best_hypothesis
 
 
-def _best_channel_error(
+def _most_probable_channel_error(
     linear_trials: LinearTrials, longest_duration: float
 ) -> tuple[float, Processes]:
-    """Return the log evidence and the process of an error of a channel, the best of a grid.
+    """Return the random process that describes the error of one channel best, with its evidence.
+
+    All pairs of a standard deviation from `CHANNEL_ERROR_DEVIATIONS` and a correlation time from
+    `CHANNEL_ERROR_TIMES` are compared.
 
     Parameters
     ----------
     linear_trials : LinearTrials
-        The trials, whose only port is the channel.
+        The trials. Their only port is the channel: a force at this port is an error of its readings
+        in units of the noise deviation, see `_with_channel_as_port`.
     longest_duration : float
-        The duration of the longest of them [s].
+        The duration of the longest trial [s].
+
+    Returns
+    -------
+    best_evidence : float
+        The log evidence of the trials with the best process [nat].
+    best_processes : mapping of int to Process
+        The best process, under the number 0 of the only port.
     """
+    channel_port = 0
     best_evidence = -np.inf
     best_processes: Processes = {}
     for deviation, relative_time in product(CHANNEL_ERROR_DEVIATIONS, CHANNEL_ERROR_TIMES):
-        processes = {0: Process(deviation, relative_time * longest_duration, may_jump=True)}
+        # an error of a sensor may begin suddenly, so the process may jump
+        process = Process(
+            standard_deviation=deviation,
+            correlation_time=relative_time * longest_duration,
+            may_jump=True,
+        )
+        processes = {channel_port: process}
         evidence = linear_trials.solve(processes).log_evidence
-        if not best_processes or evidence > best_evidence:
+        # the first process is taken in any case, even if its evidence is minus infinity
+        is_first = not best_processes
+        if is_first or evidence > best_evidence:
             best_evidence = evidence
             best_processes = processes
     return best_evidence, best_processes

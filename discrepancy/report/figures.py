@@ -83,30 +83,35 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     return figure
 
 
-def _map_of_names(
+def _heat_map_figure(
     values: FloatArray,
-    rows: Sequence[str],
-    columns: Sequence[str],
+    row_identifiers: Sequence[str],
+    column_identifiers: Sequence[str],
     norm: Normalize,
     texts: NDArray[np.str_] | None = None,
 ) -> tuple[Figure, Axes, AxesImage]:
-    """Return a figure with a map of square cells, whose rows and columns are effects.
+    """Return a figure with a heat map of square cells, its axes, and the image for a colour bar.
 
     Parameters
     ----------
     values : (R, C) ndarray
-        Values; nan for an empty cell.
-    rows, columns : sequence of str
-        Identifiers of the effects.
+        Values of the cells, which are shown as colours; nan for an empty cell.
+    row_identifiers, column_identifiers : sequence of str
+        Identifiers of the R rows and the C columns, such as "dry_friction"; the labels of the axes
+        show a space for each underscore.
     norm : Normalize
         Colour scale.
     texts : (R, C) ndarray of str, optional
-        Texts of the cells.
+        Texts that are written into the cells.
     """
-    figure, ((axes,),) = residual_figures.new_panels(1, 1, 0.175 * len(rows) + 1.6)
-    row_names = [name.replace("_", " ") for name in rows]
-    column_names = [name.replace("_", " ") for name in columns]
-    image = residual_figures.draw_heat_map(axes, values, (row_names, column_names), norm, 55, texts)
+    # in inches: a row must hold its label, the margin the slanted labels of the columns
+    height = 0.175 * len(row_identifiers) + 1.6
+    figure, ((axes,),) = residual_figures.new_panels(1, 1, height)
+    row_labels = [identifier.replace("_", " ") for identifier in row_identifiers]
+    column_labels = [identifier.replace("_", " ") for identifier in column_identifiers]
+    image = residual_figures.draw_heat_map(
+        axes, values, (row_labels, column_labels), norm, slant=55, texts=texts
+    )
     axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
@@ -133,7 +138,7 @@ def separability_figure(separability: Separability) -> Figure | None:
     cells = np.clip(distance, 0.3, _LARGEST_DISTANCE)
     np.fill_diagonal(cells, np.nan)
     labels = [names[index] for index in order]
-    figure, axes, image = _map_of_names(cells, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
+    figure, axes, image = _heat_map_figure(cells, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
     for row, column in zip(*np.nonzero(distance < CONFUSION_DISTANCE), strict=True):
         if row != column:
             axes.plot(column, row, "x", color=style.PREDICTION, ms=4.0, mew=1.1)
@@ -155,7 +160,7 @@ def confusion_figure(self_calibration: SelfCalibration) -> Figure:
     row_sums = np.maximum(counts.sum(axis=1, keepdims=True), 1)
     fractions = np.where(counts > 0, counts / row_sums, np.nan)
     texts = np.where(counts > 0, counts.astype(str), "")
-    figure, axes, _ = _map_of_names(fractions, rows, columns, Normalize(0.0, 1.0), texts)
+    figure, axes, _ = _heat_map_figure(fractions, rows, columns, Normalize(0.0, 1.0), texts)
     axes.set(xlabel="verdict", ylabel="what was hidden")
     return figure
 

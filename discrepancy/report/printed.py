@@ -84,21 +84,28 @@ def _probability_sentence(verdict: Verdict) -> str:
 
 
 def _sentences_on_proof(investigation: Investigation) -> Iterator[str]:
-    """Yield how much of the error the effects take away, and chi-square before and after."""
+    """Yield the sentences on the proof: the comparison of residuals without and with the effects.
+
+    The first sentence states the fraction of the model's error that the effects explain. The second
+    one states chi-square per sample without and with them, on the held-out trials if there are any,
+    else on the fitted trials. Nothing is yielded without a proof.
+    """
     proof = investigation.proof
     if proof is None:
         return
     yield error_sentence(investigation)
-    before, after, role = proof_scores(proof)
+    before, after, trial_role = proof_scores(proof)
     if not isfinite(before.chi_square_per_sample):
+        # chi-square is not known without a noise record, and this sentence says so
         yield proof.remaining
         return
-    trials = "none is held out"
-    if role == "held-out":
-        trials = ", ".join(trial.name for trial in investigation.campaign.held_out)
+    trial_remark = "none is held out"
+    if trial_role == "held-out":
+        trial_remark = ", ".join(trial.name for trial in investigation.campaign.held_out)
     yield (
-        f"χ² per sample on {role} trials ({trials}): {number(before.chi_square_per_sample)} "
-        f"before, {number(after.chi_square_per_sample)} with the effect, 1 for noise alone."
+        f"χ² per sample on {trial_role} trials ({trial_remark}): "
+        f"{number(before.chi_square_per_sample)} before, "
+        f"{number(after.chi_square_per_sample)} with the effect, 1 for noise alone."
     )
 
 

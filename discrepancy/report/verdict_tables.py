@@ -249,7 +249,12 @@ def _rank_hypotheses(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
 
 
 def evidence_table(verdict: Verdict) -> TitledTable:
-    """Return the table of the best hypotheses with their probabilities and evidence."""
+    """Return the table of the best hypotheses with their probabilities and evidence.
+
+    A hypothesis is a set of effects. The evidence is stated as a log Bayes factor against the
+    hypothesis without effects, if that one was compared.
+    """
+    # each row is made of a hypothesis and its role in the verdict, such as "named"
     columns: list[RecordColumn[tuple[Hypothesis, str]]] = [
         text_cells("hypothesis", lambda row: hypothesis_name(row[0])),
         text_cells("role", lambda row: row[1]),

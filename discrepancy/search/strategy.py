@@ -206,18 +206,28 @@ class Search(FittedCandidates):
     ) -> list[CandidateFit]:
         """Fit each effect by few steps from several points, and return the best fit of each.
 
+        The fit minimises an objective: the negative log posterior of the unknowns [nat]. A fit that
+        is not expected to come below a limit of the objective ends early, to save time. The limit
+        begins `least_gain` below the objective of the base fit. It falls whenever a fit, of
+        whichever effect, is so good that fits near the limit could no longer compete with it.
+
         Parameters
         ----------
         starts_by_effect : sequence of sequence of FitStart
-            The starting points of the fits of each effect.
+            For each effect, the points from which its fits start.
         base : CandidateFit
-            The fit that effects are added to; its derivatives are used for the first steps.
+            The fit without the effect. The derivatives of its predictions by nuisances (unknowns
+            other than those of effects) are used for the first steps in place of new ones.
         least_gain : float
-            The decrease of the objective below that of the base which a fit must reach [nat].
+            The decrease of the objective, from that of the base, that makes a fit worthwhile [nat].
+
+        Returns
+        -------
+        list of CandidateFit
+            For each effect that could be fitted, its fit with the highest score. The score is the
+            logarithm of evidence times prior probability.
         """
         best_fits = []
-        # a fit ends early if it is not expected to come below this objective, which falls with the
-        # best fit so far
         objective_limit = base.objective - least_gain
         for starts in report_each(
             self.on_progress,
@@ -234,11 +244,13 @@ class Search(FittedCandidates):
                     iterations=SEARCH.rough_fit_iterations,
                     objective_limit=objective_limit,
                 )
-                if rough is not None:  # None if the effect is larger than the model allows
-                    fits.append(rough)
-                    objective_limit = min(
-                        objective_limit, rough.objective + SEARCH.largest_rough_deficit
-                    )
+                if rough is None:  # the effect is larger than the model allows
+                    continue
+                fits.append(rough)
+                # a fit whose objective is higher by more than this deficit cannot become the best
+                objective_limit = min(
+                    objective_limit, rough.objective + SEARCH.largest_rough_deficit
+                )
             if fits:
                 best_fits.append(max(fits, key=self.score))
         return best_fits

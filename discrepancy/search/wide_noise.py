@@ -155,42 +155,49 @@ def _channel_process(
 
 def _add_correlation_in_time(
     process: _ChannelProcess,
-    process_variance: float,
+    variance_ratio: float,
     autocorrelation: FloatArray,
     white_variance: FloatArray,
     interval: float,
 ) -> _ChannelProcess:
-    """Return a residual process with its amplitude, correlation time and frequency.
+    """Return the random process of a channel with amplitude, correlation time and frequency set.
+
+    The residuals of the channel are the sum of white noise and this process. The process oscillates
+    if its autocorrelation has a deep first minimum; otherwise its frequency is zero.
 
     Parameters
     ----------
     process : _ChannelProcess
-        The process without these.
-    process_variance : float
-        The variance of the process over that of the noise.
+        The process, whose amplitude, correlation time and frequency are not set yet.
+    variance_ratio : float
+        The variance of the process divided by the variance of the white noise.
     autocorrelation : (K,) array
-        The autocorrelation of the residuals at lags of 1, 2, ... samples.
+        The autocorrelation of the residuals at lags of 1 to K samples.
     white_variance : (K,) array
-        The variance of each of these that white noise alone would cause.
+        The variance that each estimate in `autocorrelation` would have for white residuals.
     interval : float
         The sampling interval [s].
     """
     # White noise adds to the variance of the residuals, but not to their correlation. So the
     # correlation of the process is larger by the ratio of the variances.
-    residuals_over_process = (1.0 + process_variance) / process_variance
+    residuals_over_process = (1.0 + variance_ratio) / variance_ratio
     correlation_time = interval * noise_tests.statistical_inefficiency(
         autocorrelation, white_variance, residuals_over_process
     )
     frequency = 0.0
     process_autocorrelation = autocorrelation * residuals_over_process
+    # the first lag after which the autocorrelation rises; argmax returns the first lag of all if it
+    # never rises
     first_minimum = int(np.argmax(np.diff(process_autocorrelation) > 0.0))
     if process_autocorrelation[first_minimum] < OSCILLATION_MINIMUM:
-        # the first minimum is at half a period; the lags begin at one interval
+        # the first minimum is at half a period; index 0 is a lag of one interval
         frequency = 0.5 / ((first_minimum + 1) * interval)
-        correlation_time *= 2.0  # the mean of a squared cosine is a half
+        # The correlation time was computed from squared autocorrelations. An oscillation multiplies
+        # them by a squared cosine, whose mean is a half, so that the time came out half as long.
+        correlation_time *= 2.0
     return replace(
         process,
-        amplitude=np.sqrt(process_variance),
+        amplitude=np.sqrt(variance_ratio),
         correlation_time=correlation_time,
         frequency=frequency,
     )
