@@ -419,11 +419,10 @@ class LinearisedTrial:
             zero for a reading that does not count.
         """
         trial = self.trial
-        sample_count, channel_count = trial.residual.shape
-        output_rows = np.repeat(
-            self.force_filter.state_space.output_rows[None], sample_count, axis=0
-        )
-        coefficients = np.zeros((sample_count, channel_count, self.weight_count))
+        noise_scale = self.force_filter.white_noise_scale
+        constant_rows = self.force_filter.state_space.output_rows
+        output_rows = np.repeat(constant_rows[None], len(trial.residual), axis=0)
+        coefficients = np.zeros((*trial.residual.shape, self.weight_count))
         # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
         # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
         coefficients[:, :, 0] = trial.residual - self.sensor_errors.change
@@ -439,15 +438,13 @@ class LinearisedTrial:
         for unknown, derivative in self._readings_by_shared_unknowns().items():
             coefficients[:, :, 1 + unknown] -= derivative
             coefficients[:, :, 0] += trial.linearisation_point[unknown] * derivative
-        coefficients *= self.force_filter.white_noise_scale[:, None]
+        coefficients *= noise_scale[:, None]
         # A force at a port changes some readings at once, such as accelerations: by -e per unit of
         # force, with e in `direct_reading`. The force of the hypothesis' laws at the port is
         # force_by_weight @ (1, u) + force_by_state @ state. Its first term is brought to the left
         # side of the observation equation, which turns the sign.
         for law_index, port in enumerate(self.law_ports):
-            direct_reading = (
-                trial.system.through[port] / trial.deviation * self.force_filter.white_noise_scale
-            )
+            direct_reading = trial.system.through[port] / trial.deviation * noise_scale
             if not np.any(direct_reading):
                 continue
             force_by_state = self.force_by_state[:: trial.substeps, law_index]

@@ -223,7 +223,7 @@ def printed_sizes_table(separability: Separability) -> Table:
     columns: list[RecordColumn[Detectability]] = [
         text_cells("effect", lambda row: row.effect.identifier),
         text_cells("shows best at", lambda row: row.place),
-        text_cells("parameter", lambda row: row.parameter),
+        text_cells("parameter", lambda row: row.parameter.replace("_", " ")),
         text_cells("detectable from", lambda row: detectability_texts(row)[1]),
         text_cells("prior median", lambda row: detectability_texts(row)[2]),
     ]

@@ -1,13 +1,14 @@
 """Arguments that are one of a few words."""
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Literal, NamedTuple, Unpack, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
 import xarray
+from matplotlib.axes import Axes
 
 import uav_twin
 from calibration.dynamics.modal_identification import identify_modes
@@ -56,7 +57,8 @@ def literal_values(hint: object) -> Iterator[tuple[object, ...]]:
 
 def arguments(function: object) -> dict[str, object]:
     """Return the type hints of a function's arguments, of a TypedDict of options one by one."""
-    modules = {"xr": xarray}  # imported for type checkers alone where it takes long
+    # imported for type checkers alone where it takes long
+    modules = {"xr": xarray, "Axes": Axes, "Sequence": Sequence}
     hints = get_type_hints(function, localns=modules)
     hints.pop("return", None)
     options = hints.get("options")

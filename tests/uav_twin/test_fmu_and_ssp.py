@@ -164,7 +164,9 @@ def test_an_fmu_is_bound_and_checked(foreign_fmu, tmp_path):
     fmu, file = foreign_fmu("ball2"), tmp_path / "ball.toml"
     drafted = said("fmu", "bind", fmu, "--out", file, "--step-size", "0.05")
     assert f"uav-twin fmu check {fmu} --binding {file}" in " ".join(drafted.split())
-    assert said("fmu", "bind", fmu, "--step-size", "0.05") == file.read_text(encoding="utf-8")
+    schema, _, text = file.read_text(encoding="utf-8").partition("\n")
+    assert schema.startswith("#:schema ")
+    assert said("fmu", "bind", fmu, "--step-size", "0.05") == text
     again = refused("fmu", "bind", fmu, "--out", file, code=None)
     assert "exists: choose another --out or give --replace" in again
     record = json.loads(said("fmu", "check", fmu, "--binding", file, "--cycles", "5", "--json"))
