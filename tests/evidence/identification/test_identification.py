@@ -229,7 +229,8 @@ def test_a_written_design_is_read_back_and_the_shipped_file_is_such_a_one():
     assert sum(line.endswith("# too") for line in text.splitlines()) == len(design.webs)
     assert design_toml(again, {}) == design_toml(design, {})
     assert "row A is gauges 1-16, row B gauges 17-24" in text
-    shipped = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    schema, _, shipped = SHIPPED_DESIGN.read_text(encoding="utf-8").partition("\n")
+    assert schema.startswith("#:schema ")
     assert shipped.startswith("".join(f"# {line}".rstrip() + "\n" for line in HEADER))
     assert parse_design(rounded(DESIGN)) == DESIGN
 
