@@ -12,7 +12,7 @@ import typer
 
 from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
-from reporting.errors import ReportingError
+from reporting.errors import InvalidChoiceError, ReportingError
 from reporting.former_options import former_names_as_lines
 from reporting.words import number
 from twin_master.command_options import (
@@ -304,7 +304,9 @@ def print_outcome(outcome: "RunOutcome") -> None:
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
     for figure, printed in zip(outcome.figures, printed_figures(outcome.figures), strict=True):
-        reference = f"{printed.reference} {figure.unit}".strip() if printed.reference else ""
+        reference = printed.reference
+        if reference and not isinstance(figure.reference, str):  # a text has its unit in it
+            reference = f"{reference} {figure.unit}".strip()
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
         value = "none" if figure.value is None else f"{printed.value} {figure.unit}".strip()
@@ -373,6 +375,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
         our_errors: tuple[type[Exception], ...] = (
             TwinMasterError,
             ReportingError,
+            InvalidChoiceError,
             *_errors_of_lower_layers(),
             *further_errors,
         )

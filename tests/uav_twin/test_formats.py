@@ -19,6 +19,7 @@ from fmu_asset.client.binding import parse_binding
 from fmu_asset.errors import BindingError
 from reporting.format_tables import undocumented_keys
 from scenarios import binding_files, scenario_files, structure_files
+from tests import command_line
 from tests.refusals import refused
 from twin_master.errors import ScenarioError
 from twin_master.scenario.reading import parse_scenario
@@ -94,9 +95,13 @@ def test_the_command_lists_prints_and_writes_schemas(tmp_path):
     assert out.read_text(encoding="utf-8") == printed
     assert "#:schema ./campaign.schema.json" in told
     assert runner.invoke(app, ["schema", "--out", str(out)]).exit_code == 2
-    unknown = runner.invoke(app, ["schema", "campaigns"])
-    assert unknown.exit_code != 0
-    assert "Did you mean `campaign`?" in str(unknown.exception)
+
+
+def test_an_unknown_format_is_refused_with_the_nearest_one():
+    sentence = command_line.refused("schema", "campaigns")
+
+    assert sentence.startswith("There is no format 'campaigns'; the formats are scenario, fleet,")
+    assert sentence.endswith("Did you mean `campaign`?")
 
 
 def test_the_line_for_editors_names_a_shipped_file():
