@@ -32,7 +32,7 @@ is introduced gradually."""
 NARROWEST_WINDOWS = (0.001, 0.0002)
 """Still narrower windows, which are tried after the missing force has been lowered. In a window a
 body that sticks creeps; with a large missing force the narrow ones lead the iteration astray."""
-MOST_PASSING_ITERATIONS = 4
+MOST_PASSING_ITERATIONS = 8
 """Largest number of linearisations before the window of speeds is narrowed further, or the missing
 force lowered further."""
 MOST_LAST_ITERATIONS = 4
@@ -99,7 +99,7 @@ class MotionEstimator(GaussNewton):
             if smoothed is None:
                 return None
             current = start_from_estimate(smoothed)
-        return self._lower_missing_forces(laws, current)
+        return self._lower_missing_forces(laws, current, SPEED_WINDOWS[-1])
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
@@ -119,7 +119,7 @@ class MotionEstimator(GaussNewton):
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self._lower_missing_forces(laws, start)
+        estimate = self._lower_missing_forces(laws, start, SPEED_WINDOWS[-1])
         if estimate is None:
             return None
         estimate = self.tune_processes(laws, estimate, COARSE_FACTORS)
@@ -156,6 +156,9 @@ class MotionEstimator(GaussNewton):
     def _narrow_windows(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return the estimate with the narrowest window of speeds that makes it more probable.
 
+        With a narrower window a body that sticks creeps less, so that a smaller missing force may
+        be the more probable one. It is lowered again with each window.
+
         Parameters
         ----------
         laws : HypothesisLaws
@@ -164,14 +167,14 @@ class MotionEstimator(GaussNewton):
             The estimate with a wider window.
         """
         for speed_window in NARROWEST_WINDOWS:
-            narrower = self.iterate(laws, start_from_estimate(estimate), speed_window)
+            narrower = self._lower_missing_forces(laws, start_from_estimate(estimate), speed_window)
             if narrower is None or narrower.log_evidence < estimate.log_evidence + LEAST_RISE:
                 break
             estimate = narrower
         return estimate
 
     def _lower_missing_forces(
-        self, laws: HypothesisLaws, start: EstimatorStart
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
         """Return the most probable of several estimates with smaller and smaller missing forces.
 
@@ -200,11 +203,10 @@ class MotionEstimator(GaussNewton):
                 port: replace(process, standard_deviation=fraction * process.standard_deviation)
                 for port, process in start.processes.items()
             }
-            # the narrowest window of speeds: `estimate` has used the wider ones before
             estimate = self.iterate(
                 laws,
                 replace(current_start, processes=processes),
-                SPEED_WINDOWS[-1],
+                speed_window,
                 MOST_PASSING_ITERATIONS,
             )
             if estimate is None:
