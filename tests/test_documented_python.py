@@ -100,6 +100,13 @@ def flown(name: str, steps: int, place: str) -> Callable[[Path], None]:
     return fly
 
 
+def flown_fleet(folder: Path) -> None:
+    """Fly the fleet of the page on fleets with four twins."""
+    text, *_ = blocks(ROOT / "docs" / "how_to" / "fleets.md", "toml")
+    (folder / "fleet.toml").write_text(text.replace("count = 40", "count = 4"), encoding="utf-8")
+    command(folder, "fleet", "run", "fleet.toml", "--out", "runs/winter")
+
+
 def calibrated_wing(folder: Path) -> None:
     save_calibration(synthetic_calibration(), folder / "calibrations/wing_7/calibration.nc")
 
@@ -141,6 +148,7 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     # With the step up to which the page reports, and one more.
     "docs/reference/report.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/reference/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
+    "docs/reference/stores.md": (flown("level_turns", 22, "runs/level_turns"), flown_fleet),
     "docs/how_to/structures.md": (bracket,),
     "docs/how_to/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
     "docs/reference/verdict.md": VERDICT,
