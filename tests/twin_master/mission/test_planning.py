@@ -1,32 +1,24 @@
-"""A wing that is inspected and repaired: actions in a scenario, flown, planned on the belief.
+"""A wing that is inspected and repaired: actions in a scenario, flown, planned on the belief."""
 
-Which sensors tell most, against exhaustive search and integrals.
-"""
-
-import itertools
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-import meshio
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.stats import norm
 
 import uav_twin
-from fe.structure.location import on_surface
-from fe.structure.mesh_file import read_mesh
 from tests.command_line import refused, said
 from tests.twin_master.runs import edited, estimates_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, MissionInputError
+from twin_master.errors import FleetError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.mission import sensor_design
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     compare_simple_rules,
@@ -36,18 +28,16 @@ from twin_master.mission.planning import (
     simulate_policy,
 )
 from twin_master.mission.preparation import Knowledge, load_knowledge
-from twin_master.mission.sensor_design import DrawnReadings, choose_sensors, draw_readings, level_separations
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.transition import TransitionModel
-from twin_master.plan_command import _without_information
 from twin_master.run_folder import read_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
 from twin_master.watch.feeds import file_feed
-from uav_twin import ExactFilter, WatchfulEstimator, open_run, reduced_model, structure_files
+from uav_twin import ExactFilter, WatchfulEstimator, open_run, reduced_model
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
@@ -83,17 +73,28 @@ def asset_of(known: Knowledge) -> Any:
     return ReducedModelSource(known.scenario, reduced_model()).open()
 
 
-def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_its_step():
-    written = scenario()
-    assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
-    assert written.control[INSPECT].values == {"load_factor": 2.0}
-    assert written.rewards.control["inspect"] == pytest.approx(-0.1 - 0.2 / 16.0)
-    assert [reading[2:] for reading in written.readings] == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
-    own = scenario(('"3g" = 0.15 }', '"3g" = 0.15, inspect = 0.0 }'))
-    assert own.transition.probability["inspect"] == 0.0
-    row = knowledge().model.transition.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
-    assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
-    assert not row[1:].any()
+def test_an_action_is_a_control():
+    inspected = scenario()
+    assert inspected.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
+    assert inspected.control[INSPECT].values == {"load_factor": 2.0}
+    assert [reading[2:] for reading in inspected.readings] == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
+
+
+def test_the_price_of_an_action_is_taken_from_the_reward_of_its_control():
+    assert scenario().rewards.control["inspect"] == pytest.approx(-0.1 - 0.2 / 16.0)
+
+
+def test_an_action_may_have_a_probability_of_growth_of_its_own():
+    inspected = scenario(('"3g" = 0.15 }', '"3g" = 0.15, inspect = 0.0 }'))
+    assert inspected.transition.probability["inspect"] == 0.0
+
+
+def test_a_repair_follows_the_growth_of_its_step():
+    state_of_levels_4_and_1 = 4 * 5 + 1
+    row = knowledge().model.transition.row(REPAIR_1, state_of_levels_4_and_1)
+    probability = row.reshape(5, 5)
+    assert probability[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
+    assert not probability[1:].any()
 
 
 def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_step():
@@ -131,46 +132,119 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     assert expected[-1].filtered.max() > 0.3  # something was told
 
 
-def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_run_keeps_readings(tmp_path):
-    learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
-    path, policy, folder = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz", tmp_path / "run"
-    given = BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
-    policy.write_bytes(encode_policy(given, knowledge().model))
-    (tmp_path / "empty").touch()
-    for wrong in (path, tmp_path / "empty"):
-        told = refused("run", path, "--policy", wrong, "--out", folder)
-        assert "is no policy" in told
-        assert "pickle" not in told
-    said("run", path, "--policy", policy, "--out", folder, "--no-report")
-    kept = load_knowledge(folder, read_scenario(folder)).plan.on_belief
-    assert np.array_equal(kept.vectors, given.vectors)
-    run = open_run(folder)
-    observed, truth = run["observed"], run["truth"]
+@pytest.fixture(scope="module")
+def learning_scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The inspected wing for twelve steps, with a twin that learns and gives notice."""
+    shorter = ("steps = 120", "steps = 12")
+    learning = ("[planner]", "[learning]\n[notice]\n[planner]")
+    return written(tmp_path_factory.mktemp("learning"), TEXT, shorter, learning)
+
+
+@pytest.fixture(scope="module")
+def inspecting_policy() -> BeliefPolicy:
+    """A policy that inspects whatever the belief is."""
+    return BeliefPolicy(np.random.default_rng(0).random((1, 25)), np.array([INSPECT]))
+
+
+@pytest.fixture(scope="module")
+def inspecting_run(
+    learning_scenario: Path, inspecting_policy: BeliefPolicy, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Folder of the mission that the policy flies in that scenario."""
+    folder = tmp_path_factory.mktemp("inspecting")
+    policy = folder / "policy.npz"
+    policy.write_bytes(encode_policy(inspecting_policy, knowledge().model))
+    run = folder / "run"
+    said("run", learning_scenario, "--policy", policy, "--out", run, "--no-report")
+    return run
+
+
+@pytest.fixture(scope="module")
+def inspecting_store(inspecting_run: Path) -> Any:
+    """The store of that mission."""
+    return open_run(inspecting_run)
+
+
+@pytest.fixture(scope="module")
+def observations_read_again(inspecting_run: Path) -> np.ndarray:
+    """What a watch that is fed with the store of that mission would see, (steps, sensors)."""
+    feed = file_feed(inspecting_run / "run.nc", read_scenario(inspecting_run))
+    return np.array([message.observed for message, _ in feed.messages(None)])
+
+
+@pytest.mark.parametrize("content", ["a scenario", "nothing"])
+def test_a_file_that_is_no_policy_is_refused(learning_scenario, tmp_path, content):
+    empty = tmp_path / "empty"
+    empty.touch()
+    policy = learning_scenario if content == "a scenario" else empty
+    sentence = refused("run", learning_scenario, "--policy", policy, "--out", tmp_path / "run")
+    assert "is no policy" in sentence
+    assert "pickle" not in sentence
+
+
+def test_a_run_keeps_the_policy_of_the_file(inspecting_run, inspecting_policy):
+    kept = load_knowledge(inspecting_run, read_scenario(inspecting_run)).plan.on_belief
+    assert np.array_equal(kept.vectors, inspecting_policy.vectors)
+
+
+def test_a_stored_run_gives_back_its_strains(inspecting_store, observations_read_again):
+    strain = inspecting_store["observed"]["strain"]
+    np.testing.assert_array_equal(observations_read_again[:, :24], strain)
+
+
+@pytest.mark.parametrize(("region", "sensor"), [("z1", 24), ("z2", 25)])
+def test_a_run_keeps_the_readings_of_its_inspections(
+    inspecting_store, observations_read_again, region, sensor
+):
+    observed = inspecting_store["observed"]
     inspected = observed["control_index"].values == INSPECT
-    fed = file_feed(folder / "run.nc", read_scenario(folder)).messages(None)
-    rows = np.array([message.observed for message, _ in fed])
-    np.testing.assert_array_equal(rows[:, :24], observed["strain"])
-    for place, name in enumerate(("z1", "z2"), start=24):
-        read = observed[f"inspect_{name}"].values
-        np.testing.assert_array_equal(rows[:, place], read)
-        assert np.array_equal(np.isfinite(read), inspected)
-        assert inspected.sum() == 11
-        assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)
-    assert "learnt" in run
-    assert "notice" in run
-    assert "belief predicted" in run["filtered"]["decision_probability"].attrs["long_name"]
+    reading = observed[f"inspect_{region}"].values
+    level = inspecting_store["truth"]["state"].sel(region=region).values
+    np.testing.assert_array_equal(observations_read_again[:, sensor], reading)
+    assert np.array_equal(np.isfinite(reading), inspected)
+    assert inspected.sum() == 11
+    assert reading[inspected] == pytest.approx(level[inspected], abs=0.4)
+
+
+def test_a_twin_with_a_policy_learns_and_gives_notice(inspecting_store):
+    assert "learnt" in inspecting_store
+    assert "notice" in inspecting_store
+    decision = inspecting_store["filtered"]["decision_probability"]
+    assert "belief predicted" in decision.attrs["long_name"]
+
+
+ENDING_REPAIR = (
+    ('repairs = ["z2"]', "ends = true"),
+    ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"),
+)
+REPAIR_2 = 4
+
+
+@cache
+def stopping() -> Knowledge:
+    """Return the knowledge with a policy whose only action is the second repair, which ends the mission."""
+    always_repair = BeliefPolicy(np.ones((1, 25)), np.array([REPAIR_2]))
+    return following(knowledge_of_scenario(*ENDING_REPAIR), always_repair)
+
+
+@cache
+def knowledge_of_scenario(*changes: tuple[str, str]) -> Knowledge:
+    return of_wing(scenario(*changes))[0]
 
 
 def test_an_action_that_ends_ends_the_mission():
-    written = scenario(('repairs = ["z2"]', "ends = true"), ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"))
-    known = of_wing(written)[0]
-    stop = following(known, BeliefPolicy(np.ones((1, 25)), np.array([4])))
-    flown = fly(written, stop.twin(), stop.plant(stop.truth(1), asset_of(stop)))
-    assert flown.control_index.tolist() == [1, 4]
-    assert "decided on `repair_2`" in flown.notices[-1][1].sentence
-    assert side_by_side(stop, 2).ended[1] == flown.notices[-1][1].sentence
-    value = known.plan.action_value[:, 4]
-    assert value == pytest.approx(known.planning_reward[:, 4])  # and nothing behind it
+    stop = stopping()
+    flown = fly(stop.scenario, stop.twin(), stop.plant(stop.truth(1), asset_of(stop)))
+    assert flown.control_index.tolist() == [1, REPAIR_2]
+    sentence = flown.notices[-1][1].sentence
+    assert "decided on `repair_2`" in sentence
+    assert side_by_side(stop, 2).ended[1] == sentence
+
+
+def test_an_action_that_ends_has_no_value_behind_it():
+    known = knowledge_of_scenario(*ENDING_REPAIR)
+    value = known.plan.action_value[:, REPAIR_2]
+    assert value == pytest.approx(known.planning_reward[:, REPAIR_2])
 
 
 @cache
@@ -220,42 +294,99 @@ def test_a_limit_is_kept_by_the_plan():
     )
 
 
-def test_the_command_plans_draws_and_says_what_inspections_gauges_and_simpler_rules_are_worth(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setattr("twin_master.mission.planning.INSPECTION_PERIODS", (5,))
-    policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
-    worse = 2 * (("[0, 40]", "[0, 80]"),)
-    path = written(tmp_path, TEXT, *FOUR_STATES, *worse)
-    words = ("plan", path, "--value-of", "inspect", "--out", policy, "--picture", picture, "--json")
-    record = json.loads(said(*words))
-    assert record["lower"] < record["upper"]
-    assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
-    assert policy.stat().st_size > 1000
-    assert picture.read_bytes().startswith(b"<?xml")
-    rules = json.loads(said("plan", path, "--json"))["rules"]
-    assert rules["QMDP"][0] < rules["inspection every 5 steps"][0] < rules["planned on the belief"][0]
-    worth = json.loads(said("design", path, "--sensors", 1, "--among", "17,24", "--worth", "--json"))["worth"]
-    assert worth["all beyond chosen"][0] == pytest.approx(worth["all"][0] - worth["chosen"][0])
-    assert worth["all beyond chosen"][1] < 0.2 * worth["all"][1]  # mission by mission
+@pytest.fixture(scope="module")
+def severe_scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The inspected wing with four states, of which three are severe."""
+    severe = ("[0, 40]", "[0, 80]")
+    return written(tmp_path_factory.mktemp("severe"), TEXT, *FOUR_STATES, severe, severe)
+
+
+def plan_of_command(*words: object) -> dict[str, Any]:
+    """Return what the command plans, compared with one rule of inspections only: every 5 steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin_master.mission.planning.INSPECTION_PERIODS", (5,))
+        record: dict[str, Any] = json.loads(said("plan", *words, "--json"))
+    return record
+
+
+@pytest.fixture(scope="module")
+def severe_plan(severe_scenario: Path) -> dict[str, Any]:
+    """What the command says of the plan for it; policy and picture are written beside the scenario."""
+    policy = severe_scenario.with_name("policy.npz")
+    picture = severe_scenario.with_name("plan.svg")
+    options = ("--value-of", "inspect", "--out", policy, "--picture", picture)
+    return plan_of_command(severe_scenario, *options)
+
+
+def test_the_command_bounds_what_a_plan_brings_and_says_what_inspections_are_worth(severe_plan):
+    value = severe_plan["value"]
+    assert severe_plan["lower"] < severe_plan["upper"]
+    assert value["mean"] > value["half_width"] > 0.0
+
+
+def test_the_command_writes_the_policy_of_a_plan_and_draws_it(severe_scenario, severe_plan):
+    assert severe_scenario.with_name("policy.npz").stat().st_size > 1000
+    assert severe_scenario.with_name("plan.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_the_command_says_what_simpler_rules_are_worth(severe_scenario):
+    rules = plan_of_command(severe_scenario)["rules"]
+    mean = {name: row[0] for name, row in rules.items()}
+    assert mean["QMDP"] < mean["inspection every 5 steps"] < mean["planned on the belief"]
+
+
+def test_the_command_says_what_gauges_are_worth(severe_scenario):
+    """Differences are taken mission by mission, so that they scatter less than each of the values."""
+    options = ("--sensors", 1, "--among", "17,24", "--worth", "--json")
+    worth = json.loads(said("design", severe_scenario, *options))["worth"]
+    mean = {name: row[0] for name, row in worth.items()}
+    half_width = {name: row[1] for name, row in worth.items()}
+    assert mean["all beyond chosen"] == pytest.approx(mean["all"] - mean["chosen"])
+    assert half_width["all beyond chosen"] < 0.2 * half_width["all"]
+
+
+class RationedFleet:
+    """Sixty twins, of which three may inspect: what each of them wants, may do, and would gain."""
+
+    def __init__(self) -> None:
+        known = knowledge(*FOUR_STATES)
+        policy = planned()[1].policy
+        belief = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 60)
+        steady = TransitionModel((np.tile(np.eye(4), (5, 1, 1)),))
+        transition = replace(known.model, transition=steady).transition
+        no_control_yet = np.zeros(60, dtype=int)
+        self.wanted = policy.decide(belief)
+        self.rationed = ration_controls(transition, belief, no_control_yet, self.wanted, policy, [INSPECT], 3)
+        self.value = policy.action_value(belief, 5)
+        self.best_without = np.delete(self.value, INSPECT, axis=1).max(axis=1)
+        self.gain = self.value[:, INSPECT] - self.best_without
+        self.wanting = np.flatnonzero(self.wanted == INSPECT)
+        self.inspecting = np.flatnonzero(self.rationed == INSPECT)
+        self.declined = np.setdiff1d(self.wanting, self.inspecting)
+
+
+@cache
+def rationed_fleet() -> RationedFleet:
+    return RationedFleet()
 
 
 def test_inspections_of_a_fleet_go_where_they_are_worth_most():
-    known, (_, plan) = knowledge(*FOUR_STATES), planned()
-    ahead = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 60)
-    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(4), (5, 1, 1)),)))
-    chosen = plan.policy.decide(ahead)
-    wanting = np.flatnonzero(chosen == INSPECT)
-    few = ration_controls(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
-    value = plan.policy.action_value(ahead, 5)
-    other = np.delete(value, INSPECT, axis=1).max(axis=1)
-    gain = value[:, INSPECT] - other
-    kept = np.flatnonzero(few == INSPECT)
-    assert len(wanting) > len(kept) == 3
-    assert gain[kept].min() >= np.delete(gain, kept)[np.isin(np.delete(np.arange(60), kept), wanting)].max()
-    late = np.setdiff1d(wanting, kept)
-    assert value[late, few[late]] == pytest.approx(other[late])
-    assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
+    fleet = rationed_fleet()
+    assert len(fleet.wanting) > len(fleet.inspecting) == 3
+    assert fleet.gain[fleet.inspecting].min() >= fleet.gain[fleet.declined].max()
+
+
+def test_a_twin_without_its_inspection_takes_the_next_best_control():
+    fleet = rationed_fleet()
+    declined = fleet.declined
+    value = fleet.value[declined, fleet.rationed[declined]]
+    assert value == pytest.approx(fleet.best_without[declined])
+
+
+def test_a_twin_that_wants_no_inspection_does_what_it_wants():
+    fleet = rationed_fleet()
+    others = np.delete(np.arange(60), fleet.wanting)
+    assert np.array_equal(fleet.rationed[others], fleet.wanted[others])
 
 
 def test_a_budget_of_inspections_is_kept_in_every_step():
@@ -301,118 +432,3 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
     inspected = flown.control_index.tolist().index(INSPECT)
     spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
     assert spread[inspected] < 0.7 * spread[inspected - 1]
-
-
-# ---------------------------------------------------------------- sensors
-
-
-@cache
-def gauged() -> Knowledge:
-    return of_wing("level_turns")[0]
-
-
-def test_the_information_of_sensors_is_that_of_an_integral_also_where_something_moves_them_together():
-    """Two sensors that step one reading, and another of no meaning, by 30 degrees tell what the one does."""
-    means, moved = np.array([0.0, 1.0, 3.0]), np.array([0.3, 1.0, 0.6])
-    spread, state = np.sqrt(1.0 + moved**2), np.arange(60_000) % 3
-    shown = means[state] + spread[state] * norm.ppf((np.arange(60_000) // 3 + 0.5) / 20_000)
-    residual = np.stack((shown[:, None] - means, np.ones((60_000, 3))), axis=-1)
-    turned = np.array([[0.75**0.5, 0.0, 0.5], [-0.5, 0.0, 0.75**0.5]])  # and one shows nothing
-    shares = moved[:, None] * turned[0]
-    readings = DrawnReadings(state, residual @ turned, shares[..., None], np.zeros((3, 3)))
-
-    def entropy(value: float) -> float:
-        density = norm.pdf(value - means, scale=spread).mean()
-        return -float(density * np.log2(density))
-
-    noise = np.log2(spread).mean() + 0.5 * np.log2(2.0 * np.pi * np.e)
-    exact = quad(entropy, -9.0, 12.0, limit=200)[0] - noise
-    assert readings.information([0, 2]) == pytest.approx(exact, abs=3e-5)
-
-
-@pytest.mark.parametrize("samples", [7, 30])
-def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monkeypatch):
-    monkeypatch.setattr(sensor_design, "SAMPLES", samples)
-    for readings in draw_readings(gauged()):
-        times = np.bincount(readings.state, minlength=25)
-        assert times.max() == 1
-        assert times.sum() == min(samples, 25)
-        assert len({*(readings.state // 5)}) > 2  # not only where the first region is sound
-
-
-def test_three_of_twelve_are_those_of_an_exhaustive_search():
-    """One beside a region separates its levels, and those of the other region are hardly told."""
-    readings, able = draw_readings(gauged()), range(0, 24, 2)
-    found = choose_sensors(readings, able, 3)
-    told = {
-        some: float(np.mean([under.information(some) for under in readings]))
-        for some in itertools.combinations(able, 3)
-    }
-    best = max(told, key=lambda some: told[some])
-    assert tuple(sorted(found.sensors)) == best
-    assert found.information[-1] == pytest.approx(told[best], rel=1e-12)
-    assert found.of_all > found.information[-1] > found.information[0] > 0.0
-    with pytest.raises(MissionInputError, match="from 1 to 2"):
-        choose_sensors(readings, [0, 1], 3)
-    apart, fewer = (level_separations(gauged(), readings, gauges) for gauges in (range(24), [16, 23]))
-    assert min(far for (name, _), far in apart.items() if name == "z1") > 2.0
-    assert max(far for (name, _), far in apart.items() if name == "z2") < 1.0
-    assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
-
-
-def test_a_gauge_that_is_taken_away_tells_nothing_whatever_its_unit():
-    known, size = gauged(), 1e12
-    observation = known.scenario.observation.model_copy(update={"standard_deviation": size * 125e-6})
-    large = known.scenario.model_copy(update={"observation": observation})
-    values = size * known.sensor_model.value_per_draw
-    model = _without_information(Knowledge(large, known.model, known.draws, values), ["24"]).sensor_model
-    seen = np.where(np.arange(24) == 23, values[0, 0, 1], np.nan)
-    assert np.ptp(model.log_likelihood(seen, 1)) < 1e-6
-
-
-def test_the_command_chooses_draws_and_names_what_is_not_separated(tmp_path):
-    picture, points = tmp_path / "design.png", tmp_path / "gauges.vtu"
-    words = ("design", "level_turns", "--sensors", 2, "--among")
-    record = json.loads(said(*words, "1,17,24", "--picture", picture, "--vtu", points, "--json"))
-    assert record["sensors"] == ["17", "24"]
-    assert "z2 of 0 % from 20 %" in record["not_separated"]
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    rank = meshio.read(points).point_data["rank"]
-    assert rank[[16, 23]].tolist() == [1.0, 2.0]
-    assert rank.sum() == 3.0
-
-
-def designed(*words: object) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(said("design", "stiffened_panel", *words, "--json"))
-    return record
-
-
-def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(tmp_path):
-    points, picture = tmp_path / "gauges.vtu", tmp_path / "design.svg"
-    declared = designed("--sensors", 2)
-    found = designed("--sensors", 2, "--candidates", 10, "--vtu", points, "--picture", picture)
-    assert found["of_all"] > declared["of_all"]
-    assert found["information"][-1] > declared["information"][-1]
-    cloud = meshio.read(points)
-    assert len(cloud.points) == 6 + 3 * 10
-    mesh = read_mesh(structure_files()["stiffened_panel"].with_suffix(".msh"), 1e-3, "mm")
-    places = cloud.points[6::3]
-    assert max(on_surface(mesh, place, "it").distance for place in places) < 1e-9
-    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.eye(10)
-    assert apart.min() > 0.02  # of a panel of 0.3 m by 0.2 m
-    assert picture.read_bytes().startswith(b"<?xml")
-
-
-def test_a_listed_candidate_tells_what_the_same_gauge_of_the_file_does(tmp_path):
-    listed = tmp_path / "more.toml"
-    listed.write_text(
-        '[[gauge]]\nname = "twin_of_end"\npoint = [40, 50, -20]\ndirection = [1, 0, 0]\nlength = 5\n'
-        '[[rosette]]\nname = "r"\npoint = [150, 100, 2]\naxes = [[1, 0, 0], [0, 1, 0]]\nangles = [0, 90]\n'
-    )
-    words = ("--sensors", 1, "--candidates", listed, "--among")
-    same, own, other = (designed(*words, name)["of_all"] for name in ("twin_of_end", "end 1", "stiffener 1"))
-    assert same == pytest.approx(own, rel=0.05)  # the noise is drawn anew
-    assert abs(other - own) > 0.1 * own
-    assert designed(*words, "r_b,skin across")["sensors"][0] in ("r_b", "skin across")
-    listed.write_text("gauge = 3\n")
-    assert "more.toml" in refused("design", "stiffened_panel", *words, "end 1")
