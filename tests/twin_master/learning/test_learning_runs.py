@@ -47,48 +47,88 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def folder(scenario: Path) -> Path:
     run = scenario.parent / "run"
-    (scenario.parent / "said.json").write_text(said("run", scenario, "--out", run, "--no-report", "--json"))
+    printed = said("run", scenario, "--out", run, "--no-report", "--json")
+    (scenario.parent / "said.json").write_text(printed)
     return run
 
 
 @pytest.fixture(scope="module")
-def learnt(folder: Path) -> xr.Dataset:
-    return open_run(folder)["learnt"].to_dataset()
+def stored(folder: Path) -> xr.DataTree:
+    """The store of the run."""
+    return open_run(folder)
 
 
-def test_the_store_holds_what_the_twin_said_in_every_step(folder, learnt):
-    lines = [line["learnt"] for line in journal(folder)]
-    assert len(lines) == STEPS
-    assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
-    for name in lines[0]:
-        base, _, sensor = name.rstrip("]").partition("[")
+@pytest.fixture(scope="module")
+def learnt(stored: xr.DataTree) -> xr.Dataset:
+    return stored["learnt"].to_dataset()
+
+
+@pytest.fixture(scope="module")
+def learnt_lines(folder: Path) -> list[dict[str, Any]]:
+    """What the journal says in each step of what was learnt."""
+    return [line["learnt"] for line in journal(folder)]
+
+
+def test_the_journal_has_each_learnt_quantity_in_every_step(learnt_lines):
+    parameter, transitions, noises, gains, offsets = 1, 1, 24, 24, 23
+    assert len(learnt_lines) == STEPS
+    assert len(learnt_lines[0]) == parameter + transitions + noises + gains + offsets
+
+
+def test_the_store_holds_what_the_twin_said_in_every_step(learnt, learnt_lines):
+    for name in learnt_lines[0]:
+        quantity, _, sensor = name.rstrip("]").partition("[")
         for moment in MOMENTS:
-            kept = learnt[f"{base}_{moment}"]
-            told = [line[name][moment] for line in lines]
-            np.testing.assert_array_equal(kept.sel(sensor=int(sensor)) if sensor else kept, told)
+            stored = learnt[f"{quantity}_{moment}"]
+            course = stored.sel(sensor=int(sensor)) if sensor else stored
+            journalled = [line[name][moment] for line in learnt_lines]
+            np.testing.assert_array_equal(course, journalled)
+
+
+def test_a_gauge_without_a_deviation_of_its_offset_learns_none(learnt):
     assert np.isnan(learnt["gauge_offset_mean"].sel(sensor=24)).all()
     assert learnt["gauge_offset_prior_upper"].sel(sensor=1) > 0
-    for variable in learnt.data_vars.values():
-        assert variable.attrs["units"] == "1"  # strains and factors
-        assert variable.attrs["long_name"]
 
 
-def test_prior_and_truth_are_those_of_the_scenario(learnt, folder):
-    run = open_run(folder)
-    draws = run["calibration"]["draw_value"].values
-    mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
-    assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
-    assert wide == pytest.approx(draws.std(), rel=0.1)
+def test_learnt_variables_have_units_and_names(learnt):
+    """Strains and factors have no unit."""
+    assert {variable.attrs["units"] for variable in learnt.data_vars.values()} == {"1"}
+    assert all(variable.attrs["long_name"] for variable in learnt.data_vars.values())
+
+
+def test_the_prior_of_the_parameter_is_that_of_its_draws(learnt, stored):
+    """States between the draws are believed as well."""
+    draws = stored["calibration"]["draw_value"].values
+    mean = learnt["young_modulus_factor_prior_mean"].item()
+    standard_deviation = learnt["young_modulus_factor_prior_standard_deviation"].item()
+    assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())
+    assert standard_deviation == pytest.approx(draws.std(), rel=0.1)
+
+
+def test_the_prior_of_the_transitions_is_the_mean_of_their_factors(learnt):
     assert float(learnt["transition_factor_prior_mean"]) == pytest.approx(3.5 / 3)
-    # lambda² ~ inverse gamma(5, 5); gain | lambda ~ N(0, (0.02 lambda)²), whose variance is 0.02² E[lambda²]
-    squared = invgamma(5.0, scale=5.0)
-    noise = [float(learnt[f"noise_scale_prior_{moment}"].sel(sensor=7)) for moment in MOMENTS]
+
+
+SQUARED_SCALE = invgamma(5.0, scale=5.0)
+"""The square of the scale lambda of the noise is distributed as an inverse gamma(5, 5)."""
+
+
+def test_the_prior_of_the_noise_is_that_of_an_inverse_gamma(learnt):
+    prior = [float(learnt[f"noise_scale_prior_{moment}"].sel(sensor=7)) for moment in MOMENTS]
     mean = np.sqrt(5.0) * np.exp(gammaln(4.5) - gammaln(5.0))
-    wide = np.sqrt(squared.mean() - mean**2)
-    np.testing.assert_allclose(noise, [mean, wide, *np.sqrt(squared.ppf([0.05, 0.95]))], rtol=1e-10)
-    gain = float(learnt["gauge_gain_prior_standard_deviation"].sel(sensor=7))
-    assert gain == pytest.approx(0.02 * np.sqrt(squared.mean()))
-    truth = run["truth"].to_dataset()
+    standard_deviation = np.sqrt(SQUARED_SCALE.mean() - mean**2)
+    interval = np.sqrt(SQUARED_SCALE.ppf([0.05, 0.95]))
+    np.testing.assert_allclose(prior, [mean, standard_deviation, *interval], rtol=1e-10)
+
+
+def test_the_prior_of_a_gain_scales_with_the_noise(learnt):
+    """gain | lambda ~ N(0, (0.02 lambda)²), whose variance is 0.02² E[lambda²]."""
+    standard_deviation = float(learnt["gauge_gain_prior_standard_deviation"].sel(sensor=7))
+    assert standard_deviation == pytest.approx(0.02 * np.sqrt(SQUARED_SCALE.mean()))
+
+
+def test_the_truth_is_that_of_the_scenario(stored):
+    truth = stored["truth"].to_dataset()
     assert float(truth["young_modulus_factor"]) == 0.95
     np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
     np.testing.assert_array_equal(truth["gauge_gain"], 0.0)
@@ -104,69 +144,154 @@ def test_the_true_factor_is_that_of_the_true_probabilities(faster, truth):
     assert (factor.name, factor.truth) == ("transition_factor", truth)
 
 
-def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt):
-    summary = json.loads((folder / "summary.json").read_text())
-    figures = {figure["key"]: figure for figure in summary["figures"]}
+@pytest.fixture(scope="module")
+def summary(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return record
+
+
+@pytest.fixture(scope="module")
+def figures(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The figures of the summary by their keys."""
+    return {figure["key"]: figure for figure in summary["figures"]}
+
+
+def test_the_summary_has_the_figures_that_the_scenario_names(figures, scenario):
     assert tuple(figures) == load_scenario(scenario).scenario.figure_names
-    assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
-    assert figures["young_modulus_factor_mean"]["title"] == "Young modulus factor learnt, mean"
+
+
+def test_the_summary_says_what_was_learnt_of_the_parameter(figures, learnt):
+    figure = figures["young_modulus_factor_mean"]
+    assert figure["value"] == learnt["young_modulus_factor_mean"].values[-1]
+    assert figure["title"] == "Young modulus factor learnt, mean"
+
+
+def test_the_summary_says_what_was_believed_before_and_what_is_true(figures):
     assert figures["young_modulus_factor_prior_mean"]["value"] == pytest.approx(1.0)
     assert figures["young_modulus_factor_true"]["value"] == 0.95
+
+
+def test_the_summary_has_the_mean_of_the_noise_of_all_gauges(figures, learnt):
     assert figures["noise_scale_mean"]["value"] == learnt["noise_scale_mean"].values[-1].mean()
+
+
+def test_the_summary_names_the_gauge_whose_gain_departs_most(figures, learnt):
     last = learnt.isel(step=-1)
-    most = int(np.argmax(abs(last["gauge_gain_mean"].values) / last["gauge_gain_standard_deviation"].values))
-    assert figures["gauge_gain_most"]["title"] == f"gain error learnt, gauge {most + 1} (departs most)"
-    assert figures["gauge_gain_most"]["value"] == pytest.approx(100 * last["gauge_gain_mean"].values[most])
-    told = json.loads((folder.parent / "said.json").read_text())
-    assert told["learnt"] == summary["learnt"]
+    gain = last["gauge_gain_mean"].values
+    departure = abs(gain) / last["gauge_gain_standard_deviation"].values
+    gauge = int(np.argmax(departure))
+    figure = figures["gauge_gain_most"]
+    assert figure["title"] == f"gain error learnt, gauge {gauge + 1} (departs most)"
+    assert figure["value"] == pytest.approx(100 * gain[gauge])
+
+
+def test_the_command_prints_what_the_summary_says_was_learnt(folder, summary):
+    printed = json.loads((folder.parent / "said.json").read_text())
+    assert printed["learnt"] == summary["learnt"]
+
+
+def test_the_summary_has_each_gauge_with_its_truth(summary, learnt):
     noise = summary["learnt"]["noise_scale"]
-    assert noise["posterior"]["upper"] == last["noise_scale_upper"].values.tolist()
+    offset = summary["learnt"]["gauge_offset"]
+    assert noise["posterior"]["upper"] == learnt["noise_scale_upper"].values[-1].tolist()
     assert noise["truth"] == [1.2] * 24
-    assert summary["learnt"]["gauge_offset"]["posterior"]["mean"][23] is None
+    assert offset["posterior"]["mean"][23] is None
 
 
-def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
-    record, drawn = read_run(folder), {figure.name: figure for figure in report_figures(folder)}
+@pytest.fixture(scope="module")
+def report_of_run(folder: Path) -> Any:
+    """What the report reads of the run."""
+    return read_run(folder)
+
+
+@pytest.fixture(scope="module")
+def drawn(folder: Path) -> dict[str, Any]:
+    """The figures of the report by their names."""
+    return {figure.name: figure for figure in report_figures(folder)}
+
+
+def test_the_report_draws_what_was_learnt(drawn, learnt):
     figure = drawn["learnt"].figure
+    course, *_, truth = figure.axes[0].get_lines()
     assert len(figure.axes) == 2 + 3 * 2
-    parameter = figure.axes[0]
-    np.testing.assert_array_equal(parameter.get_lines()[0].get_ydata(), learnt["young_modulus_factor_mean"])
-    assert parameter.get_lines()[-1].get_ydata()[0] == 0.95  # the truth
-    sensors = sensor_rows(record)
-    assert len(sensors) == 24
-    assert sensors[23].count("—") == 1  # the offset
-    text = render_page(record, dict.fromkeys(drawn, b'<svg viewBox="0 0 1 1"></svg>'), drawn)
-    assert "0.05 in 2g and 0.1 in 3g" in text
-    assert re.search(r">Young modulus factor</td>.*>Factor on the transitions</td>", text, re.DOTALL)
-    assert re.search(r"it learnt the Young modulus factor: [\d.]+ \([\d.]+ to [\d.]+, truth 0\.95\)\.", text)
-    assert "posterior mean of the Young" not in text
+    np.testing.assert_array_equal(course.get_ydata(), learnt["young_modulus_factor_mean"])
+    assert truth.get_ydata()[0] == 0.95
 
 
-def test_the_view_shows_what_was_learnt(folder):
-    """From the posterior of each quantity alone, which the journal tells."""
-    flight, run = Flight(folder), open_run(folder)
-    filtered = run["filtered"].to_dataset()
-    flight.update()
-    shown = flight.beliefs_in(flight.records_of_steps(0, STEPS)).expected
-    noise = filtered["noise_standard_deviation"].values
-    wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
-    np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
-    np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = flight.prediction_after(flight.records_of_steps(STEPS - 1, STEPS)[0]).expected.mean
-    assert np.abs((ahead - run["predicted"]["quantity_mean"].values[-1]) / noise[-1]).max() < 0.06
+def test_the_report_lists_what_was_learnt_of_each_gauge(report_of_run):
+    """Of the last gauge no offset was learnt."""
+    rows = sensor_rows(report_of_run)
+    assert len(rows) == 24
+    assert rows[23].count("—") == 1
 
-    def off() -> float:
-        error = (
-            flight.beliefs_in(flight.records_of_steps(0, STEPS)).expected.mean
-            - filtered["quantity_mean"].values
-        )
-        return float(np.abs(error / noise).max())
 
-    residual = (run["observed"]["strain"].values - filtered["quantity_mean"].values) / noise
-    np.testing.assert_allclose(residual, filtered["residual"].values)
-    learnt = off()
-    flight.knowledge.__dict__["expectation"] = None
-    assert learnt < 0.06 < 0.3 < off()  # as calibrated
+@pytest.fixture(scope="module")
+def page(report_of_run: Any, drawn: dict[str, Any]) -> str:
+    drawing = b'<svg viewBox="0 0 1 1"></svg>'
+    return render_page(report_of_run, dict.fromkeys(drawn, drawing), drawn)
+
+
+def test_the_report_lists_what_was_learnt_of_parameter_and_transitions(page):
+    rows = re.compile(r">Young modulus factor</td>.*>Factor on the transitions</td>", re.DOTALL)
+    assert "0.05 in 2g and 0.1 in 3g" in page
+    assert rows.search(page)
+
+
+def test_the_report_begins_with_what_was_learnt(page):
+    opening = r"it learnt the Young modulus factor: [\d.]+ \([\d.]+ to [\d.]+, truth 0\.95\)\."
+    assert re.search(opening, page)
+    assert "posterior mean of the Young" not in page
+
+
+class View:
+    """The run as its view shows it, from the posterior of each quantity alone, which the journal has."""
+
+    def __init__(self, folder: Path, stored: xr.DataTree) -> None:
+        self.flight = Flight(folder)
+        self.flight.update()
+        self.filtered = stored["filtered"].to_dataset()
+        self.mean = self.filtered["quantity_mean"].values
+        self.noise = self.filtered["noise_standard_deviation"].values
+
+    def expected(self) -> Any:
+        """Return what the view expects the gauges to read in all steps."""
+        return self.flight.beliefs_in(self.flight.records_of_steps(0, STEPS)).expected
+
+    def largest_error(self) -> float:
+        """Return the largest error of the shown means, in standard deviations of the noise."""
+        return float(np.abs((self.expected().mean - self.mean) / self.noise).max())
+
+
+@pytest.fixture
+def view(folder: Path, stored: xr.DataTree) -> View:
+    return View(folder, stored)
+
+
+def test_the_view_shows_the_standard_deviations_and_rewards_of_the_store(view):
+    shown = view.expected()
+    stored_deviation = np.hypot(view.noise, view.filtered["quantity_standard_deviation"].values)
+    shown_deviation = np.hypot(shown.standard_deviation, shown.noise)
+    np.testing.assert_allclose(shown_deviation, stored_deviation, rtol=0.1)
+    np.testing.assert_allclose(shown.reward_mean, view.filtered["reward_mean"].values, atol=0.03)
+
+
+def test_the_view_predicts_what_the_store_does(view, stored):
+    last = view.flight.records_of_steps(STEPS - 1, STEPS)[0]
+    shown = view.flight.prediction_after(last).expected.mean
+    predicted = stored["predicted"]["quantity_mean"].values[-1]
+    assert np.abs((shown - predicted) / view.noise[-1]).max() < 0.06
+
+
+def test_a_stored_residual_is_the_reading_minus_its_mean_over_the_noise(view, stored):
+    residual = (stored["observed"]["strain"].values - view.mean) / view.noise
+    np.testing.assert_allclose(residual, view.filtered["residual"].values)
+
+
+def test_the_view_shows_what_was_learnt_and_not_what_was_calibrated(view):
+    error_as_learnt = view.largest_error()
+    view.flight.knowledge.__dict__["expectation"] = None
+    error_as_calibrated = view.largest_error()
+    assert error_as_learnt < 0.06 < 0.3 < error_as_calibrated
 
 
 def test_a_watch_keeps_the_last_steps_of_what_it_learnt(scenario, folder, learnt):
@@ -189,87 +314,191 @@ def test_more_transitions_than_there_can_be_are_refused(tmp_path):
         knowledge.twin()
 
 
-def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
-    """And no mean: that of litres a minute, newton metres, degrees and bars says nothing."""
-    given: dict[str, Any] = {"mission": {"steps": 2}, "calibration": {"draws": 4}}
-    given |= {"learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
-    plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is no strain
-    assert printed_unit_of_quantity("gauge_offset", "1", plain.scenario) == (1.0, "")
-    fly(changed_scenario("pump_wear", given), tmp_path, report=False)
-    summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]
-    told = {figure["key"]: figure for figure in summary["figures"]}
-    most = told["gauge_offset_most"]
-    assert most["unit"] == units[int(re.search(r"sensor (\d)", most["title"])[1]) - 1]
-    assert told["gauge_offset_mean"]["value"] is None
-    assert summary["learnt"]["gauge_offset"]["unit"] == units
-    learnt = journal(tmp_path)[-1]["learnt"]
-    assert [learnt[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == units
+PUMP_UNITS = ["L/min", "N.m", "degC", "bar"]
+PUMP_OFFSETS: dict[str, Any] = {
+    "mission": {"steps": 2},
+    "calibration": {"draws": 4},
+    "learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]},
+}
 
 
-def test_notices_are_on_in_every_file_that_does_not_step_them_off(tmp_path):
+@pytest.fixture(scope="module")
+def pump_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of two steps of a pump that learns offsets of four sensors in four units."""
+    folder = tmp_path_factory.mktemp("pump")
+    fly(changed_scenario("pump_wear", PUMP_OFFSETS), folder, report=False)
+    return folder
+
+
+def test_an_offset_of_a_quantity_without_unit_is_printed_without_one():
+    no_strain = changed_scenario("pump_wear", PUMP_OFFSETS | {"observation": {"unit": "1"}})
+    assert printed_unit_of_quantity("gauge_offset", "1", no_strain.scenario) == (1.0, "")
+
+
+def test_the_offset_that_departs_most_has_the_unit_of_its_sensor(pump_run):
+    summary = json.loads((pump_run / "summary.json").read_text())
+    figure = next(row for row in summary["figures"] if row["key"] == "gauge_offset_most")
+    sensor = int(re.search(r"sensor (\d)", figure["title"])[1])
+    assert figure["unit"] == PUMP_UNITS[sensor - 1]
+
+
+def test_offsets_of_sensors_of_several_units_have_no_mean(pump_run):
+    """A mean of litres a minute, newton metres, degrees and bars says nothing."""
+    assert figures_of(pump_run)["gauge_offset_mean"] is None
+
+
+def test_offsets_of_sensors_of_several_units_have_their_own(pump_run):
+    summary = json.loads((pump_run / "summary.json").read_text())
+    last = journal(pump_run)[-1]["learnt"]
+    assert summary["learnt"]["gauge_offset"]["unit"] == PUMP_UNITS
+    assert [last[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == PUMP_UNITS
+
+
+WITHOUT_NOTICES = ("paper_level_turns", "model_mismatch", "inspected_wing")
+"""Two of them measure what the filter alone does; inspections stand beside what notices watch."""
+
+
+def test_notices_have_the_defaults_of_their_table():
     assert dict(Noticing()) == vars(Noticing())
-    for name in scenario_files():
-        loaded = load_scenario(name)
-        # what two measure is the filter alone, and inspections stand beside what notices watch
-        off = name in ("paper_level_turns", "model_mismatch", "inspected_wing")
-        assert loaded.scenario.notice == (None if off else Noticing()), name
-        assert not loaded.remark
-        kept = loaded.scenario.to_dict()
-        assert (kept["notice"] is None) is off
-        assert parse_scenario(kept, name) == loaded.scenario  # as a run folder says it
-        assert loaded.scenario.mission.name == name
-    for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
-        assert load_scenario(name).scenario.searchable is searched  # causes are looked for in wings alone
-    of_its_own = ("[transition]", 'average_over_draws = "inside"\n[transition]')
-    levels = "[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
-    many = [(levels, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")] * 2
-    for changes, remark in (
-        ([of_its_own], "each sensor has a parameter of"),
-        (many, "they take 11,664,000 numbers a step, more than 1,000,000"),
-    ):
-        text = text_of("level_turns", *changes)
-        loaded = load_scenario(written(tmp_path, text))
-        assert loaded.scenario.notice is None
-        assert remark in loaded.remark
-        assert not load_scenario(written(tmp_path, text, ("format = 2", "format = 2\nnotice = false"))).remark
-    asked = text_of("level_turns", of_its_own) + "[notice]\n"
-    with pytest.raises(TwinMasterError, match=r"`notice` needs `observation.average_over_draws` `outside`"):
-        load_scenario(written(tmp_path, asked))
 
 
-def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_report(tmp_path):
-    faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
-    spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
-    console = said("run", spoilt, "--out", noticed, "--no-report")
-    assert printed_value(123_456, "") == "123456"  # a step has all of its digits
-    alarm = next(line for line in console.splitlines() if line.startswith("Step ") and "gauge 5" in line)
+@pytest.mark.parametrize("name", scenario_files())
+def test_notices_are_on_in_every_file_that_does_not_turn_them_off(name):
+    loaded = load_scenario(name)
+    assert loaded.scenario.notice == (None if name in WITHOUT_NOTICES else Noticing())
+    assert not loaded.remark
+
+
+@pytest.mark.parametrize("name", scenario_files())
+def test_a_run_folder_keeps_a_scenario_with_its_notices(name):
+    scenario = load_scenario(name).scenario
+    kept = scenario.to_dict()
+    assert (kept["notice"] is None) is (name in WITHOUT_NOTICES)
+    assert parse_scenario(kept, name) == scenario
+    assert scenario.mission.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "searchable"), [("watched_wing", True), ("three_regions", False), ("pump_wear", False)]
+)
+def test_causes_are_looked_for_in_wings_alone(name, searchable):
+    assert load_scenario(name).scenario.searchable is searchable
+
+
+AVERAGE_INSIDE = ("[transition]", 'average_over_draws = "inside"\n[transition]')
+FIVE_LEVELS = "[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
+NINETY_LEVELS = (FIVE_LEVELS, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")
+
+
+@pytest.mark.parametrize(
+    ("changes", "remark"),
+    [
+        ([AVERAGE_INSIDE], "each sensor has a parameter of"),
+        ([NINETY_LEVELS] * 2, "they take 11,664,000 numbers a step, more than 1,000,000"),
+    ],
+    ids=["averages within the likelihood", "many levels"],
+)
+def test_notices_that_cannot_be_given_are_off_with_a_remark(tmp_path, changes, remark):
+    text = text_of("level_turns", *changes)
+    loaded = load_scenario(written(tmp_path, text))
+    turned_off = written(tmp_path, text, ("format = 2", "format = 2\nnotice = false"))
+    assert loaded.scenario.notice is None
+    assert remark in loaded.remark
+    assert not load_scenario(turned_off).remark
+
+
+def test_notices_that_cannot_be_given_and_are_asked_for_are_refused(tmp_path):
+    asked_for = text_of("level_turns", AVERAGE_INSIDE) + "[notice]\n"
+    sentence = r"`notice` needs `observation.average_over_draws` `outside`"
+    with pytest.raises(TwinMasterError, match=sentence):
+        load_scenario(written(tmp_path, asked_for))
+
+
+class NoticedRun:
+    """A run in which gauge 5 drifts, and gauge 12 shows absurd values from step 3 on."""
+
+    def __init__(self, folder: Path) -> None:
+        end = "# What the figures"
+        faults = Inputs(__file__).text("faults.toml")
+        spoilt = written(folder, TEXT, *SHORT, (end, faults + end))
+        self.folder = folder / "run"
+        self.console = said("run", spoilt, "--out", self.folder, "--no-report")
+        self.lines = journal(self.folder)
+        self.notices = json.loads((self.folder / "summary.json").read_text())["notices"]
+        self.store = open_run(self.folder)["notice"].to_dataset()
+        self.figures = figures_of(self.folder)
+
+
+@pytest.fixture(scope="module")
+def noticed(tmp_path_factory: pytest.TempPathFactory) -> NoticedRun:
+    return NoticedRun(tmp_path_factory.mktemp("noticed"))
+
+
+def test_a_large_whole_number_is_printed_with_all_digits():
+    """The number of a step is one."""
+    assert printed_value(123_456, "") == "123456"
+
+
+def test_the_console_says_what_an_alarm_is_of_and_how_its_cause_is_found(noticed):
+    lines = noticed.console.splitlines()
+    alarm = next(line for line in lines if line.startswith("Step ") and "gauge 5" in line)
+    command = f"uav-twin discrepancy run --from-run {noticed.folder} --from-step 2"
     assert "gauge 5 shows too much, or the asset near it" in alarm
     assert ", since about step 2 (" in alarm
-    search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-step 2"
-    assert alarm.endswith(f"alarm from 100){search}")
-    assert "Step 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in console
+    assert alarm.endswith(f"alarm from 100); to find the cause: {command}")
 
-    notices = json.loads((noticed / "summary.json").read_text())["notices"]
-    assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
-    assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
-    lines = journal(noticed)
-    assert [{"step": line["step"]} | n for line in lines for n in line.get("notices", ())] == notices
-    kept = open_run(noticed)["notice"].to_dataset()
-    for name, values in kept.data_vars.items():
-        assert [line["suspicion"][name] for line in lines] == values.values.tolist()
-    np.testing.assert_array_equal(kept["left_out"].sel(sensor=12), [0, 0, 0, 1, 1, 1, 1, 1, 1])
-    figures = figures_of(noticed)
-    assert figures["alarm_step"] == next(n["step"] for n in notices if n["kind"] == "alarm")
-    assert figures["gauge_off"] == kept["gauge_off"].values[-1]
-    decided = [line["suspicion"]["decided_by"] for line in lines]
-    assert figures["decided_by"] == decided[-1]
-    assert decided[0] == "model"
-    assert "gauge 5 off" in decided
-    told = lines[-1]["suspicion"]["hypotheses"]
-    assert told["none of these"] == pytest.approx(kept["none_of_these"].values[-1], rel=1e-12)
-    assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
 
-    report = render_page(read_run(noticed), {}, {})
+def test_the_console_says_that_a_gauge_shows_what_no_state_can_show(noticed):
+    sentence = "Step 3: gauge 12 shows 1e+14 microstrain, and no state can show less than"
+    assert sentence in noticed.console
+
+
+def test_the_summary_has_the_notices_of_both_gauges(noticed):
+    of_gauges = {(notice["kind"], *notice["sensors"]) for notice in noticed.notices}
+    assert {notice["kind"] for notice in noticed.notices} == {"gauge_left_out", "alarm", "hypothesis"}
+    assert of_gauges >= {("gauge_left_out", 12), ("alarm", 5)}
+
+
+def test_the_journal_has_the_notices_of_the_summary(noticed):
+    journalled = [
+        {"step": line["step"]} | notice for line in noticed.lines for notice in line.get("notices", ())
+    ]
+    assert journalled == noticed.notices
+
+
+def test_the_store_has_the_suspicions_of_the_journal(noticed):
+    for name, stored in noticed.store.data_vars.items():
+        journalled = [line["suspicion"][name] for line in noticed.lines]
+        assert journalled == stored.values.tolist()
+
+
+def test_the_store_says_from_when_on_a_gauge_is_left_out(noticed):
+    left_out = noticed.store["left_out"].sel(sensor=12)
+    np.testing.assert_array_equal(left_out, [0, 0, 0, 1, 1, 1, 1, 1, 1])
+
+
+def test_the_figures_of_a_run_are_those_of_its_notices(noticed):
+    alarm = next(notice for notice in noticed.notices if notice["kind"] == "alarm")
+    assert noticed.figures["alarm_step"] == alarm["step"]
+    assert noticed.figures["gauge_off"] == noticed.store["gauge_off"].values[-1]
+
+
+def test_the_model_decides_until_a_gauge_is_believed_to_be_off(noticed):
+    deciding = [line["suspicion"]["decided_by"] for line in noticed.lines]
+    assert noticed.figures["decided_by"] == deciding[-1]
+    assert deciding[0] == "model"
+    assert "gauge 5 off" in deciding
+
+
+def test_the_journal_has_the_probability_of_each_hypothesis(noticed):
+    probability = noticed.lines[-1]["suspicion"]["hypotheses"]
+    stored = noticed.store["none_of_these"].values[-1]
+    assert probability["none of these"] == pytest.approx(stored, rel=1e-12)
+    assert sum(probability.values()) == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_report_says_what_was_noticed(noticed):
+    report = render_page(read_run(noticed.folder), {}, {})
     assert "gauge 5 shows too much" in report
-    assert f"what decides its control is: {figures['decided_by']}" in report
+    assert f"what decides its control is: {noticed.figures['decided_by']}" in report
     assert "gauge 12 shows 1e+14 microstrain" in report
