@@ -21,7 +21,8 @@ import pytest
 from paho.mqtt import client as paho
 
 from reporting.progress import SilentProgress
-from tests.twin_master.runs import flight_of, text_of
+from tests.twin_master.runs import flight_of, journal, text_of
+from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.replay import BelievedModel
 from twin_master.mission.steps import History
@@ -69,6 +70,21 @@ def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Cou
     for steps in stops or (None,):
         counts = watch.run(feed, lambda _decision: time.sleep(pause), step_limit=steps)
     return counts
+
+
+def last_line(folder: Path) -> str:
+    """The last record of a journal, as text, without its hash."""
+    return (folder / JOURNAL_NAME).read_text().splitlines()[-1][65:]
+
+
+def journalled(watch: Watch, folder: Path | None = None) -> list[Any]:
+    """The decisions that the journal of a watch, or of one like it, holds."""
+    model, lines = watch.models[0].knowledge.model, journal(folder or watch.folder)
+    return [decision_from_line(line, watch.scenario, model) for line in lines]
+
+
+def belief_of(watch: Watch) -> object:
+    return [line["filtered"] for line in journal(watch.folder) if "filtered" in line][-1]
 
 
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
