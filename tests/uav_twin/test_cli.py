@@ -9,9 +9,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +30,8 @@ from tests.conftest import synthetic_calibration
 from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
-from tests.uav_twin.test_discrepancy import TWO
-from twin_master.errors import MissionInputError, ScenarioError
+from tests.uav_twin.test_discrepancy_import import TWO
+from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError, ScenarioError
 from twin_master.mission.steps import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.workflow import check_scenario
@@ -43,36 +46,60 @@ def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]
     return found
 
 
-def test_every_command_has_help_and_the_common_options():
+def test_the_version_is_that_of_the_package():
     assert said("--version") == f"uav-twin {version('uav-twin')}\n"
-    everything = leaves(terminal.with_common_options(cli.app))
-    assert len(everything) > 25
-    for words, leaf in everything:
-        given = [option for parameter in leaf.params for option in parameter.opts]  # type: ignore[attr-defined]
-        for option in ("--quiet", "-q", "--verbose", "-v"):
-            assert given.count(option) == 1, (words, option)
+
+
+def test_every_command_has_help_and_the_common_options():
+    commands = leaves(terminal.with_common_options(cli.app))
+    assert len(commands) > 25
+    for words, leaf in commands:
+        options = [option for parameter in leaf.params for option in parameter.opts]  # type: ignore[attr-defined]
+        for common in ("--quiet", "-q", "--verbose", "-v"):
+            assert options.count(common) == 1, (words, common)
         assert leaf.help, words  # type: ignore[attr-defined]
 
 
-@pytest.mark.usefixtures("no_report")
-def test_run_prints_figures_and_report(tmp_path, library_file):
-    out = tmp_path / "run"
+@pytest.fixture(scope="module")
+def level_turns(
+    library_file: Path, no_report: None, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, tuple[object, ...], str]:
+    """The folder of a run, the words of its command, and what the command printed."""
+    out = tmp_path_factory.mktemp("level_turns") / "run"
     words = ("run", "level_turns", "--out", out, "--strain-library", library_file)
-    text = said(*words, "--seed", "3")
+    return out, words, said(*words, "--seed", "3")
+
+
+def test_run_prints_figures_and_report(level_turns):
+    out, _, text = level_turns
     assert re.search(r"policy changes from 3g to 2g +60 % +60 % \(1\)", " ".join(text.split()))
-    assert all(part in text for part in ("(1) Kapteyn et al. 2021\n", f"Report: {out / 'report.html'}"))
+    assert "(1) Kapteyn et al. 2021\n" in text
+    assert f"Report: {out / 'report.html'}" in text
+
+
+def test_a_run_is_replaced_only_on_demand(level_turns):
+    _, words, _ = level_turns
     assert "holds a run already" in refused(*words)
     done = command(*words, "--replace", "--quiet")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_a_run_without_a_report_is_printed_as_data(level_turns):
+    out, words, _ = level_turns
     said("run", "--resume", out, "--quiet")
     (out / "report.html").unlink(missing_ok=True)
     record = json.loads(said(*words, "--replace", "--json", "--no-report"))
+    keys = {figure["key"] for figure in record["figures"]}
     assert (record["folder"], record["report"], record["scenario"]) == (str(out), None, "level_turns")
-    assert {figure["key"] for figure in record["figures"]} >= {"fallback_delay", "policy_switch_damage"}
+    assert keys >= {"fallback_delay", "policy_switch_damage"}
     assert not (out / "report.html").exists()
-    text = said("run", "growing_damage", "--out", tmp_path / "other", "--strain-library", library_file)
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_scenario_without_references_has_no_column_for_them(tmp_path, library_file):
+    text = said("run", "growing_damage", "--out", tmp_path / "run", "--strain-library", library_file)
     assert "rms error of the estimated stiffness loss of region 1" in " ".join(text.split())
-    assert "reference" not in text  # the scenario has none, and no column for them
+    assert "reference" not in text
 
 
 def test_the_traceback_is_told_where_it_is_asked_for():
@@ -152,23 +179,50 @@ SHAPES = {
 """States, steps and sensors, where they are not those of the paper's mission."""
 
 
+NEEDS_LIBRARY = "model_mismatch"
+"""The scenario that names no strain library of its own."""
+
+
+def test_a_scenario_without_a_strain_library_says_what_it_needs():
+    with pytest.raises(MissionInputError, match="--strain-library FILE"):
+        check_scenario(load_scenario(NEEDS_LIBRARY))
+
+
+@cache
+def checked_scenario(name: str, library: Path) -> dict[str, Any]:
+    """Return what the check of a shipped scenario finds."""
+    options = {"strain_library": library} if name == NEEDS_LIBRARY else {}
+    return check_scenario(load_scenario(name), options)
+
+
 @pytest.mark.parametrize("name", sorted(scenario_files()))
-def test_every_shipped_scenario_can_be_flown_or_says_what_it_needs(name, library_file):
-    loaded, given = load_scenario(name), {}
-    if name == "model_mismatch":  # it names no strain library of its own
-        with pytest.raises(MissionInputError, match="--strain-library FILE"):
-            check_scenario(loaded)
-        given = {"strain_library": library_file}
-    found, shape = check_scenario(loaded, given), SHAPES.get(name, (25, 50, 24))
-    assert (found["states"], found["steps"], found["sensors"]) == shape
-    assert found["name"] == name
-    # at least predictions (E, S, U, G) and transitions (U, S, S)
-    drawn, controls = found["draws"] * shape[0] * shape[2], len(found["controls"])
-    assert found["memory"] > 8 * controls * (drawn + shape[0] ** 2)
-    model = build_graphical_model(loaded.scenario)
-    assert (model.states.size, *Truth(loaded.scenario, model, 0).noise.shape) == shape
-    if name == "watched_wing":
-        assert loaded.scenario.watch.recording == recording_files()[name]
+def test_every_shipped_scenario_can_be_flown(name, library_file):
+    record = checked_scenario(name, library_file)
+    shape = SHAPES.get(name, (25, 50, 24))
+    assert (record["states"], record["steps"], record["sensors"]) == shape
+    assert record["name"] == name
+
+
+@pytest.mark.parametrize("name", sorted(scenario_files()))
+def test_the_memory_of_a_scenario_is_at_least_that_of_predictions_and_transitions(name, library_file):
+    """Predictions are an array of draws, states, controls and sensors; transitions of controls and states."""
+    record = checked_scenario(name, library_file)
+    states, _, sensors = SHAPES.get(name, (25, 50, 24))
+    numbers_of_a_control = record["draws"] * states * sensors + states**2
+    assert record["memory"] > 8 * len(record["controls"]) * numbers_of_a_control
+
+
+@pytest.mark.parametrize("name", sorted(scenario_files()))
+def test_the_graphical_model_of_a_scenario_has_its_shape(name):
+    scenario = load_scenario(name).scenario
+    model = build_graphical_model(scenario)
+    steps_and_sensors = Truth(scenario, model, 0).noise.shape
+    assert (model.states.size, *steps_and_sensors) == SHAPES.get(name, (25, 50, 24))
+
+
+def test_the_watched_wing_watches_the_shipped_recording():
+    recording = load_scenario("watched_wing").scenario.watch.recording
+    assert recording == recording_files()["watched_wing"]
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), Inputs(__file__).table("changed.toml")["scenario"])
@@ -180,19 +234,38 @@ def test_a_fault_is_one_sentence(old, new, sentence, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
-    nan, out = float("nan"), tmp_path / "out"
-    checks = [Check("patch test", "strain", 1e-15, 1e-12), Check("mesh", "order", nan)]
+@pytest.fixture
+def sound_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the command find checks of a wing that are kept, as running them takes a minute."""
+    checks = [Check("patch test", "strain", 1e-15, 1e-12), Check("mesh", "order", float("nan"))]
     monkeypatch.setattr(wing_checks, "all_checks", lambda *_, **__: checks)
-    text = said("wing", "verify", "--out", out)
+
+
+@pytest.mark.usefixtures("sound_checks")
+def test_checks_of_a_wing_are_listed():
+    text = said("wing", "verify")
     assert "patch test" in text
     assert "kept" in text
-    record = json.loads((out / "verification.json").read_text())
+
+
+@pytest.mark.usefixtures("sound_checks")
+def test_checks_of_a_wing_are_written(tmp_path):
+    said("wing", "verify", "--out", tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "verification.json").read_text())
     assert [check["passed"] for check in record["checks"]] == [True, True]
     assert record["checks"][1]["value"] is None
     assert record["design_hash"] == load_design().hash
-    assert "not an empty folder" in refused("wing", "verify", "--out", out)
-    checks[:] = [Check("wing", "mass", 1e-3, 1e-10), Check("wing", "energy", nan, 1e-5)]
+
+
+@pytest.mark.usefixtures("sound_checks")
+def test_checks_of_a_wing_are_not_written_over_others(tmp_path):
+    said("wing", "verify", "--out", tmp_path / "out")
+    assert "not an empty folder" in refused("wing", "verify", "--out", tmp_path / "out")
+
+
+def test_broken_checks_of_a_wing_are_named(monkeypatch):
+    checks = [Check("wing", "mass", 1e-3, 1e-10), Check("wing", "energy", float("nan"), 1e-5)]
+    monkeypatch.setattr(wing_checks, "all_checks", lambda *_, **__: checks)
     done = command("wing", "verify")
     assert (done.returncode, done.stdout.count("BROKEN")) == (1, 2)
     assert "2 of 2 checks broke their limit: wing, mass; wing, energy." in done.stderr
@@ -257,68 +330,102 @@ def test_what_is_said(folder, monkeypatch, line, words):
 ROOT = Path(__file__).parents[2]
 
 
-def test_every_name_is_there_under_its_own_name_and_documented():
+def names_for_type_checkers() -> dict[str, str | None]:
+    """Return the modules of the names that the package hands on to type checkers."""
     tree = ast.parse(Path(uav_twin.__file__).read_text(encoding="utf-8"))
-    told = {}
-    for_type_checkers = next(node for node in tree.body if isinstance(node, ast.If))
-    for line in for_type_checkers.body:
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    modules: dict[str, str | None] = {}
+    for line in block.body:
         assert isinstance(line, ast.ImportFrom)
         (alias,) = line.names
         assert alias.asname == alias.name  # which type checkers take as handed on
-        told[alias.name] = line.module
-    assert told == _HOMES
+        modules[alias.name] = line.module
+    return modules
+
+
+def test_type_checkers_see_the_names_of_the_package():
+    assert names_for_type_checkers() == _HOMES
+
+
+def test_completion_offers_the_names_of_the_package():
     assert 15 <= len(uav_twin.__all__) <= 55
-    assert set(uav_twin.__all__) == set(dir(uav_twin))  # what completion in a notebook offers
-    # The import of a module of the command line would take the place of a name like it.
-    assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
+    assert set(uav_twin.__all__) == set(dir(uav_twin))
+
+
+def test_no_module_of_the_command_line_is_named_like_a_name_of_the_package():
+    """The import of such a module would take the place of the name."""
+    modules = {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")}
+    assert not modules & {*uav_twin.__all__}
+
+
+@pytest.mark.parametrize("name", uav_twin.__all__)
+def test_every_name_of_the_package_can_be_called_under_its_own_name(name):
+    function_or_class = getattr(uav_twin, name)
+    assert (callable(function_or_class), function_or_class.__name__) == (True, name)
+
+
+@pytest.mark.parametrize("name", uav_twin.__all__)
+def test_every_name_of_the_package_is_documented(name):
+    function_or_class = getattr(uav_twin, name)
     page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
-    for name in uav_twin.__all__:
-        found = getattr(uav_twin, name)
-        assert (callable(found), found.__name__) == (True, name)
-        assert found.__doc__, name
-        assert f"`{name}`" in page, name
-        text = pydoc.plaintext.document(found)
-        assert f"class {name}" in text or f"{name}(" in text
+    text = pydoc.plaintext.document(function_or_class)
+    assert function_or_class.__doc__
+    assert f"`{name}`" in page
+    assert f"class {name}" in text or f"{name}(" in text
+
+
+def test_a_name_that_the_package_does_not_have_is_refused_with_those_that_it_has():
     with pytest.raises(AttributeError, match=r"no attribute 'simulate_fmu'.*load_design"):
         uav_twin.simulate_fmu  # noqa: B018
 
 
-MODULE, NAME = "import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"
+MODULE = "import uav_twin; uav_twin.load_design()"
+NAME = "from uav_twin import load_design; load_design()"
 
 
-@pytest.mark.parametrize(
-    ("hidden", "words"),
-    [
-        ("fe.py", ("-c", MODULE)),
-        ("scenarios/__init__.py", ("-c", NAME)),
-        ("scenarios/mine.txt", ("-c", MODULE)),
-        ("fe.py", ("-m", "uav_twin", "wing")),
-    ],
-)
-def test_a_file_that_hides_a_package_is_named(hidden, words, tmp_path):
-    """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""
-    (tmp_path / hidden).parent.mkdir(exist_ok=True)
-    (tmp_path / hidden).write_text("", encoding="utf-8")
-    line = [sys.executable, *words]
-    found = subprocess.run(line, cwd=tmp_path, check=False, capture_output=True, text=True)
-    if hidden == "scenarios/mine.txt" and not found.returncode:
-        return
-    assert found.returncode == 1
-    *before, last = found.stderr.strip().splitlines()
-    name, place = Path(hidden).parts[0].removesuffix(".py"), tmp_path / Path(hidden).parts[0]
-    assert last.startswith("uav_twin.shadowing.ShadowedPackageError: ") or not before
-    assert (found.stdout, bool(before)) == ("", "-c" in words)
-    assert f"{place} hides the package `{name}` of uav-twin" in last
+def refusal_of_hidden_package(folder: Path, hidden: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with some words in a folder in which a file hides a package, or may hide it."""
+    (folder / hidden).parent.mkdir(exist_ok=True)
+    (folder / hidden).write_text("", encoding="utf-8")
+    program = [sys.executable, *words]
+    return subprocess.run(program, cwd=folder, check=False, capture_output=True, text=True)
+
+
+def check_hidden_package(done: subprocess.CompletedProcess[str], path: Path, package: str) -> None:
+    """Check that the last line of a process names the file that hides a package."""
+    last = done.stderr.strip().splitlines()[-1]
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{path} hides the package `{package}` of uav-twin" in last
     assert "rename it" in last
 
 
-def test_records_show_themselves_in_a_few_words(library_file):
+@pytest.mark.parametrize(
+    ("hidden", "code"), [("fe.py", MODULE), ("scenarios/__init__.py", NAME), ("scenarios/mine.txt", MODULE)]
+)
+def test_a_file_that_hides_a_package_from_python_is_named(hidden, code, tmp_path):
+    """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""
+    done = refusal_of_hidden_package(tmp_path, hidden, "-c", code)
+    if hidden == "scenarios/mine.txt" and not done.returncode:
+        return
+    *traceback, last = done.stderr.strip().splitlines()
+    first_part = Path(hidden).parts[0]
+    check_hidden_package(done, tmp_path / first_part, first_part.removesuffix(".py"))
+    assert last.startswith("uav_twin.shadowing.ShadowedPackageError: ")
+    assert traceback
+
+
+def test_a_file_that_hides_a_package_from_the_command_is_named_in_one_sentence(tmp_path):
+    done = refusal_of_hidden_package(tmp_path, "fe.py", "-m", "uav_twin", "wing")
+    check_hidden_package(done, tmp_path / "fe.py", "fe")
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def shown_records(library_file: Path) -> list[tuple[object, tuple[str, ...]]]:
+    """Records of all packages, and words that a notebook shows of each."""
     from calibration.wing.calibrate import WingCalibration
     from discrepancy.document import Origin
     from discrepancy.files.verdict import StoredVerdict
-    from discrepancy.fmu_models.model import FmuModel
-    from discrepancy.system.interface import Model
-    from discrepancy.system.structures import WingModel
     from discrepancy.verdict import Verdict, VerdictKind
     from discrepancy.workflow import Investigation
 
@@ -326,7 +433,7 @@ def test_records_show_themselves_in_a_few_words(library_file):
     verdict = Verdict(VerdictKind.NOTHING_MISSING, "Nothing.", 0.9, 0.0)
     wing = synthetic_calibration()
     knowledge = uav_twin.prepare_twin("level_turns", {"strain_library": library_file})
-    shown: list[tuple[object, tuple[str, ...]]] = [
+    return [
         (campaign, (campaign.name, "trials=", "channels=")),
         (model, ("LumpedModel", "parameters=")),
         (verdict, ("nothing missing", "0.9")),
@@ -341,42 +448,89 @@ def test_records_show_themselves_in_a_few_words(library_file):
         (knowledge.twin(), ("steps=0", "GraphicalModel(")),
         (uav_twin.load_design(), ("regions=2 (z1, z2)", "gauges=24")),
     ]
-    for record, words in shown:
+
+
+def test_records_show_themselves_in_a_few_words(shown_records):
+    for record, _ in shown_records:
         text = repr(record)
         assert text.startswith(f"{type(record).__name__}(")
         assert len(text) < 400
         assert "array(" not in text
-        for word in words:
-            assert word in text, text
+
+
+def test_records_show_what_tells_them_apart(shown_records):
+    for record, words in shown_records:
+        text = repr(record)
+        assert [word for word in words if word not in text] == [], text
+
+
+def test_models_of_wings_and_fmus_show_themselves_as_all_models_do():
+    from discrepancy.fmu_models.model import FmuModel
+    from discrepancy.system.interface import Model
+    from discrepancy.system.structures import WingModel
+
     assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 
 
-def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file, monkeypatch):
-    from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError
+class GentleRun:
+    """A run under a policy of one's own, which always flies the first control; it has no report."""
 
-    monkeypatch.setattr("twin_master.workflow._write_report", None)  # none is drawn where none is asked for
-    flown = {"strain_library": library_file}
-    known = uav_twin.prepare_twin("level_turns", flown)
-    controls = known.model.controls
-    gentle = np.zeros((known.model.states.size, len(controls)))
-    gentle[:, 0] = 1.0
+    def __init__(self, library: Path, folder: Path) -> None:
+        self.folder = folder
+        self.options = {"strain_library": library}
+        self.known = uav_twin.prepare_twin("level_turns", self.options)
+        self.policy = np.zeros((self.known.model.states.size, len(self.known.model.controls)))
+        self.policy[:, 0] = 1.0
+        with without_report():
+            uav_twin.fly("level_turns", folder, self.options, policy=self.policy, report=False)
+
+
+@contextmanager
+def without_report() -> Iterator[None]:
+    """Let a run fail if it draws a report, which it must not where none is asked for."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin_master.workflow._write_report", None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def gentle_run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> GentleRun:
+    return GentleRun(library_file, tmp_path_factory.mktemp("gentle") / "run")
+
+
+def test_a_policy_of_another_shape_and_a_misspelt_key_are_refused_and_write_nothing(tmp_path, library_file):
     folder = tmp_path / "run"
+    policy = np.ones((3, 1))
     with pytest.raises(InvalidModelError, match="expected a policy of shape"):
-        uav_twin.fly("level_turns", folder, flown, policy=np.ones((3, 1)))
+        uav_twin.fly("level_turns", folder, {"strain_library": library_file}, policy=policy)
     with pytest.raises(MissionInputError, match="'sead' is not a key"):
         uav_twin.fly("level_turns", folder, {"sead": 1})
     assert not folder.exists()
-    uav_twin.fly("level_turns", folder, flown, policy=gentle, report=False)
-    run = uav_twin.open_run(folder)
-    np.testing.assert_array_equal(np.load(folder / "policy.npy"), gentle)
+
+
+def test_a_policy_of_ones_own_is_kept(gentle_run):
+    run = uav_twin.open_run(gentle_run.folder)
+    np.testing.assert_array_equal(np.load(gentle_run.folder / "policy.npy"), gentle_run.policy)
     assert not run["policy"]["control_index"].values.any()
-    first = int(run["observed"]["control_index"][0])
-    assert run["observed"]["control_index"].values[1:].tolist() == [0] * (len(run["observed"]["step"]) - 1)
-    assert first == controls.index(known.scenario.mission.first_control)
-    before = (folder / "run.nc").read_bytes()
-    uav_twin.resume(folder, report=False)
-    assert (folder / "run.nc").read_bytes() == before
-    (folder / "run.nc").unlink()  # a run that is finished is not flown again
-    np.save(folder / "policy.npy", gentle[:, ::-1])
-    with pytest.raises(NotResumableError, match="policy changed"):
+
+
+def test_a_policy_of_ones_own_is_flown_after_the_first_step(gentle_run):
+    first, *others = uav_twin.open_run(gentle_run.folder)["observed"]["control_index"].values.tolist()
+    known = gentle_run.known
+    assert first == known.model.controls.index(known.scenario.mission.first_control)
+    assert others == [0] * (known.scenario.mission.steps - 1)
+
+
+def test_a_finished_run_with_a_policy_of_ones_own_is_not_flown_again(gentle_run):
+    store_before = (gentle_run.folder / "run.nc").read_bytes()
+    with without_report():
+        uav_twin.resume(gentle_run.folder, report=False)
+    assert (gentle_run.folder / "run.nc").read_bytes() == store_before
+
+
+def test_a_run_whose_policy_was_changed_is_not_resumed(gentle_run, tmp_path):
+    folder = shutil.copytree(gentle_run.folder, tmp_path / "run")
+    (folder / "run.nc").unlink()
+    np.save(folder / "policy.npy", gentle_run.policy[:, ::-1])
+    with without_report(), pytest.raises(NotResumableError, match="policy changed"):
         uav_twin.resume(folder, report=False)
