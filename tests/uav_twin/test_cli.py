@@ -483,6 +483,7 @@ class GentleRun:
         self.policy[:, 0] = 1.0
         with without_report():
             uav_twin.fly("level_turns", folder, self.options, policy=self.policy, report=False)
+        self.store = uav_twin.open_run(folder)
 
 
 @contextmanager
@@ -509,13 +510,12 @@ def test_a_policy_of_another_shape_and_a_misspelt_key_are_refused_and_write_noth
 
 
 def test_a_policy_of_ones_own_is_kept(gentle_run):
-    run = uav_twin.open_run(gentle_run.folder)
     np.testing.assert_array_equal(np.load(gentle_run.folder / "policy.npy"), gentle_run.policy)
-    assert not run["policy"]["control_index"].values.any()
+    assert not gentle_run.store["policy"]["control_index"].values.any()
 
 
 def test_a_policy_of_ones_own_is_flown_after_the_first_step(gentle_run):
-    first, *others = uav_twin.open_run(gentle_run.folder)["observed"]["control_index"].values.tolist()
+    first, *others = gentle_run.store["observed"]["control_index"].values.tolist()
     known = gentle_run.known
     assert first == known.model.controls.index(known.scenario.mission.first_control)
     assert others == [0] * (known.scenario.mission.steps - 1)

@@ -1,4 +1,4 @@
-"""`uav-twin fmu`, `library sample`, `ssp` and `run x.ssp` as a user calls them."""
+"""`uav-twin fmu` and `library sample` as a user calls them."""
 
 import csv
 import json
@@ -6,6 +6,7 @@ import math
 import re
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,82 +20,171 @@ from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from scenarios import binding_files
 from tests.command_line import command, refused, said
-from tests.fmu_asset.making import DESCRIPTION, archive_of, edited, members
+from tests.fmu_asset.making import DESCRIPTION, archive_of, members
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
 ROOM = INPUTS.folder / "room.toml"
 
 
-def test_histories_in_outputs_out(foreign_fmu, tmp_path):
-    fmu, given = foreign_fmu("room2"), tmp_path / "inputs.csv"
-    power, outside = [0.0, 3.0, 1.5, 0.25], [5.0, -3.5, 0.1, 20.0]
-    lines = [f"{120.0 + 60.0 * i},{p},{o}" for i, (p, o) in enumerate(zip(power, outside, strict=True))]
-    given.write_text("time, power, load.outside\n" + "\n".join(lines) + "\n\n", encoding="utf-8")
-    with FmiAsset(fmu, ROOM, isolated=False) as asset:
-        seen = [asset.step({"power": p}, load={"outside": o}) for p, o in zip(power, outside, strict=True)]
-    for out, more in ((tmp_path / "out.csv", ()), (tmp_path / "out.nc", ("--in-process",))):
-        words = ("fmu", "simulate", fmu, "--binding", ROOM, "--inputs", given, "--out", out)
-        assert "4 steps to t = 360 s" in said(*words, *more)
-    with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as stream:
+POWER = [0.0, 3.0, 1.5, 0.25]
+OUTSIDE = [5.0, -3.5, 0.1, 20.0]
+
+
+class SimulatedRoom:
+    """A room under histories of power and outside temperature, called from Python and by the command."""
+
+    def __init__(self, fmu: Path, folder: Path) -> None:
+        self.table, self.store = folder / "out.csv", folder / "out.nc"
+        inputs = folder / "inputs.csv"
+        rows = [
+            f"{120.0 + 60.0 * row},{power},{outside}"
+            for row, (power, outside) in enumerate(zip(POWER, OUTSIDE, strict=True))
+        ]
+        header = "time, power, load.outside\n"
+        inputs.write_text(header + "\n".join(rows) + "\n\n", encoding="utf-8")
+        self.words = ("fmu", "simulate", fmu, "--binding", ROOM, "--inputs", inputs, "--out")
+        self.printed = [said(*self.words, self.table), said(*self.words, self.store, "--in-process")]
+        with FmiAsset(fmu, ROOM, isolated=False) as asset:
+            self.observations = [
+                asset.step({"power": power}, load={"outside": outside})
+                for power, outside in zip(POWER, OUTSIDE, strict=True)
+            ]
+        self.slopes = [observation.extra["der(room.T)"] for observation in self.observations]
+
+
+@pytest.fixture(scope="module")
+def simulated_room(foreign_fmu, tmp_path_factory) -> SimulatedRoom:
+    return SimulatedRoom(foreign_fmu("room2"), tmp_path_factory.mktemp("room"))
+
+
+def test_a_simulation_counts_its_steps(simulated_room):
+    assert all("4 steps to t = 360 s" in text for text in simulated_room.printed)
+
+
+def test_a_table_of_outputs_has_what_python_gets(simulated_room):
+    with simulated_room.table.open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
+    expected = [
+        [observation.time, *observation.values.tolist(), slope]
+        for observation, slope in zip(simulated_room.observations, simulated_room.slopes, strict=True)
+    ]
     assert header == ["time", "room.T", "room.sensor.T", "der(room.T)"]
-    expected = [[item.time, *item.values.tolist(), item.extra["der(room.T)"]] for item in seen]
     assert [[float(cell) for cell in row] for row in rows] == expected
-    with xr.open_dataset(tmp_path / "out.nc", engine="h5netcdf", decode_times=False) as data:
+
+
+def test_a_store_of_outputs_has_the_observations_with_their_units(simulated_room):
+    expected = np.array([observation.values for observation in simulated_room.observations])
+    with xr.open_dataset(simulated_room.store, engine="h5netcdf", decode_times=False) as data:
         assert data["time"].values.tolist() == [180.0, 240.0, 300.0, 360.0]
-        assert data["observation"].values.tobytes() == np.array([item.values for item in seen]).tobytes()
+        assert data["observation"].values.tobytes() == expected.tobytes()
         assert data["observation_unit"].values.tolist() == ["degC", "degC"]
-        assert data["extra"].sel(extra_name="der(room.T)").values.tolist() == [row[-1] for row in expected]
+
+
+def test_a_store_of_outputs_has_further_outputs_with_their_units(simulated_room):
+    with xr.open_dataset(simulated_room.store, engine="h5netcdf", decode_times=False) as data:
+        assert data["extra"].sel(extra_name="der(room.T)").values.tolist() == simulated_room.slopes
         assert data["extra_unit"].values.tolist() == ["K/s"]
-    assert "exists: choose another --out or give --replace" in refused(*words, code=None)
 
 
-def test_an_fmu_alone(foreign_fmu, tmp_path):
-    """A ball that is let go, against its closed form; its second bounce ends the simulation."""
-    out, plot, fmu = tmp_path / "ball.csv", tmp_path / "ball.png", foreign_fmu("ball2", "ENDS")
-    wanted = ("--stop-time", 3, "--step-size", 0.1, "--set", "e=0.8", "--set", "g=3.72", "--in-process")
-    told = said("fmu", "simulate", fmu, *wanted, "--out", out, "--plot", plot)
-    end = math.sqrt(2.0 / 3.72) * (1.0 + 2.0 * 0.8)
-    assert f"20 steps to t = {end:g} s, every 0.1 s" in told
-    assert f"ended at t = {end:g} s" in told
-    rows = np.genfromtxt(out, delimiter=",", names=True)
-    falling = rows["time"] < math.sqrt(2.0 / 3.72)
-    np.testing.assert_allclose(rows["h"][falling], 1.0 - 1.86 * rows["time"][falling] ** 2, atol=1e-4)
+def test_outputs_are_replaced_only_on_demand(simulated_room):
+    sentence = refused(*simulated_room.words, simulated_room.store, "--in-process", code=None)
+    assert "exists: choose another --out or give --replace" in sentence
+
+
+GRAVITY = 3.72
+RESTITUTION = 0.8
+FIRST_IMPACT = math.sqrt(2.0 / GRAVITY)
+SECOND_IMPACT = FIRST_IMPACT * (1.0 + 2.0 * RESTITUTION)
+
+
+class FallingBall:
+    """A ball that is let go from one metre; its second bounce ends the simulation."""
+
+    def __init__(self, fmu: Path, folder: Path) -> None:
+        table = folder / "ball.csv"
+        self.picture = folder / "ball.png"
+        parameters = ("--set", f"e={RESTITUTION}", "--set", f"g={GRAVITY}")
+        options = ("--stop-time", 3, "--step-size", 0.1, *parameters, "--in-process")
+        self.printed = said("fmu", "simulate", fmu, *options, "--out", table, "--plot", self.picture)
+        self.rows = np.genfromtxt(table, delimiter=",", names=True)
+
+
+@pytest.fixture(scope="module")
+def falling_ball(foreign_fmu, tmp_path_factory) -> FallingBall:
+    return FallingBall(foreign_fmu("ball2", "ENDS"), tmp_path_factory.mktemp("ball"))
+
+
+def test_an_fmu_that_ends_its_simulation_is_told_to_have_ended(falling_ball):
+    assert f"20 steps to t = {SECOND_IMPACT:g} s, every 0.1 s" in falling_ball.printed
+    assert f"ended at t = {SECOND_IMPACT:g} s" in falling_ball.printed
+
+
+def test_an_fmu_alone_follows_its_closed_form(falling_ball):
+    rows = falling_ball.rows
+    is_falling = rows["time"] < FIRST_IMPACT
+    height = 1.0 - 0.5 * GRAVITY * rows["time"][is_falling] ** 2
+    np.testing.assert_allclose(rows["h"][is_falling], height, atol=1e-4)
     assert rows[0].tolist()[:3] == (0.0, 1.0, 0.0)
     assert rows["bounces"].tolist() == [0] * 8 + [1] * 12 + [2]
-    assert plot.read_bytes()[:4] == b"\x89PNG"
-    told = said("fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4)
-    assert "500 steps to t = 0.4 s, every 0.0008 s" in told
-    text = '<DefaultExperiment startTime="2.0" stopTime="3.0" stepSize="0.25"/><ModelVariables>'
-    fmu = foreign_fmu.changed("ball2", "ball_with_experiment", ("<ModelVariables>", text))
-    assert "4 steps to t = 3 s" in said("fmu", "simulate", fmu, "--in-process", "--out", out, "--replace")
-    rows = np.genfromtxt(out, delimiter=",", names=True)
+
+
+def test_an_fmu_alone_is_drawn(falling_ball):
+    assert falling_ball.picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_without_a_step_size_an_fmu_takes_500_steps(foreign_fmu):
+    fmu = foreign_fmu("ball2", "ENDS")
+    printed = said("fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4)
+    assert "500 steps to t = 0.4 s, every 0.0008 s" in printed
+
+
+def test_an_fmu_alone_is_simulated_as_its_default_experiment_says(foreign_fmu, tmp_path):
+    experiment = '<DefaultExperiment startTime="2.0" stopTime="3.0" stepSize="0.25"/><ModelVariables>'
+    fmu = foreign_fmu.changed("ball2", "ball_with_experiment", ("<ModelVariables>", experiment))
+    printed = said("fmu", "simulate", fmu, "--in-process", "--out", tmp_path / "ball.csv")
+    rows = np.genfromtxt(tmp_path / "ball.csv", delimiter=",", names=True)
+    assert "4 steps to t = 3 s" in printed
     assert rows["time"].tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
     assert rows["h"][0] == 1.0
 
 
-def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path):
-    """Each element sums its weight times its input: n of them, set in configuration mode; it may be none."""
-    fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
-    wanted = ("fmu", "simulate", fmu, "--stop-time", 3, "--step-size", 1, "--replace", "--out", out)
-    for where in ((), ("--in-process",)):
-        said(*wanted, *where, "--set", "n=4", "--set", "u=1,2,0,-1")
-        rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
-        assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
-        assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
-    said(*wanted, "--in-process", "--set", "n=0")
+@pytest.mark.parametrize("options", [(), ("--in-process",)], ids=["in a worker", "in process"])
+def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path, options):
+    """Each of four elements sums its weight times its input."""
+    out = tmp_path / "x.csv"
+    sized = ("--set", "n=4", "--set", "u=1,2,0,-1")
+    run = ("fmu", "simulate", foreign_fmu("resize3"), "--stop-time", 3, "--step-size", 1, "--out", out)
+    said(*run, *options, *sized)
+    rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
+    assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
+    assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
+
+
+def test_arrays_may_have_no_elements(foreign_fmu, tmp_path):
+    out = tmp_path / "x.csv"
+    experiment = ("--stop-time", 3, "--step-size", 1, "--in-process", "--set", "n=0")
+    said("fmu", "simulate", foreign_fmu("resize3"), *experiment, "--out", out)
     assert out.read_text(encoding="utf-8").splitlines()[:3] == ["time,total", "0.0,0.0", "1.0,0.0"]
-    # By a binding, with weights 1, 2, 3 and histories whose columns stand in any order.
-    bound, given = tmp_path / "b.toml", tmp_path / "u.csv"
-    words = ("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process")
-    bound.write_text(INPUTS.text("sized.toml"), encoding="utf-8")
-    given.write_text("u[2],time,u[1],u[3]\n2,0,1,3\n0,1,0,1\n", encoding="utf-8-sig")
-    said(*words, "--replace")
-    assert out.read_text(encoding="utf-8").splitlines()[1:] == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
-    bound.write_text(INPUTS.text("sized.toml", ("n = 3", "n = 0")), encoding="utf-8")
-    given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
-    assert "control.u must be 0 values" in refused(*words, "--replace")
+
+
+def test_a_binding_sizes_arrays_whose_columns_stand_in_any_order(foreign_fmu, tmp_path):
+    """The weights are 1, 2 and 3."""
+    inputs, out = tmp_path / "u.csv", tmp_path / "x.csv"
+    inputs.write_text("u[2],time,u[1],u[3]\n2,0,1,3\n0,1,0,1\n", encoding="utf-8-sig")
+    options = ("--binding", INPUTS.folder / "sized.toml", "--inputs", inputs, "--out", out)
+    said("fmu", "simulate", foreign_fmu("resize3"), *options, "--in-process")
+    rows = out.read_text(encoding="utf-8").splitlines()[1:]
+    assert rows == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
+
+
+def test_inputs_of_an_array_without_elements_are_refused(foreign_fmu, tmp_path):
+    binding, inputs = tmp_path / "b.toml", tmp_path / "u.csv"
+    binding.write_text(INPUTS.text("sized.toml", ("n = 3", "n = 0")), encoding="utf-8")
+    inputs.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
+    options = ("--binding", binding, "--inputs", inputs, "--out", tmp_path / "x.csv", "--in-process")
+    sentence = refused("fmu", "simulate", foreign_fmu("resize3"), *options)
+    assert "control.u must be 0 values" in sentence
 
 
 def test_structural_parameters_of_a_binding(foreign_fmu):
@@ -160,58 +250,141 @@ def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path):
         assert all(part in members(path)[DESCRIPTION].decode() for part in expected)
 
 
-def test_an_fmu_is_bound_and_checked(foreign_fmu, tmp_path):
-    fmu, file = foreign_fmu("ball2"), tmp_path / "ball.toml"
-    drafted = said("fmu", "bind", fmu, "--out", file, "--step-size", "0.05")
-    assert f"uav-twin fmu check {fmu} --binding {file}" in " ".join(drafted.split())
+@pytest.fixture(scope="module")
+def bound_ball(foreign_fmu, tmp_path_factory) -> tuple[Path, Path, str]:
+    """An FMU of a ball, the binding that the command drafts, and what the command printed."""
+    fmu = foreign_fmu("ball2")
+    file = tmp_path_factory.mktemp("bound") / "ball.toml"
+    return fmu, file, said("fmu", "bind", fmu, "--out", file, "--step-size", "0.05")
+
+
+def test_a_drafted_binding_begins_with_its_schema_and_is_printed_without(bound_ball):
+    fmu, file, printed = bound_ball
     schema, _, text = file.read_text(encoding="utf-8").partition("\n")
+    assert f"uav-twin fmu check {fmu} --binding {file}" in " ".join(printed.split())
     assert schema.startswith("#:schema ")
     assert said("fmu", "bind", fmu, "--step-size", "0.05") == text
-    again = refused("fmu", "bind", fmu, "--out", file, code=None)
-    assert "exists: choose another --out or give --replace" in again
-    record = json.loads(said("fmu", "check", fmu, "--binding", file, "--cycles", "5", "--json"))
-    assert record["passed"] is True
-    found = {finding["check"]: finding["verdict"] for finding in record["findings"]}
-    assert (found["fmpy validate"], found["state"], found["instances"]) == ("ok", "warning", "ok")
-    shown = command("fmu", "check", fmu, "--binding", file, "--cycles", "0")
-    assert "no problem found" in shown.stdout
-    assert all(finding in shown.stdout for finding in found if finding != "instances")
-    assert "..." in shown.stderr  # a stage tells that it has begun, in a pipe too
 
 
-def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu, tmp_path):
-    words = ("fmu", "check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0")
-    checked = command(*words)
-    assert checked.returncode == 1
-    assert "SIGSEGV" in checked.stdout
-    assert "1 problem." in checked.stderr
-    assert "Traceback" not in checked.stdout + checked.stderr
-    told = json.loads(command(*words, "--json").stdout)
-    assert told["passed"] is False
-    assert any(finding["verdict"] == "problem" for finding in told["findings"])
+def test_a_binding_is_not_written_over_another_file(bound_ball):
+    fmu, file, _ = bound_ball
+    sentence = refused("fmu", "bind", fmu, "--out", file, code=None)
+    assert "exists: choose another --out or give --replace" in sentence
 
 
-def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
-    foreign_fmu, tmp_path, monkeypatch
-):
-    fmu, elsewhere = foreign_fmu("ball2"), tmp_path / "elsewhere.fmu"
-    for_windows = {n.replace("linux64", "win64").replace(".so", ".dll"): c for n, c in members(fmu).items()}
-    archive_of(elsewhere, for_windows)
-    record, other = (json.loads(said("fmu", "info", file, "--json")) for file in (fmu, elsewhere))
+@pytest.fixture(scope="module")
+def check_of_ball(bound_ball: tuple[Path, Path, str]) -> dict[str, Any]:
+    """What the command says as data of a check of that FMU with its binding."""
+    fmu, file, _ = bound_ball
+    words = ("fmu", "check", fmu, "--binding", file, "--cycles", "5", "--json")
+    record: dict[str, Any] = json.loads(said(*words))
+    return record
+
+
+def test_a_check_of_an_fmu_is_printed_as_data(check_of_ball):
+    verdicts = {finding["check"]: finding["verdict"] for finding in check_of_ball["findings"]}
+    assert check_of_ball["passed"] is True
+    assert verdicts["state"] == "warning"
+    assert (verdicts["fmpy validate"], verdicts["instances"]) == ("ok", "ok")
+
+
+def test_a_check_of_an_fmu_is_printed_as_a_table(bound_ball, check_of_ball):
+    """Without cycles of reset there are no instances to check.
+
+    A stage tells on the stream of errors that it has begun, in a pipe too.
+    """
+    fmu, file, _ = bound_ball
+    done = command("fmu", "check", fmu, "--binding", file, "--cycles", "0")
+    checks = {finding["check"] for finding in check_of_ball["findings"]} - {"instances"}
+    assert "no problem found" in done.stdout
+    assert all(check in done.stdout for check in checks)
+    assert "..." in done.stderr
+
+
+@pytest.fixture
+def crashing_check(foreign_fmu) -> tuple[object, ...]:
+    """The words of a check of an FMU that crashes."""
+    return ("fmu", "check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0")
+
+
+def test_a_problem_is_named_and_the_exit_code_says_so(crashing_check):
+    done = command(*crashing_check)
+    assert (done.returncode, "SIGSEGV" in done.stdout) == (1, True)
+    assert "1 problem." in done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_a_problem_is_a_verdict_of_the_data(crashing_check):
+    record = json.loads(command(*crashing_check, "--json").stdout)
+    assert record["passed"] is False
+    assert any(finding["verdict"] == "problem" for finding in record["findings"])
+
+
+@pytest.fixture(scope="module")
+def fmu_for_windows(foreign_fmu, tmp_path_factory) -> Path:
+    """The FMU of a ball with a binary for another platform only."""
+    fmu = tmp_path_factory.mktemp("windows") / "elsewhere.fmu"
+    contents = {
+        name.replace("linux64", "win64").replace(".so", ".dll"): content
+        for name, content in members(foreign_fmu("ball2")).items()
+    }
+    archive_of(fmu, contents)
+    return fmu
+
+
+def info(fmu: Path) -> dict[str, Any]:
+    """Return what the command says of an FMU as data."""
+    record: dict[str, Any] = json.loads(said("fmu", "info", fmu, "--json"))
+    return record
+
+
+def test_an_fmu_for_this_platform_has_no_obstacle(foreign_fmu):
+    fmu = foreign_fmu("ball2")
+    record = info(fmu)
     assert (record["file"], record["obstacle"]) == (str(fmu), "")
-    assert "no binary for this platform" in other["obstacle"]
-    assert "win64" in other["obstacle"]
-    assert other["variables"] == record["variables"]
-    assert "It cannot be flown here: " in said("fmu", "info", elsewhere)
-    refused("fmu", "simulate", elsewhere, "--stop-time", "1")
-    for columns in ("", "80"):  # a pipe, and a narrow terminal
-        first, *rest = command("fmu", "info", fmu, columns=columns).stdout.splitlines()
-        assert "…" not in first + "".join(rest)
-        assert str(fmu) in first
-        second_words = "".join(line.split(" ", 2)[1] for line in [first, *rest] if " " in line)
-        assert record["variables"]
-        assert all(variable["name"] in second_words for variable in record["variables"])
-        assert not columns or max(map(len, rest)) <= 80
+
+
+def test_an_fmu_for_another_platform_is_described_with_its_obstacle(foreign_fmu, fmu_for_windows):
+    record = info(fmu_for_windows)
+    assert "no binary for this platform" in record["obstacle"]
+    assert "win64" in record["obstacle"]
+    assert record["variables"] == info(foreign_fmu("ball2"))["variables"]
+
+
+def test_an_fmu_for_another_platform_is_said_not_to_fly(fmu_for_windows):
+    assert "It cannot be flown here: " in said("fmu", "info", fmu_for_windows)
+    refused("fmu", "simulate", fmu_for_windows, "--stop-time", "1")
+
+
+def description(fmu: Path, columns: str) -> list[str]:
+    """Return the lines that describe an FMU on a screen of so many columns."""
+    return command("fmu", "info", fmu, columns=columns).stdout.splitlines()
+
+
+PIPE, NARROW = "", "80"
+
+
+@pytest.mark.parametrize("columns", [PIPE, NARROW], ids=["a pipe", "a narrow terminal"])
+def test_an_fmu_is_described_with_all_its_variables(foreign_fmu, columns):
+    fmu = foreign_fmu("ball2")
+    variables = info(fmu)["variables"]
+    lines = description(fmu, columns)
+    second_words = "".join(line.split(" ", 2)[1] for line in lines if " " in line)
+    assert variables
+    assert all(variable["name"] in second_words for variable in variables)
+
+
+@pytest.mark.parametrize("columns", [PIPE, NARROW], ids=["a pipe", "a narrow terminal"])
+def test_an_fmu_is_described_without_cuts_behind_its_whole_path(foreign_fmu, columns):
+    fmu = foreign_fmu("ball2")
+    first, *others = description(fmu, columns)
+    assert str(fmu) in first
+    assert "…" not in first + "".join(others)
+
+
+def test_the_description_of_an_fmu_fits_into_a_narrow_terminal(foreign_fmu):
+    _, *lines = description(foreign_fmu("ball2"), NARROW)
+    assert max(map(len, lines)) <= 80
 
 
 def test_the_items_of_an_enumeration_are_shown(foreign_fmu):
@@ -260,93 +433,3 @@ def test_from_a_script_to_a_library(tmp_path):
     ):
         assert words in refused(*sample, *extra)
         assert out.read_bytes() == content
-
-
-END = "</ssm:ParameterMapping>"
-
-
-@pytest.fixture(scope="module")
-def system(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The heat exchanger as an SSP file."""
-    place = tmp_path_factory.mktemp("system") / "x.ssp"
-    assert "x.ssp: " in said("ssp", "export", heat_exchanger / "fouling.toml", "--out", place)
-    return place
-
-
-def mapped(*entries: tuple[str, str]) -> tuple[str, str]:
-    """What adds entries, sources and targets, to the mapping of parameters."""
-    texts = (f'<ssm:MappingEntry source="{one}" target="heat_exchanger.{other}" />' for one, other in entries)
-    return END, "".join(texts) + END
-
-
-def test_a_system_is_checked_simulated_as_it_lies_there_and_flown(heat_exchanger, system, tmp_path):
-    """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
-    text = said("ssp", "check", system)
-    assert "no problem found; 7 connections, 2 parameters" in text
-    assert "evaluated in the order heat_exchanger (HeatExchanger)" in text
-    table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
-    simulate = ("ssp", "simulate", system, "--stop-time", "3", "--step-size", "1", "--in-process")
-    assert "3 steps to t = 3 s, every 1 s." in said(*simulate, "--out", table, "--plot", picture)
-    assert picture.read_text(encoding="utf-8").startswith("<?xml")
-    rows = np.genfromtxt(table, delimiter=",", names=True)
-    np.testing.assert_allclose(rows["time"], [0.0, 1.0, 2.0, 3.0])
-    assert rows["outlet"][-1] == pytest.approx(20.0 + 60.0 * -np.expm1(-6100.0 / 4186.0), rel=1e-14)
-    for number, name in enumerate(("conductance", "heat_exchanger.conductance")):
-        again = tmp_path / f"{number}.nc"
-        said(*simulate, "--set", "mass_flow=0.5", "--set", f"{name}=5000", "--out", again)
-        with xr.open_dataset(again, engine="h5netcdf") as data:
-            outlet = float(data["observation"].sel(observation_name="outlet")[-1])
-            assert data.attrs["fmu"] == "x.ssp"
-        assert outlet == pytest.approx(20.0 + 60.0 * -np.expm1(-5000.0 / (4186.0 * 0.5)), rel=1e-14)
-    assert "no parameter or input" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
-    asked = "asks for linear interpolation of inputs, but no component"
-    assert asked in refused(*simulate, "--interpolation", "linear")
-    out = tmp_path / "run"
-    options = "--out", out, "--in-process", "--no-report", "-q"
-    said("run", system, "--scenario", heat_exchanger / "fouling.toml", *options)
-    assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
-    assert (out / "csv" / "observed.csv").is_file()
-
-
-def test_what_nothing_takes_is_a_warning_and_not_flown(heat_exchanger, system, tmp_path):
-    """The nearest name is said; what another entry gives is not missed."""
-    file = edited(system, tmp_path / "more.ssp", mapped(("conductance", "baffle")))
-    named = f"{file} sets parameters that nothing takes: heat_exchanger.baffle; correct"
-    for words in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
-        assert f"warning: {named}" in " ".join(said("ssp", *words).split())
-    assert json.loads(said("ssp", "check", file, "--json"))["unused"] == ["heat_exchanger.baffle"]
-    more = mapped(("conductance", "conductanse"), ("cold", "wall_temperature"))
-    file = edited(system, tmp_path / "misspelt.ssp", more)
-    meant = "heat_exchanger.conductanse (did you mean 'heat_exchanger.conductance'?)"
-    named = f"{file} sets parameters that nothing takes: {meant}"
-    assert f"warning: {named}" in " ".join(said("ssp", "check", file).split())
-    out = tmp_path / "run"
-    assert named in refused("run", file, "--scenario", heat_exchanger / "fouling.toml", "--out", out, "-q")
-    assert not out.exists()
-
-
-def test_the_words_of_ssp_2_are_read(system, tmp_path):
-    """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
-    meta = '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />'
-    words = ('version="1.0" name=', 'version="2.0" name='), ("</ssd:SystemS", f"{meta}</ssd:SystemS")
-    numbers = ("ssc:Real", "ssc:Float64"), ("ssv:Real", "ssv:Float64")
-    newer = edited(system, tmp_path / "newer.ssp", *words, *numbers)
-    tables = [tmp_path / "0.csv", tmp_path / "1.csv"]
-    for file, table in zip((system, newer), tables, strict=True):
-        said("ssp", "simulate", file, "--out", table, "--step-size", "0.25", "--in-process")
-    assert tables[0].read_bytes() == tables[1].read_bytes()
-    for what, by, sentence in (
-        ("<ssc:Float64 />", '<ssc:Float64 /><ssd:Dimension size="2" />', "has an array"),
-        ("<ssc:Float64 />", "<ssc:Clock />", "has a clock"),
-        ('kind="parameter"', 'kind="structuralParameter"', "a connector of the kind structuralParameter"),
-        (' source="resources/heat_exchanger.fmu"', "", "'heat_exchanger' without a source"),
-    ):
-        bad = edited(newer, tmp_path / "bad.ssp", (what, by))
-        assert sentence in refused("ssp", "simulate", bad)
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("wing")
-def test_the_wing_of_a_design(tmp_path):
-    said("ssp", "export", "uav_wing", "--out", tmp_path / "wing.ssp")
-    assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", tmp_path / "wing.ssp")

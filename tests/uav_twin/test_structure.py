@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -36,54 +37,115 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "bar.toml"
 
 
-def test_info_gives_as_data_what_a_structure_is(file):
-    record = json.loads(said("structure", "info", file, "--modes", "2", "--quiet", "--json"))
-    assert record["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
-    assert record["centre_of_gravity"] == pytest.approx([50, 5, 5])
-    assert (record["unknowns"], record["held"], record["loose_nodes"]) == (12, 12, [9])
-    # A bar under 20 MPa: 100 microstrain, 0.01 mm.
-    (load,) = record["loads"]
+@pytest.fixture(scope="module")
+def bar(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the command says as data of a bar under 20 MPa."""
+    folder = tmp_path_factory.mktemp("bar")
+    for name in ("bar.inp", "bar.toml"):
+        (folder / name).write_text(INPUTS.text(name))
+    words = ("structure", "info", folder / "bar.toml", "--modes", "2", "--quiet", "--json")
+    record: dict[str, Any] = json.loads(said(*words))
+    return record
+
+
+def test_info_gives_mass_and_centre_of_gravity(bar):
+    assert bar["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
+    assert bar["centre_of_gravity"] == pytest.approx([50, 5, 5])
+
+
+def test_info_counts_unknowns_and_modes(bar):
+    assert (bar["unknowns"], bar["held"], bar["loose_nodes"]) == (12, 12, [9])
+    assert len(bar["frequencies"]) == 2
+
+
+def test_info_gives_strains_and_outputs_of_loads(bar):
+    """The bar has 100 microstrain and is 0.01 mm longer."""
+    (load,) = bar["loads"]
     assert load["strain"]["top"] == pytest.approx(1e-4, rel=1e-9)
     assert load["output"]["end"] == pytest.approx(1e-5, rel=1e-9)
-    assert len(record["frequencies"]) == 2
+
+
+def test_a_structure_without_mass_has_no_modes(file):
     file.write_text(INPUTS.text("bar.toml", ("density = 7800", "density = 0")))
     assert "No modes: nothing has mass." in said("structure", "info", file, "--modes", "3")
+
+
+def test_a_set_that_the_mesh_does_not_have_is_refused_with_those_that_it_has(file):
     file.write_text(INPUTS.text("bar.toml", ('"ROOT"', '"WALL"')))
-    assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in refused("structure", "info", file)
+    sentence = refused("structure", "info", file)
+    assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in sentence
 
 
-@pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
-def test_verify_compares_with_calculix(file, tmp_path, monkeypatch):
+CALCULIX_IS_THERE = pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
+
+
+@CALCULIX_IS_THERE
+def test_verify_compares_with_calculix(file, tmp_path):
     out = tmp_path / "jobs"
     text = said("structure", "verify", file, "--modes", "2", "--out", out)
-    assert text.count("kept") == 4
-    assert "BROKEN" not in text
+    assert (text.count("kept"), text.count("BROKEN")) == (4, 0)
     assert (out / "static.inp").is_file()
     assert "is not an empty folder" in refused("structure", "verify", file, "--out", out)
-    told = json.loads(said("structure", "verify", file, "--modes", "2", "--json", "--quiet"))
-    assert told["passed"] is True
+
+
+@CALCULIX_IS_THERE
+def test_verify_prints_its_verdict_as_data(file):
+    record = json.loads(said("structure", "verify", file, "--modes", "2", "--json", "--quiet"))
+    assert record["passed"] is True
+
+
+@CALCULIX_IS_THERE
+def test_verify_names_the_checks_that_broke_their_limit(file, monkeypatch):
     monkeypatch.setattr("uav_twin.structure.FREQUENCY_LIMIT", 0.0)
-    found = command("structure", "verify", file, "--modes", "2")
-    assert "BROKEN" in found.stdout
-    assert found.returncode == 1
-    assert found.stderr.strip().endswith("1 of 4 checks broke their limit: 2 modes, frequencies.")
+    done = command("structure", "verify", file, "--modes", "2")
+    assert done.returncode == 1
+    assert "BROKEN" in done.stdout
+    assert done.stderr.strip().endswith("1 of 4 checks broke their limit: 2 modes, frequencies.")
 
 
-def test_a_structure_is_reduced_and_compared(write_beam, tmp_path, monkeypatch):
-    """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    file = str(write_beam(tmp_path))
-    record = json.loads(said("structure", "reduce", file, "--json", "--states", "4", "--quiet"))
-    assert record["ranges"]["z1"] == [0.0, 0.8]
-    errors = record["errors"]  # the bound holds, nearly as asked for, and tells the error within a few times
-    assert max(errors["strain"], errors["displacement"]) < errors["bound"] < min(1e-3, 15 * errors["strain"])
+class ReducedBeam:
+    """A beam that the command reduces and compares in four states, in a cache of its own."""
+
+    def __init__(self, file: Path, folder: Path) -> None:
+        self.file = file
+        self.cache = folder / "cache"
+        self.record = json.loads(self.reduce("--json", "--states", "4", "--quiet"))
+        (self.model,) = (self.cache / "uav-twin").glob("structure-*.npz")
+
+    def reduce(self, *options: str) -> str:
+        """Return what the command prints of the reduction."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_CACHE_HOME", str(self.cache))
+            return said("structure", "reduce", self.file, *options)
+
+
+@pytest.fixture(scope="module")
+def reduced_beam(write_beam, tmp_path_factory) -> ReducedBeam:
+    folder = tmp_path_factory.mktemp("reduced")
+    return ReducedBeam(write_beam(folder), folder)
+
+
+def test_a_reduction_says_its_ranges(reduced_beam):
+    assert reduced_beam.record["ranges"]["z1"] == [0.0, 0.8]
+
+
+def test_the_errors_of_a_reduction_lie_within_its_bound(reduced_beam):
+    """The bound is nearly the one asked for, and tells the error within a few times."""
+    errors = reduced_beam.record["errors"]
+    largest_error = max(errors["strain"], errors["displacement"])
+    assert largest_error < errors["bound"] < min(1e-3, 15 * errors["strain"])
     assert (errors["broken"], errors["states"]) == (0, 4)
     assert errors["frequency"] < 2e-5
-    kept = list((tmp_path / "cache" / "uav-twin").glob("structure-*.npz"))
-    before = kept[0].stat().st_mtime_ns
-    assert "load_factor" in said("structure", "reduce", file, "--states", "0")
-    assert kept[0].stat().st_mtime_ns == before
-    write_beam(tmp_path, {'name = "z1",': 'name = "z1", largest_loss = 2,'})
+
+
+def test_a_second_reduction_finds_the_model_in_the_cache(reduced_beam):
+    time_before = reduced_beam.model.stat().st_mtime_ns
+    assert "load_factor" in reduced_beam.reduce("--states", "0")
+    assert reduced_beam.model.stat().st_mtime_ns == time_before
+
+
+def test_a_loss_of_more_than_all_is_refused(write_beam, tmp_path):
+    file = write_beam(tmp_path, {'name = "z1",': 'name = "z1", largest_loss = 2,'})
     assert "largest_loss" in refused("structure", "reduce", file, code=None)
 
 
@@ -111,39 +173,76 @@ def matrices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_calculix
-def test_every_command_takes_it(matrices, tmp_path):
-    """Info, reduce and fmu as of a mesh; FMPy finds nothing; what needs a mesh says so."""
-    info = said("structure", "info", matrices, "--modes", "2")
-    assert "725 free" in info
-    assert "whole.sti, whole.mas, whole.dof" in info
+def test_info_takes_matrices(matrices):
+    text = said("structure", "info", matrices, "--modes", "2")
+    assert "725 free" in text
+    assert "whole.sti, whole.mas, whole.dof" in text
+
+
+@needs_calculix
+def test_reduce_takes_matrices(matrices):
     said("structure", "reduce", matrices, "--states", "2")
-    for kind in ("python", "compiled"):
-        target = tmp_path / f"{kind}.fmu"
-        said("structure", "fmu", matrices, "--out", target, "--kind", kind)
-        assert validate_fmu(str(target)) == []
+
+
+@needs_calculix
+@pytest.mark.parametrize("kind", ["python", "compiled"])
+def test_matrices_become_an_fmu_in_which_fmpy_finds_nothing(matrices, tmp_path, kind):
+    target = tmp_path / f"{kind}.fmu"
+    said("structure", "fmu", matrices, "--out", target, "--kind", kind)
+    assert validate_fmu(str(target)) == []
+
+
+@needs_calculix
+def test_both_commands_build_the_same_fmu_of_matrices(matrices, tmp_path):
+    said("structure", "fmu", matrices, "--out", tmp_path / "a.fmu", "--kind", "python")
     said("fmu", "build", "--design", matrices, "--out", tmp_path / "b.fmu")
-    assert (tmp_path / "b.fmu").read_bytes() == (tmp_path / "python.fmu").read_bytes()
+    assert (tmp_path / "b.fmu").read_bytes() == (tmp_path / "a.fmu").read_bytes()
+
+
+@needs_calculix
+def test_a_command_that_needs_a_mesh_refuses_matrices(matrices, tmp_path):
     for words in (("verify", matrices), ("field", matrices, "--out", tmp_path / "field.vtu")):
         assert "is a structure from matrices: without a mesh" in refused("structure", *words)
 
 
-@needs_calculix
-def test_a_twin_finds_the_patch_that_calculix_weakened(matrices, tmp_path):
-    """The strains flown are CalculiX' with that patch."""
+LOSS = 0.4
+"""Loss of stiffness of the patch in the mission."""
+
+
+@pytest.fixture(scope="module")
+def skin_run(matrices: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the mission of the skin from matrices."""
     scenario = parse_scenario(INPUTS.table("skin_mission.toml"), "mission")
     loaded = LoadedScenario(scenario, matrices.with_name("mission.toml"), "0" * 64)
-    folder = fly(loaded, tmp_path / "run", report=False).folder
-    tree = open_run(folder)
-    assert tree["truth"]["state"].values[-1] == pytest.approx([0.4])
-    deck = stiffened_skin(skin=1.03, patch=1.03 * (1.0 - 0.4))
-    (found,) = solved(deck, tmp_path / "calculix", [(CORNER, (0.0, 0.5, 1.0))])  # by 1 N
-    strain = np.array([float(found[last][0] - found[first][0]) / 100.0 for first, last in (PATCH, OTHER)])
-    wanted, flown = float(tree["observed"]["push"][-1]) * strain, tree["truth"]["strain"].values[-1]
-    np.testing.assert_allclose(flown, wanted, rtol=0.0, atol=1e-3 * np.abs(wanted).max())
-    assert tree["filtered"]["mean"].values[-1] == pytest.approx([0.4], abs=0.1)
-    copies = {path.name for path in (folder / "asset" / "flown").iterdir()}
+    return fly(loaded, tmp_path_factory.mktemp("skin_run") / "run", report=False).folder
+
+
+@needs_calculix
+def test_a_twin_finds_the_patch_that_calculix_weakened(skin_run):
+    tree = open_run(skin_run)
+    assert tree["truth"]["state"].values[-1] == pytest.approx([LOSS])
+    assert tree["filtered"]["mean"].values[-1] == pytest.approx([LOSS], abs=0.1)
+
+
+@needs_calculix
+def test_the_strains_flown_are_those_of_calculix_with_the_weakened_patch(skin_run, tmp_path):
+    tree = open_run(skin_run)
+    deck = stiffened_skin(skin=1.03, patch=1.03 * (1.0 - LOSS))
+    unit_force = [(CORNER, (0.0, 0.5, 1.0))]
+    (displacement,) = solved(deck, tmp_path / "calculix", unit_force)
+    strain_by_newton = np.array(
+        [float(displacement[last][0] - displacement[first][0]) / 100.0 for first, last in (PATCH, OTHER)]
+    )
+    expected = float(tree["observed"]["push"][-1]) * strain_by_newton
+    strain = tree["truth"]["strain"].values[-1]
+    np.testing.assert_allclose(strain, expected, rtol=0.0, atol=1e-3 * np.abs(expected).max())
+
+
+@needs_calculix
+def test_a_run_keeps_the_matrices_that_it_flew(skin_run):
+    copies = {path.name for path in (skin_run / "asset" / "flown").iterdir()}
     assert {"whole.sti", "whole.mas", "whole.dof", "patch_half.sti", "skin_half.sti"} <= copies
-    assert not (folder / "structure.vtu").exists()
+    assert not (skin_run / "structure.vtu").exists()
 
 
 TRUTH = {"e": 0.96}
@@ -178,44 +277,89 @@ def mission(**calibration: object) -> LoadedScenario:
     return changed_scenario("bracket", changes | {"truth": {"gains": []}, "calibration": calibration})
 
 
-def test_the_twin_flies_with_it(calibrated, tmp_path, monkeypatch):
-    """The campaign tells the modulus and not the mass, which follows it; what flies stands at the means."""
-    found, told, given = load_calibration(calibrated), noted(monkeypatch), Overrides(calibration=calibrated)
-    assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
-    assert found.explained is True
-    assert any("does not tell pump" in sentence for sentence in found.findings)
-    folder = fly(mission(), tmp_path / "run", given, report=False).folder
-    wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
-    assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
-    believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
-    assert any(note.startswith(wanted_words) and note.endswith(believed) for note in told)
-    tree = open_run(folder)
-    draws = tree["calibration"]["draw_value"].values
-    assert set(draws) <= set(found.draws_of("e"))
-    np.testing.assert_allclose(draws.mean(), found.mean("e"), atol=0.1 * found.standard_deviation("e"))
-    assert (folder / "asset/calibration.nc").read_bytes() == calibrated.read_bytes()
-    full = load_and_assemble(structure_files()["bracket"])
-    solution = Factorisation(full.stiffness({"e": found.mean("e")}, {})).solve(full.load("weight", 1.0))
-    wanted = float(tree["observed"]["load_factor"][0]) * (full.gauge_output @ solution)
-    np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
+class CalibratedMission:
+    """A bracket that is calibrated, and a mission with the file of its calibration."""
 
-    told.clear()
-    with begin_watch(
-        resolve_scenario(mission(), given), mission().file, tmp_path / "watch", SilentProgress()
-    ):
+    def __init__(self, file: Path, folder: Path) -> None:
+        self.file = file
+        self.calibration = load_calibration(file)
+        self.options = Overrides(calibration=file)
+        with pytest.MonkeyPatch.context() as patch:
+            self.notes = noted(patch)
+            self.folder = fly(mission(), folder / "run", self.options, report=False).folder
+        self.tree = open_run(self.folder)
+        self.full = load_and_assemble(structure_files()["bracket"])
+        hash_begin = self.calibration.design_hash[:12]
+        self.believed = f"The twin believes the design that was calibrated, {hash_begin}."
+
+    def strains_by_load_factor(self, young_modulus_factor: float) -> np.ndarray:
+        """Return the strains that the full model shows under a load factor of 1."""
+        stiffness = self.full.stiffness({"e": young_modulus_factor}, {})
+        solution = Factorisation(stiffness).solve(self.full.load("weight", 1.0))
+        return np.asarray(self.full.gauge_output @ solution)
+
+
+@pytest.fixture(scope="module")
+def calibrated_mission(calibrated: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibratedMission:
+    return CalibratedMission(calibrated, tmp_path_factory.mktemp("calibrated"))
+
+
+def test_a_campaign_tells_the_modulus_and_not_the_mass(calibrated_mission):
+    """The mass of the pump follows the modulus."""
+    calibration = calibrated_mission.calibration
+    error = abs(calibration.mean("e") - TRUTH["e"])
+    assert error < 3.0 * calibration.standard_deviation("e") < 0.03
+    assert calibration.explained is True
+    assert any("does not tell pump" in sentence for sentence in calibration.findings)
+
+
+def test_a_mission_says_what_was_calibrated_what_flies_and_what_is_believed(calibrated_mission):
+    calibration, file = calibrated_mission.calibration, calibrated_mission.file
+    beginning = (
+        f"Calibrated was the model {calibration.model}; flown is the FMU of the structure bracket, and"
+    )
+    end = calibrated_mission.believed
+    assert calibration.design_hash == packed_design_hash(file.parents[1] / "bracket.fmu")
+    assert any(note.startswith(beginning) and note.endswith(end) for note in calibrated_mission.notes)
+
+
+def test_a_mission_draws_from_its_calibration(calibrated_mission):
+    calibration = calibrated_mission.calibration
+    draws = calibrated_mission.tree["calibration"]["draw_value"].values
+    tolerance = 0.1 * calibration.standard_deviation("e")
+    copy = calibrated_mission.folder / "asset/calibration.nc"
+    assert set(draws) <= set(calibration.draws_of("e"))
+    np.testing.assert_allclose(draws.mean(), calibration.mean("e"), atol=tolerance)
+    assert copy.read_bytes() == calibrated_mission.file.read_bytes()
+
+
+def test_what_flies_stands_at_the_means_of_the_calibration(calibrated_mission):
+    tree = calibrated_mission.tree
+    strains = calibrated_mission.strains_by_load_factor(calibrated_mission.calibration.mean("e"))
+    expected = float(tree["observed"]["load_factor"][0]) * strains
+    np.testing.assert_allclose(tree["truth"]["strain"].values[0], expected, rtol=5e-4)
+
+
+def test_a_watch_says_what_is_believed(calibrated_mission, tmp_path, monkeypatch):
+    notes = noted(monkeypatch)
+    scenario = resolve_scenario(mission(), calibrated_mission.options)
+    with begin_watch(scenario, mission().file, tmp_path / "watch", SilentProgress()):
         pass
-    assert any("flown is the watched asset" in note and note.endswith(believed) for note in told)
+    believed = calibrated_mission.believed
+    assert any("flown is the watched asset" in note and note.endswith(believed) for note in notes)
 
+
+def test_the_mass_that_was_calibrated_beside_the_modulus_follows_its_draws(calibrated_mission, tmp_path):
+    """The pump bends the bracket with nearly all of the load."""
     scenario = mission(draws=3).scenario
-    source = prepared(mission(draws=3), tmp_path, given)
-    drawn = source.draws(scenario.mission.seed)
-    assert dict(drawn.others).keys() == {"pump"}
-    table = source.observation_table(drawn, build_graphical_model(scenario))
-    row = {"e": float(drawn.values[1])}
-    solution = Factorisation(full.stiffness(row, {})).solve(full.load("weight", 1.0))
-    ratio = table[1, 0, 0] / (1.5 * (full.gauge_output @ solution))
-    arm = (drawn.others["pump"][1] - 2.5) / 2.5  # the pump bends the bracket with nearly all of the load
-    np.testing.assert_allclose(ratio, 1.0 + arm, rtol=1e-3)
+    source = prepared(mission(draws=3), tmp_path, calibrated_mission.options)
+    draws = source.draws(scenario.mission.seed)
+    table = source.observation_table(draws, build_graphical_model(scenario))
+    strains = calibrated_mission.strains_by_load_factor(float(draws.values[1]))
+    ratio = table[1, 0, 0] / (1.5 * strains)
+    relative_mass = (draws.others["pump"][1] - 2.5) / 2.5
+    assert dict(draws.others).keys() == {"pump"}
+    np.testing.assert_allclose(ratio, 1.0 + relative_mass, rtol=1e-3)
 
 
 def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
