@@ -5,7 +5,7 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,54 +73,93 @@ def write_former_store(whole: Path, folder: Path) -> None:
     former.to_zarr(folder / STORE_NAME, group="growing_damage", consolidated=False, zarr_format=3)
 
 
-def test_a_store_of_an_earlier_version_is_read_with_one_sentence(whole, tmp_path):
-    folder = shutil.copytree(whole, tmp_path / "former")
+@pytest.fixture(scope="module")
+def present_group(whole: Path) -> xr.DataTree:
+    """The group of the flown fleet."""
+    return open_fleet(whole)["growing_damage"]
+
+
+@pytest.fixture(scope="module")
+def former_group(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> xr.DataTree:
+    """The same group, read from a store of an earlier version; a second warning would be an error."""
+    folder = shutil.copytree(whole, tmp_path_factory.mktemp("former") / "fleet")
     write_former_store(whole, folder)
-    said = r"fleet\.zarr: `turn` is now called `step`, `factor` is now called `region`"
-    with pytest.warns(FormerNameWarning, match=said):
+    sentence = r"fleet\.zarr: `turn` is now called `step`, `factor` is now called `region`"
+    with pytest.warns(FormerNameWarning, match=sentence):
         group = open_fleet(folder)["growing_damage"]
-    assert group.equals(open_fleet(folder)["growing_damage"])  # a second warning were an error
-    present = open_fleet(whole)["growing_damage"]
-    assert group.equals(present)
-    for node in present.subtree:
+    assert group.equals(open_fleet(folder)["growing_damage"])
+    return group
+
+
+def test_a_store_of_an_earlier_version_is_read_with_one_sentence(former_group, present_group):
+    assert former_group.equals(present_group)
+    assert group_figures(former_group) == group_figures(present_group)
+
+
+def test_variables_of_a_store_of_an_earlier_version_have_their_present_attributes(
+    former_group, present_group
+):
+    for node in present_group.subtree:
+        former = former_group[node.relative_to(present_group)]
         for name, variable in node.variables.items():
-            assert group[node.relative_to(present)][name].attrs == variable.attrs, name
-    assert group_figures(group) == group_figures(present)
+            assert former[name].attrs == variable.attrs, name
 
 
-def test_a_fleet_is_chosen_from_by_the_labels_of_a_run(library_file, whole, tmp_path):
-    fleet = open_fleet(whole)
-    first_region = fleet.sel(region="z1")["growing_damage"]
-    group = fleet["growing_damage"]
-    for path in ("filtered/mean", "filtered/standard_deviation", "truth/state"):
-        assert first_region[path].dims == ("twin", "step")
-        assert np.array_equal(first_region[path], group[path].values[..., 0])
-    assert group.sel(twin="seed-3", step=5)["observed"].sel(sensor=12)["strain"].shape == ()
-    assert group["filtered"].sel(region="z2")["mean"].equals(group["filtered/mean"].sel(region="z2"))
-    last_belief = group["filtered/last_probability"]
-    assert last_belief.coords["z1"].dims == last_belief.coords["z2"].dims == ("state",)
-    run = open_run(new_run("growing_damage", tmp_path / "one", {"strain_library": library_file}).folder)
-    for tree in (run, fleet):  # the whole, and each group that has regions
+@pytest.mark.parametrize("path", ["filtered/mean", "filtered/standard_deviation", "truth/state"])
+def test_a_region_of_a_fleet_is_chosen_by_its_label(whole, present_group, path):
+    first_region = open_fleet(whole).sel(region="z1")["growing_damage"][path]
+    assert first_region.dims == ("twin", "step")
+    assert np.array_equal(first_region, present_group[path].values[..., 0])
+
+
+def test_twins_steps_and_sensors_of_a_fleet_are_chosen_by_their_labels(present_group):
+    observed = present_group.sel(twin="seed-3", step=5)["observed"]
+    second_region = present_group["filtered"].sel(region="z2")
+    assert observed.sel(sensor=12)["strain"].shape == ()
+    assert second_region["mean"].equals(present_group["filtered/mean"].sel(region="z2"))
+
+
+def test_states_of_a_belief_have_the_levels_of_their_regions(present_group):
+    levels = present_group["filtered/last_probability"].coords
+    assert levels["z1"].dims == levels["z2"].dims == ("state",)
+
+
+def test_a_run_is_chosen_from_by_the_labels_of_a_fleet(library_file, whole, tmp_path):
+    options = {"strain_library": library_file}
+    run = open_run(new_run("growing_damage", tmp_path / "one", options).folder)
+    for tree in (run, open_fleet(whole)):
         assert tree.sel(region="z1").sizes.get("region") is None
     for name in ("filtered", "smoothed", "predicted", "truth"):
         assert "region" not in run[name].sel(region="z1").dims
 
 
-def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_path):
-    given = Overrides(strain_library=library_file, seed=7)
-    group = open_fleet(str(whole))["growing_damage"]
-    tree = open_run(new_run("growing_damage", tmp_path / "one", given, report=False).folder)
-    row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
-    for path in ("observed/strain", "observed/control_index", "filtered/mean", "truth/state"):
-        ours, single = group[path], tree[path]
-        assert np.array_equal(ours.values[row], single.values.astype(ours.dtype)), path
-        assert ours.dims == ("twin", *single.dims)
-        assert ours.attrs["units"] == single.attrs["units"]
-        for name, coordinate in single.coords.items():
-            assert np.array_equal(ours.coords[name], coordinate), name
-    figures, study = group_figures(group), Outcomes.from_store(group)
-    names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
-    assert [figures[name] for name in names] == [study.log_evidence, study.rms[1], study.bias[1]]
+@pytest.fixture(scope="module")
+def single_run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> xr.DataTree:
+    """The store of a run with a seed of the fleet."""
+    options = Overrides(strain_library=library_file, seed=7)
+    folder = tmp_path_factory.mktemp("single") / "one"
+    return open_run(new_run("growing_damage", folder, options, report=False).folder)
+
+
+@pytest.mark.parametrize(
+    "path", ["observed/strain", "observed/control_index", "filtered/mean", "truth/state"]
+)
+def test_a_twin_of_an_ensemble_flies_what_a_run_flies(present_group, single_run, path):
+    row = present_group["seed"].values.tolist().index(int(single_run.attrs["seed"]))
+    of_fleet, of_run = present_group[path], single_run[path]
+    assert np.array_equal(of_fleet.values[row], of_run.values.astype(of_fleet.dtype))
+    assert of_fleet.dims == ("twin", *of_run.dims)
+    assert of_fleet.attrs["units"] == of_run.attrs["units"]
+    for name, coordinate in of_run.coords.items():
+        assert np.array_equal(of_fleet.coords[name], coordinate), name
+
+
+def test_figures_of_a_fleet_are_those_of_its_store(present_group):
+    figures = group_figures(present_group)
+    outcomes = Outcomes.from_store(present_group)
+    assert figures["log evidence of a step"] == outcomes.log_evidence
+    assert figures["filtered rms error of z2"] == outcomes.rms[1]
+    assert figures["bias of z2"] == outcomes.bias[1]
 
 
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
@@ -132,66 +171,120 @@ def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
     assert len(np.unique(first["truth/state"].values[:, -1], axis=0)) > 1
 
 
-def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monkeypatch):
-    fleet, cut, append = growing(library_file), tmp_path / "cut", JournalFile.append
+def kill_after_second_chunk(monkeypatch: pytest.MonkeyPatch, fleet: Fleet, folder: Path) -> None:
+    """Fly a fleet that dies when its second chunk is written, and its journal does not know yet."""
+    append = JournalFile.append
 
     def dying(self: JournalFile, record: Any) -> None:
-        if record.get("rows") == [4, 8]:  # its chunk is written, and the journal does not know
+        if record.get("rows") == [4, 8]:
             raise KeyboardInterrupt
         append(self, record)
 
     with monkeypatch.context() as patch:
         patch.setattr(JournalFile, "append", dying)
         with pytest.raises(KeyboardInterrupt):
-            fly_fleet(fleet, cut)
-    assert open_fleet(cut)["growing_damage"]["status"].values.tolist() == [1] * 8 + [0] * 2
+            fly_fleet(fleet, folder)
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Return the names of all files of a folder, relative to it."""
+    return sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_killed_fleet_keeps_what_it_has_flown(library_file, tmp_path, monkeypatch):
+    kill_after_second_chunk(monkeypatch, growing(library_file), tmp_path / "cut")
+    status = open_fleet(tmp_path / "cut")["growing_damage"]["status"].values
+    assert status.tolist() == [1] * 8 + [0] * 2
+
+
+def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monkeypatch):
+    """The journal has times and is no result."""
+    fleet, cut = growing(library_file), tmp_path / "cut"
+    kill_after_second_chunk(monkeypatch, fleet, cut)
     with (cut / "journal.jsonl").open("a") as file:
         file.write(64 * "0" + ' {"shard": 2, "fail')  # a line that the kill cut off
-    outcome = fly_fleet(fleet, cut)
-    assert (outcome.shards_kept, outcome.shards_flown) == (1, 2)
-    kept = [  # the journal keeps times and is no result
-        sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-        for folder in (cut, whole)
-    ]
-    assert kept[0] == kept[1]
-    results = [str(path) for path in kept[0] if path.parts[0] in ("fleet.zarr", "groups", "fleet.json")]
+    first = fly_fleet(fleet, cut)
+    second = fly_fleet(fleet, cut)
+    assert (first.shards_kept, first.shards_flown, second.shards_flown) == (1, 2, 0)
+    files = files_of(cut)
+    results = [str(path) for path in files if path.parts[0] in ("fleet.zarr", "groups", "fleet.json")]
+    assert files == files_of(whole)
     assert len(results) > 10
     check_same(cut, whole, *results)
-    assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
-    library_file, tmp_path, monkeypatch
-):
-    fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
-    monkeypatch.setattr("twin_master.fleet.engine.CONNECTING", 0.2)
-    with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        fly_fleet(fleet, folder, Engine(cluster="tcp://127.0.0.1:9"))
+@pytest.fixture(scope="module")
+def small_fleet(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fleet, Path]:
+    """A flown fleet of two twins and its folder, which no test changes."""
+    fleet = growing(library_file, count=2)
+    folder = tmp_path_factory.mktemp("small") / "fleet"
     assert fly_fleet(fleet, folder).shards_flown == 1
+    return fleet, folder
+
+
+@pytest.fixture
+def folder_of_another_kind(tmp_path: Path) -> Path:
+    """A folder with a file of the user's."""
+    folder = tmp_path / "other"
+    folder.mkdir()
+    (folder / "thesis.txt").touch()
+    return folder
+
+
+def test_a_cluster_that_does_not_answer_is_named(library_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin_master.fleet.engine.CONNECTING", 0.2)
+    engine = Engine(cluster="tcp://127.0.0.1:9")
+    with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        fly_fleet(growing(library_file, count=2), tmp_path / "fleet", engine)
+
+
+def test_another_fleet_is_flown_into_a_folder_on_demand_only(small_fleet, library_file, tmp_path):
+    folder = shutil.copytree(small_fleet[1], tmp_path / "fleet")
+    other = growing(library_file, count=3)
     with pytest.raises(RunFolderError, match="another fleet"):
         fly_fleet(other, folder)
+    assert fly_fleet(other, folder, replace_old=True).twins == 3
+
+
+def test_a_fleet_of_other_versions_does_not_go_on(small_fleet, tmp_path):
+    fleet, flown_folder = small_fleet
+    folder = shutil.copytree(flown_folder, tmp_path / "fleet")
     record = json.loads((folder / "config.json").read_text())
     record["provenance"]["versions"]["numpy"] = "0.1"
     written(folder, json.dumps(record), name="config.json")
     with pytest.raises(NotResumableError, match="numpy"):
         fly_fleet(fleet, folder)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "thesis.txt").touch()
+
+
+def test_a_fleet_that_is_not_there_is_named(tmp_path):
     with pytest.raises(RunFolderError, match="there is no folder"):
         open_fleet(tmp_path / "nowhere")
-    for opened in (open_fleet, learn_fleet, write_fleet_report):
-        with pytest.raises(RunFolderError, match="not the folder of a fleet"):
-            opened(tmp_path / "other")
+
+
+@pytest.mark.parametrize("reader", [open_fleet, learn_fleet, write_fleet_report])
+def test_a_folder_of_another_kind_is_refused(folder_of_another_kind, reader):
+    with pytest.raises(RunFolderError, match="not the folder of a fleet"):
+        reader(folder_of_another_kind)
+
+
+def test_a_folder_of_another_kind_is_not_replaced(folder_of_another_kind, library_file):
     with pytest.raises(RunFolderError, match="not touched"):
-        fly_fleet(fleet, tmp_path / "other", replace_old=True)
-    assert fly_fleet(other, folder, replace_old=True).twins == 3
-    for lacking, sentence in (
-        ("distributed", r"needs distributed: pip install 'uav-twin\[fleet\]'\.$"),
-        ("zarr", "needs zarr: pip install"),
-    ):
-        monkeypatch.setitem(sys.modules, lacking, None)
-        with pytest.raises(FleetError, match=sentence):
-            fly_fleet(fleet, tmp_path / "none", Engine(2 if lacking == "distributed" else 0))
+        fly_fleet(growing(library_file, count=2), folder_of_another_kind, replace_old=True)
+
+
+@pytest.mark.parametrize(
+    ("package", "workers", "sentence"),
+    [
+        ("distributed", 2, r"needs distributed: pip install 'uav-twin\[fleet\]'\.$"),
+        ("zarr", 0, "needs zarr: pip install"),
+    ],
+)
+def test_a_fleet_without_a_package_that_it_needs_is_not_begun(
+    library_file, tmp_path, monkeypatch, package, workers, sentence
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(FleetError, match=sentence):
+        fly_fleet(growing(library_file, count=2), tmp_path / "none", Engine(workers))
     assert not (tmp_path / "none").exists()
 
 
@@ -209,22 +302,39 @@ def changed(file: Path, *changes: tuple[str, str], seed: int | None = None) -> F
     return load_fleet(written(file.parent, FLEET, *changes, name=file.name), seed=seed)
 
 
+def seeds_of(fleet: Fleet) -> list[int]:
+    return [member.seed for group in fleet.groups for member in group.members]
+
+
 def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file):
-    fleet, fewer = load_fleet(fleet_file), changed(fleet_file, ("count = 3", "count = 1"))
-    seeds, left = (
-        [member.seed for group in one.groups for member in group.members] for one in (fleet, fewer)
-    )
+    fleet = load_fleet(fleet_file)
+    fewer = changed(fleet_file, ("count = 3", "count = 1"))
+    seeds = seeds_of(fleet)
     assert len(set(seeds)) == 5
-    assert left == [seeds[0], *seeds[3:]]
-    assert [m.parameters for m in fewer.groups[1].members] == [m.parameters for m in fleet.groups[1].members]
-    assert changed(fleet_file, seed=6).groups[0].members[0].seed != seeds[0]
-    assert fleet.groups[1].scenarios[0].mission.steps == 9
-    assert fleet.groups[0].scenarios[0].mission.seed == 5
-    slow = ("steps = 9", 'true_probability = { "2g" = 0.0, "3g" = 0.0 }')
-    scenario = changed(fleet_file, slow).groups[1].scenarios[0]  # true rates may differ from those believed
+    assert seeds_of(fewer) == [seeds[0], *seeds[3:]]
+    assert seeds_of(changed(fleet_file, seed=6))[0] != seeds[0]
+
+
+def test_a_twin_has_its_parameters_whatever_else_flies(fleet_file):
+    south = load_fleet(fleet_file).groups[1]
+    south_beside_fewer = changed(fleet_file, ("count = 3", "count = 1")).groups[1]
+    parameters = [member.parameters for member in south.members]
+    assert [member.parameters for member in south_beside_fewer.members] == parameters
+
+
+def test_a_group_has_the_mission_of_its_table(fleet_file):
+    north, south = load_fleet(fleet_file).groups
+    assert south.scenarios[0].mission.steps == 9
+    assert north.scenarios[0].mission.seed == 5
+
+
+def test_true_rates_of_a_group_may_differ_from_those_believed(fleet_file):
+    sound = ("steps = 9", 'true_probability = { "2g" = 0.0, "3g" = 0.0 }')
+    as_believed = load_fleet(fleet_file).groups[1].scenarios[0]
+    scenario = changed(fleet_file, sound).groups[1].scenarios[0]
     assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
     assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
-    assert fleet.groups[1].scenarios[0].truth.probability == {}
+    assert as_believed.truth.probability == {}
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("fleet"))
@@ -233,24 +343,33 @@ def test_a_wrong_fleet_file_is_refused(fleet_file, old, new, sentence):
         changed(fleet_file, (old, new))
 
 
-def test_all_assets_that_cannot_fly_are_in_one_list_and_a_truth_beyond_the_model_is_refused(fleet_file):
+def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
     for name in ("a", "b"):
         (fleet_file.parent / f"{name}.fmu").write_bytes(b"no FMU")
+    out = fleet_file.parent / "out"
     fleet = changed(fleet_file, ("count = 3", 'fmus = "*.fmu"'), ("young_modulus_factor", "colour"))
     with pytest.raises(FleetError) as caught:
-        fly_fleet(fleet, fleet_file.parent / "out")
-    lines = str(caught.value).splitlines()
-    assert lines[0].startswith("3 of the assets cannot fly")
-    assert [line.split(":")[0] for line in lines[1:]] == ["north a", "north b", "south"]
-    soft = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
-    with pytest.raises(FleetError, match=soft):
-        fly_fleet(changed(fleet_file, ("mean = 1.0,", "mean = 1.3,")), fleet_file.parent / "out")
-    loss = '[[truth.gains]]\nstate = "z1"\nfirst_step = 0\nlast_step = 49\ngain_percent = 5\n\n[truth.noise]'
+        fly_fleet(fleet, out)
+    head, *lines = str(caught.value).splitlines()
+    assert head.startswith("3 of the assets cannot fly")
+    assert [line.split(":")[0] for line in lines] == ["north a", "north b", "south"]
+    assert not out.exists()
+
+
+def test_a_true_parameter_beyond_the_model_is_refused(fleet_file):
+    soft = changed(fleet_file, ("mean = 1.0,", "mean = 1.3,"))
+    sentence = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
+    with pytest.raises(FleetError, match=sentence):
+        fly_fleet(soft, fleet_file.parent / "out")
+    assert not (fleet_file.parent / "out").exists()
+
+
+def test_a_true_state_beyond_the_model_is_refused(fleet_file):
+    gain = '[[truth.gains]]\nstate = "z1"\nfirst_step = 0\nlast_step = 49\ngain_percent = 5\n\n[truth.noise]'
     north = edited(text_of("growing_damage"), ('kind = "random_growth"', 'kind = "scripted"'))
-    written(fleet_file.parent, north, ("[truth.noise]", loss), name="north.toml")
-    with pytest.raises(
-        FleetError, match=r"north: the z1 that .* in step \d+ is .* gives z1 the range 0 to 0.8"
-    ):
+    written(fleet_file.parent, north, ("[truth.noise]", gain), name="north.toml")
+    sentence = r"north: the z1 that .* in step \d+ is .* gives z1 the range 0 to 0.8"
+    with pytest.raises(FleetError, match=sentence):
         fly_fleet(changed(fleet_file), fleet_file.parent / "out")
     assert not (fleet_file.parent / "out").exists()
 
@@ -279,32 +398,63 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     assert flight.endings_of(outcome.folder) == (failures, {})
 
 
-def test_a_fallback_that_was_called_for_in_the_last_steps_is_no_failure():
+@pytest.fixture(scope="module")
+def late_fallbacks() -> tuple[Knowledge, Flights]:
+    """Five flights of seven steps, after which the asset ends; damage in late steps calls for a fallback."""
     knowledge = prepare_twin("growing_damage")
     flights = Flights.empty(knowledge, 5)
-    flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven steps, then the asset ends
-    for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
-        flights.state[twin, called:, 0] = 0.8
-        flights.control_index[twin, left:7] = 0
+    flights.state[:] = 0.0
+    flights.control_index[:, :7] = 1
+    called_and_left = [(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]
+    for twin, (step_of_call, step_of_fallback) in enumerate(called_and_left):
+        flights.state[twin, step_of_call:, 0] = 0.8
+        flights.control_index[twin, step_of_fallback:7] = 0
+    return knowledge, flights
+
+
+def test_a_fallback_that_was_called_for_in_the_last_steps_is_no_failure(late_fallbacks):
+    knowledge, flights = late_fallbacks
     delay, early = fallbacks_of(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
     assert (early == 0).all()
-    lost = knowledge.model.states.coordinates.sum(axis=1)
-    both = replace(knowledge, policy=np.eye(2)[(lost < 0.5).astype(int)])
-    delay, early = fallbacks_of(both, flights)  # by which no state alone calls for a fallback
-    assert (np.isnan(delay) & (early == -1)).all()
 
 
-def test_the_command_line(library_file, tmp_path):
-    words = ("run", "growing_damage", "--strain-library", library_file, "--workers", 0, "--json", "--seeds")
-    told = json.loads(said(*words, "0:3", "--out", tmp_path / "a"))
-    assert (told["twins"], told["failed"]) == (3, 0)
-    said(*words, "3:5", "--out", tmp_path / "b")
-    compared = json.loads(said("compare", tmp_path / "a", tmp_path / "b", "--json"))
+def test_a_policy_by_which_no_state_alone_calls_for_a_fallback_has_no_delays(late_fallbacks):
+    knowledge, flights = late_fallbacks
+    loss_of_both = knowledge.model.states.coordinates.sum(axis=1)
+    policy = np.eye(2)[(loss_of_both < 0.5).astype(int)]
+    delay, early = fallbacks_of(replace(knowledge, policy=policy), flights)
+    assert np.isnan(delay).all()
+    assert (early == -1).all()
+
+
+@pytest.fixture(scope="module")
+def flown_by_command(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Any]:
+    """The folders of two fleets that the command flew, and what it said of the first as data."""
+    folder = tmp_path_factory.mktemp("command")
+    words = ("run", "growing_damage", "--strain-library", library_file, "--workers", 0, "--json")
+    record = json.loads(said(*words, "--seeds", "0:3", "--out", folder / "a"))
+    said(*words, "--seeds", "3:5", "--out", folder / "b")
+    return folder / "a", folder / "b", record
+
+
+def test_the_command_flies_a_fleet_of_seeds(flown_by_command):
+    _, _, record = flown_by_command
+    assert (record["twins"], record["failed"]) == (3, 0)
+
+
+def test_the_command_compares_fleets(flown_by_command):
+    first, second, _ = flown_by_command
+    compared = json.loads(said("compare", first, second, "--json"))
     assert [group["twins"] for group in compared.values()] == [3, 2]
-    (counts,) = (tmp_path / "b" / "fleet.zarr").glob("*/notice/count")
+
+
+def test_a_store_that_lacks_a_variable_is_refused(flown_by_command, tmp_path):
+    first, second, _ = flown_by_command
+    damaged = shutil.copytree(second, tmp_path / "b")
+    (counts,) = (damaged / "fleet.zarr").glob("*/notice/count")
     shutil.rmtree(counts)
-    assert "lacks notice/count: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
+    assert "lacks notice/count: fly the fleet again" in refused("compare", first, damaged)
 
 
 def test_all_processors_fly_unless_the_user_says_how_many():
@@ -325,47 +475,94 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
 
 def same(first: Flights, second: Flights) -> bool:
     names = ("observation_rows", "control_index", "state", "filtered", "log_evidence")
-    pairs = ((getattr(first, name), getattr(second, name)) for name in names)
-    told = (first.failure, first.ended) == (second.failure, second.ended)
-    return told and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    has_same_endings = (first.failure, first.ended) == (second.failure, second.ended)
+    return has_same_endings and all(
+        np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True) for name in names
+    )
 
 
-@pytest.mark.parametrize(
-    ("name", "decide_on", "product"),
-    [
-        ("level_turns", "filtered", False),
-        ("growing_damage", "predicted", False),
-        ("growing_damage", "filtered", True),  # of tables, one for each region
-        ("failing_gauges", "filtered", False),
-        ("inspected_wing", "predicted", False),
-    ],
-)
-def test_each_twin_flies_what_it_flies_alone(name, decide_on, product, library_file, monkeypatch):
-    if product:
-        monkeypatch.setattr("twin_master.network.transition.JOINT_NON_ZEROS", 0)
+@dataclass
+class Side:
+    """Flights of one knowledge and asset side by side, under the truths of some seeds."""
+
+    knowledge: Knowledge
+    asset: StatelessAsset
+    truths: list[Any]
+    together: Flights
+
+
+def flown_side_by_side(knowledge: Knowledge, asset: StatelessAsset, seeds: int = 5) -> Side:
+    truths = [knowledge.truth(seed) for seed in range(seeds)]
+    together = fly_side_by_side(knowledge, truths, [asset] * seeds)
+    return Side(knowledge, asset, truths, together)
+
+
+def check_flown_alone(side: Side) -> None:
+    """Check flights side by side against flights one by one, and one against a mission."""
+    knowledge, asset, truths = side.knowledge, side.asset, side.truths
+    mission = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truths[4], asset))
+    assert same(side.together, fly_one_by_one(knowledge, truths, lambda *_: asset))
+    assert np.array_equal(mission.control_index, side.together.control_index[4])
+
+
+@pytest.mark.parametrize(("name", "decide_on"), [("level_turns", "filtered"), ("failing_gauges", "filtered")])
+def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
     knowledge, asset = known(name, library_file, decide_on)
-    assert knowledge.model.transition.is_product is product
-    truths = [knowledge.truth(seed) for seed in range(5)]
-    together = fly_side_by_side(knowledge, truths, [asset] * 5)
-    assert same(together, fly_one_by_one(knowledge, truths, lambda *_: asset))
-    alone = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truths[4], asset))
-    assert np.array_equal(alone.control_index, together.control_index[4])
-    assert len(np.unique(together.state[:, -1], axis=0)) > 1 or name != "growing_damage"
-    if name == "inspected_wing":  # a region is sound behind its repair
-        places = knowledge.scenario.control_names.index("repair_1"), together.control_index[:, :-1]
-        assert (together.state[:, 1:, 0] == 0.0)[places[1] == places[0]].all()
-        assert (places[1] == places[0]).any()
+    assert knowledge.model.transition.is_product is False
+    check_flown_alone(flown_side_by_side(knowledge, asset))
+
+
+def test_each_twin_with_growing_damage_flies_what_it_flies_alone(library_file):
+    knowledge, asset = known("growing_damage", library_file, "predicted")
+    side = flown_side_by_side(knowledge, asset)
+    assert knowledge.model.transition.is_product is False
+    assert len(np.unique(side.together.state[:, -1], axis=0)) > 1
+    check_flown_alone(side)
+
+
+def test_each_twin_with_a_transition_of_each_region_flies_what_it_flies_alone(library_file, monkeypatch):
+    monkeypatch.setattr("twin_master.network.transition.JOINT_NON_ZEROS", 0)
+    knowledge, asset = known("growing_damage", library_file)
+    side = flown_side_by_side(knowledge, asset)
+    assert knowledge.model.transition.is_product is True
+    assert len(np.unique(side.together.state[:, -1], axis=0)) > 1
+    check_flown_alone(side)
+
+
+@pytest.fixture(scope="module")
+def inspected(library_file: Path) -> Side:
+    knowledge, asset = known("inspected_wing", library_file, "predicted")
+    return flown_side_by_side(knowledge, asset)
+
+
+def test_each_inspected_twin_flies_what_it_flies_alone(inspected):
+    assert inspected.knowledge.model.transition.is_product is False
+    check_flown_alone(inspected)
+
+
+def test_a_region_is_sound_behind_its_repair(inspected):
+    repair = inspected.knowledge.scenario.control_names.index("repair_1")
+    is_repaired = inspected.together.control_index[:, :-1] == repair
+    is_sound_in_next_step = inspected.together.state[:, 1:, 0] == 0.0
+    assert is_repaired.any()
+    assert is_sound_in_next_step[is_repaired].all()
 
 
 class Remembering:
     """An asset that is none of `StatelessAsset`, so that it is driven by a plant of its own."""
 
     def __init__(self, asset: StatelessAsset) -> None:
-        self.step, self.units = asset.step, dict[str, str]()
-        self.restore_state, self.close = (lambda _state: None), (lambda: None)
+        self.step = asset.step
+        self.units = dict[str, str]()
 
     def save_state(self) -> bytes:
         return b""
+
+    def restore_state(self, _state: bytes) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
@@ -380,45 +577,75 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
     return StatelessAsset(step)
 
 
-@pytest.mark.parametrize(
-    ("driven", "error"),
-    [
+class Softening:
+    """Flights of six assets, each of which fails or ends once its first region has lost 40 %."""
+
+    def __init__(self, library: Path, drive: Any, error: Exception) -> None:
+        self.knowledge, asset = known("growing_damage", library)
+        truths = [self.knowledge.truth(seed) for seed in range(6)]
+        soft = until_soft(asset, error)
+        self.ends = isinstance(error, FmuEndedError)
+        self.whole = fly_side_by_side(self.knowledge, truths, [asset] * 6)
+        self.whole_driven = fly_side_by_side(self.knowledge, truths, [drive(asset) for _ in truths])
+        with np.errstate(over="ignore"):
+            self.flights = fly_side_by_side(self.knowledge, truths, [drive(soft) for _ in truths])
+            self.one_by_one = fly_one_by_one(self.knowledge, truths, lambda *_: drive(soft))
+        is_soft = self.whole.state[:, :, 0] >= 0.4 - 1e-9
+        self.steps = np.where(is_soft.any(axis=1), is_soft.argmax(axis=1), 35)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
         (lambda asset: asset, MissionInputError("too soft")),
         (lambda asset: asset, ImpossibleObservation("growing_damage", 0, {})),
         (Remembering, MissionInputError("too soft")),
         (Remembering, FmuEndedError("It is over.", time=1.0)),
     ],
+    ids=["fails", "shows what is impossible", "fails with a state of its own", "ends"],
 )
-def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(
-    driven, error, library_file
-):
-    knowledge, asset = known("growing_damage", library_file)
-    truths, soft = [knowledge.truth(seed) for seed in range(6)], until_soft(asset, error)
-    whole = fly_side_by_side(knowledge, truths, [asset] * 6)
-    assert same(whole, fly_side_by_side(knowledge, truths, [driven(asset) for _ in truths]))
-    with np.errstate(over="ignore"):
-        found = fly_side_by_side(knowledge, truths, [driven(soft) for _ in truths])
-        assert same(found, fly_one_by_one(knowledge, truths, lambda *_: driven(soft)))
-    softened = whole.state[:, :, 0] >= 0.4 - 1e-9
-    flown = np.where(softened.any(axis=1), softened.argmax(axis=1), 35)
-    assert 0 < np.sum(flown < 35) < 6
-    ends, over = isinstance(error, FmuEndedError), "The asset ended the mission after"
-    said = [f"{over} {n} of 35 steps: It is over." if ends and n < 35 else "" for n in flown]
-    assert found.ended == said
-    assert [text != "" for text in found.failure] == [not ends and n < 35 for n in flown]
-    for twin, end in enumerate(flown):
-        assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
-        assert np.isnan(found.filtered[twin, end:]).all()
-        assert (found.control_index[twin, end:] == -1).all()
-    kept = stored_variables(knowledge, found, [Member(row, "", row, {}) for row in range(6)])
-    for row, steps in enumerate(flown):
-        if ends or steps == 35:
-            assert kept["status"][row] == (ENDED if found.ended[row] else FLOWN)
-            np.testing.assert_array_equal(
-                kept["filtered/last_probability"][row], found.filtered[row, steps - 1].astype("f4")
-            )
-            inside = in_credible_set(knowledge.model, found.filtered[row, :steps], found.state[row, :steps])
-            assert kept["credible"][row] == np.float32(inside.mean())
+def softening(request: pytest.FixtureRequest, library_file: Path) -> Softening:
+    return Softening(library_file, *request.param)
+
+
+def test_assets_that_fail_or_end_fly_side_by_side_what_they_fly_one_by_one(softening):
+    assert same(softening.whole, softening.whole_driven)
+    assert same(softening.flights, softening.one_by_one)
+
+
+def test_an_asset_that_fails_or_ends_says_after_how_many_steps(softening):
+    flights, ends = softening.flights, softening.ends
+    is_short = softening.steps < 35
+    sentences = [
+        f"The asset ended the mission after {steps} of 35 steps: It is over." if ends and steps < 35 else ""
+        for steps in softening.steps
+    ]
+    assert 0 < np.sum(is_short) < 6
+    assert flights.ended == sentences
+    assert [text != "" for text in flights.failure] == [bool(short) and not ends for short in is_short]
+
+
+def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_the_others(softening):
+    flights, whole = softening.flights, softening.whole
+    for twin, steps in enumerate(softening.steps):
+        assert np.array_equal(flights.filtered[twin, :steps], whole.filtered[twin, :steps])
+        assert np.isnan(flights.filtered[twin, steps:]).all()
+        assert (flights.control_index[twin, steps:] == -1).all()
+
+
+def test_the_store_has_the_last_belief_of_an_asset_that_ended(softening):
+    knowledge, flights = softening.knowledge, softening.flights
+    members = [Member(row, "", row, {}) for row in range(6)]
+    stored = stored_variables(knowledge, flights, members)
+    for row, steps in enumerate(softening.steps):
+        if not softening.ends and steps < 35:
+            continue  # it failed, and has no result
+        belief, states = flights.filtered[row, :steps], flights.state[row, :steps]
+        coverage = in_credible_set(knowledge.model, belief, states).mean()
+        last_belief = stored["filtered/last_probability"][row]
+        assert stored["status"][row] == (ENDED if flights.ended[row] else FLOWN)
+        np.testing.assert_array_equal(last_belief, belief[-1].astype("f4"))
+        assert stored["credible"][row] == np.float32(coverage)
 
 
 def test_damage_grows_as_the_model_says(library_file):

@@ -2,10 +2,11 @@
 
 import json
 import re
-import tomllib
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
+from subprocess import CompletedProcess
 from threading import Event, Thread
 from typing import Any
 
@@ -13,116 +14,122 @@ import numpy as np
 import pytest
 
 from tests.command_line import command, said, seen
-from tests.twin_master.runs import journal, text_of, written
-from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
+from tests.twin_master.fleet.recordings import (
+    LOGS,
+    STEPS,
+    Decision,
+    fleet_of,
+    log_of,
+    watch_alone,
+    watched,
+    write_fleet,
+)
+from tests.twin_master.runs import journal
+from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.reading import group_figures, leaving_probabilities
+from twin_master.fleet.reading import leaving_probabilities
 from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
 from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
-from uav_twin import fly_fleet, learn_from_fleet, open_fleet
-
-STEPS = 6
-FLOWN = [1, 1, 1, 1, 1, 0]
-"""Control of each step: what the last one does to the wing nobody sees."""
-LOGS = 'observations = "logs/*.csv"'
-Decision = Mapping[str, Any]
+from uav_twin import fly_fleet, open_fleet
 
 
 @pytest.fixture
 def fleet_file(library_file: Path, tmp_path: Path) -> Path:
-    """A fleet of three wings with a recording each.
-
-    Of one a line is garbage and a gauge unreadable for a step, of another a step is late.
-    """
-    text = text_of("growing_damage")
-    flown = text[text.index("[asset]") : text.index("[calibration]")]
-    library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
-    written(tmp_path, text, (flown, library), name="wing.toml")
-    (tmp_path / "logs").mkdir()
-    noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, STEPS, 24))
-    for number, rows in enumerate(noise):
-        write_csv(log_of(tmp_path, number), rows, np.array(FLOWN), number == 1)
-    unread, late = (log_of(tmp_path, number).read_text().splitlines() for number in (1, 2))
-    unread[3] = ",".join([*unread[3].split(",")[:-1], "OL"])
-    late[3], late[4] = late[4], late[3]
-    for number, lines in ((1, unread), (2, late)):
-        log_of(tmp_path, number).write_text("\n".join(lines) + "\n")
-    return fleet_of(tmp_path, LOGS)
-
-
-def log_of(folder: Path, number: int) -> Path:
-    return folder / "logs" / f"wing-{number}.csv"
-
-
-def fleet_of(folder: Path, *lines: str) -> Path:
-    head = (
-        'format = 1\nfleet = { name = "real", seed = 7 }\n[[group]]\nname = "north"\nscenario = "wing.toml"'
-    )
-    return written(folder, "\n".join([head, *lines, ""]), name="fleet.toml")
+    """A fleet of three wings with a recording each."""
+    return write_fleet(library_file, tmp_path)
 
 
 @pytest.fixture
 def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
     """The journals of watches of one asset alone."""
-    for number in range(3):
-        given = "--observations", log_of(tmp_path, number), "--out", tmp_path / "alone" / f"wing-{number}"
-        said("watch", tmp_path / "wing.toml", *given, "--seed", 7, "--no-report")
-    return [path.read_bytes() for path in sorted((tmp_path / "alone").glob(f"*/{JOURNAL_NAME}"))]
+    return watch_alone(tmp_path)
 
 
 def journals(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted((folder / "north").glob(f"*/{JOURNAL_NAME}"))]
 
 
-def watched(fleet_file: Path, out: Path, stop_after: int | None = None) -> FleetWatch:
-    """Return a fleet that was watched; where it is to stop, in the middle of it."""
-    told: list[str] = []
-
-    def tell(asset: WatchedAsset, _decision: Decision) -> None:
-        told.append(asset.name)
-        fleet.is_end_requested = len(told) == stop_after
-
-    fleet = FleetWatch(load_fleet(fleet_file), out, tell, told.append)
-    fleet.run()
-    return fleet
+WINGS = ["north/wing-0", "north/wing-1", "north/wing-2"]
 
 
 def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path):
-    again = tmp_path / "again"
-    for stop in (2, 9, None):  # in the middle of assets; the last time to the end
-        watched(fleet_file, again, stop)
-    assert journals(again) == alone
-    state = json.loads((again / "watched.json").read_text())["assets"]
-    assert [state[f"north/wing-{number}"]["last"]["step"] for number in range(3)] == [STEPS - 1] * 3
-    (again / "watched.json").unlink()  # as if a kill had come: nobody knows whether the last ones were told
+    """The watch of the fleet is stopped twice in the middle of assets."""
+    out = tmp_path / "again"
+    for stop in (2, 9, None):
+        watched(fleet_file, out, stop)
+    assets = json.loads((out / "watched.json").read_text())["assets"]
+    assert journals(out) == alone
+    assert [assets[name]["last"]["step"] for name in WINGS] == [STEPS - 1] * 3
+
+
+@pytest.fixture(scope="module")
+def watched_fleet(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The file of a fleet, and the folder in which it was watched to its end."""
+    folder = tmp_path_factory.mktemp("watched_fleet")
+    file = write_fleet(library_file, folder)
+    watched(file, folder / "out")
+    return file, folder / "out"
+
+
+def test_after_a_kill_each_asset_tells_its_last_decision_again(watched_fleet, tmp_path):
+    """Nobody knows whether it was told."""
+    file, watched_folder = watched_fleet
+    out = shutil.copytree(watched_folder, tmp_path / "out")
+    (out / "watched.json").unlink()
     told = list[tuple[str, bool]]()
 
-    def tell(one: WatchedAsset, decision: Decision) -> None:
-        told.append((one.name, decision["told_again"]))
+    def tell(asset: WatchedAsset, decision: Decision) -> None:
+        told.append((asset.name, decision["told_again"]))
 
-    FleetWatch(load_fleet(fleet_file), again, tell, print).run()
-    assert sorted(told) == [(f"north/wing-{number}", True) for number in range(3)]
+    FleetWatch(load_fleet(file), out, tell, print).run()
+    assert sorted(told) == [(name, True) for name in WINGS]
+
+
+def test_the_folder_of_another_fleet_is_refused(watched_fleet):
+    file, out = watched_fleet
     with pytest.raises(RunFolderError, match="another fleet"):
-        FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
-    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--steps", 3)
-    assert done.returncode == 0, done.stderr
+        FleetWatch(load_fleet(file, seed=8), out, print, print)
+
+
+@pytest.fixture(scope="module")
+def fleet_of_three_steps(
+    watched_fleet: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> CompletedProcess[str]:
+    """What the command prints that watches a fleet for three steps."""
+    out = tmp_path_factory.mktemp("three_steps") / "out"
+    return command("fleet", "watch", watched_fleet[0], "--out", out, "--steps", 3)
+
+
+def test_the_command_watches_a_fleet_up_to_a_number_of_steps(fleet_of_three_steps):
+    done = fleet_of_three_steps
     decisions = [json.loads(line) for line in done.stdout.splitlines()]
-    last = {decision["asset"]: decision["step"] for decision in decisions}
-    assert last == {f"north/wing-{number}": 2 for number in range(3)}
+    last_steps = {decision["asset"]: decision["step"] for decision in decisions}
+    assert done.returncode == 0, done.stderr
+    assert last_steps == dict.fromkeys(WINGS, 2)
     assert "3 assets, 9 steps, 3 alarms" in done.stderr
-    former = command("fleet", "watch", fleet_file, "--out", tmp_path / "former", "--turns", 3)
-    assert former.stdout == done.stdout
-    assert "The option --turns: `--turns` is now called `--steps`. The former name" in former.stderr
+
+
+def test_the_former_name_of_the_option_of_steps_is_read_with_a_sentence(
+    watched_fleet, fleet_of_three_steps, tmp_path
+):
+    file, _ = watched_fleet
+    former = command("fleet", "watch", file, "--out", tmp_path / "former", "--turns", 3)
+    sentence = "The option --turns: `--turns` is now called `--steps`. The former name"
+    assert former.stdout == fleet_of_three_steps.stdout
+    assert sentence in former.stderr
     assert "--turns" not in said("fleet", "watch", "--help")
-    screen = seen("fleet", "watch", fleet_file, "--out", tmp_path / "seen")  # people see a table
+
+
+def test_people_see_the_decisions_of_a_fleet_as_a_table(fleet_file, tmp_path):
+    screen = seen("fleet", "watch", fleet_file, "--out", tmp_path / "seen")
     rows = re.findall(r"(north/wing-\d) +5 +2g +.* 2g +1 ", screen)
-    assert rows[-3:] == ["north/wing-0", "north/wing-1", "north/wing-2"]
+    assert rows[-3:] == WINGS
     assert '"asset"' not in screen
 
 
@@ -152,190 +159,234 @@ def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(Watch, "decisions", once_unwell)
 
 
-def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, monkeypatch):
-    """One whose file was wrong, and one that met an error of ours; a log that is gone is awaited."""
-    for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
-        monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
-    logs = [log_of(tmp_path, number) for number in range(3)]
-    (tmp_path / "logs" / "wing-1.txt").write_text("step,strain_1\n")  # another of that name
-    contents, at, notes = [log.read_bytes() for log in logs], 0, list[str]()
-    logs[1].write_text("step,strian_1\n")
-    logs[2].write_bytes(contents[2][:9])  # its header is not whole yet
-    make_unwell(monkeypatch, "wing-2")
+class LostAssets:
+    """A fleet that loses an asset with a wrong file, and one that meets an error of ours.
 
-    def tell(asset: WatchedAsset, decision: Decision) -> None:
-        if asset.name == "north/wing-0" and decision["step"] == 2 and "told_again" not in decision:
-            logs[0].unlink()
+    Of the third the log is gone for a while. All files are mended at the third look for files.
+    """
 
-    def mend() -> None:
-        nonlocal at
-        at += 1
-        for log, content in zip(logs, contents, strict=True) if at == 3 else ():
-            log.write_bytes(content)
-        fleet.is_end_requested = at == 6
+    def __init__(self, folder: Path, alone: list[bytes]) -> None:
+        self.alone, self.out = alone, folder / "out"
+        logs = [log_of(folder, number) for number in range(3)]
+        self.whole = {log: log.read_bytes() for log in logs}
+        self.log_that_goes, misspelt, without_header = logs
+        (folder / "logs" / "wing-1.txt").write_text("step,strain_1\n")  # another of that name
+        misspelt.write_text("step,strian_1\n")
+        without_header.write_bytes(self.whole[without_header][:9])
+        self.notes = list[str]()
+        self.looks = 0
+        planned = load_fleet(fleet_of(folder, LOGS.replace(".csv", "")))
+        self.fleet = FleetWatch(planned, self.out, self.tell, self.notes.append, follow=True)
+        self.fleet.run(self.mend)
 
-    planned = load_fleet(fleet_of(tmp_path, LOGS.replace(".csv", "")))
-    fleet = FleetWatch(planned, tmp_path / "out", tell, notes.append, follow=True)
-    fleet.run(mend)
-    assert journals(tmp_path / "out") == alone
-    assert fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
-    lost = [note for note in notes if "is not watched" in note]
-    assert sum(note.startswith("north/wing-2 is not watched: ZeroDivisionError") for note in lost) == 1
-    assert sum("strian_1" in note for note in lost) == 1
-    again = [note for note in notes if note.endswith("is watched again.")]
+    def tell(self, asset: WatchedAsset, decision: Decision) -> None:
+        is_third_step = asset.name == "north/wing-0" and decision["step"] == 2
+        if is_third_step and "told_again" not in decision:
+            self.log_that_goes.unlink()
+
+    def mend(self) -> None:
+        """Write all files as they were at the third look, and ask for the end at the sixth."""
+        self.looks += 1
+        if self.looks == 3:
+            for log, content in self.whole.items():
+                log.write_bytes(content)
+        self.fleet.is_end_requested = self.looks == 6
+
+
+@pytest.fixture(scope="module")
+def lost_assets(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> LostAssets:
+    folder = tmp_path_factory.mktemp("lost_assets")
+    write_fleet(library_file, folder)
+    alone = watch_alone(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
+            patch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
+        make_unwell(patch, "wing-2")
+        return LostAssets(folder, alone)
+
+
+def test_an_asset_that_was_lost_is_taken_up_again(lost_assets):
+    again = [note for note in lost_assets.notes if note.endswith("is watched again.")]
+    assert journals(lost_assets.out) == lost_assets.alone
     assert sorted(again) == ["north/wing-1 is watched again.", "north/wing-2 is watched again."]
 
 
-def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
-    """Asked to end within; then one cannot be taken up, and one is lost: what came meanwhile waits."""
-    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
-    make_unwell(monkeypatch, "wing-0")
-    heard, sent, told, north = list[str](), list[int](), list[int](), tmp_path / "out" / "north"
-    listener, publisher = broker.client("listener"), broker.client("publisher")
-    listener.on_message = lambda _client, _data, message: heard.append(message.topic)
-    listener.subscribe("wings/+/decision", qos=1)
+def test_a_lost_asset_is_told_once_with_its_reason(lost_assets):
+    lost = [note for note in lost_assets.notes if "is not watched" in note]
+    error_of_ours = "north/wing-2 is not watched: ZeroDivisionError"
+    assert lost_assets.fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
+    assert sum(note.startswith(error_of_ours) for note in lost) == 1
+    assert sum("strian_1" in note for note in lost) == 1
 
-    def send() -> None:
+
+class WatchedTopics:
+    """A fleet whose assets have a topic each; it is asked to end within, and goes on.
+
+    Then one asset cannot be taken up, and one is lost: what came meanwhile waits.
+    """
+
+    def __init__(self, broker: Mosquitto, folder: Path) -> None:
+        self.folder = folder
+        self.out = folder / "out"
+        self.north = self.out / "north"
+        self.publisher = broker.client("publisher")
+        self.heard, self.told = list[str](), list[int]()
+        listener = broker.client("listener")
+        listener.on_message = lambda _client, _data, message: self.heard.append(message.topic)
+        listener.subscribe("wings/+/decision", qos=1)
+        self.is_published = False
+        self.run()
+        (self.north / "wing-2").write_text("no folder")
+        self.run()
+
+    def run(self) -> None:
+        """Watch the fleet until its end is asked for."""
+        self.notes = list[str]()
+        planned = load_fleet(self.folder / "fleet.toml")
+        self.fleet = FleetWatch(planned, self.out, self.tell, self.notes.append)
+        self.fleet.run(self.send)
+
+    def tell(self, _asset: WatchedAsset, decision: Decision) -> None:
+        self.told.append(decision["step"])
+        revised = 1  # by the late message
+        self.fleet.is_end_requested = len(self.told) in (2, 2 * STEPS + revised)
+
+    def send(self) -> None:
         """Publish once the twin is connected; mend what is wrong once all that came meanwhile is here."""
-        if notes and not sent:
-            sent.append(1)
-            for number in (0, 2):
-                for row in log_of(tmp_path, number).read_text().splitlines()[1:]:
-                    step, control, *cells = row.split(",")
-                    publish(publisher, f"wing-{number}", int(step), control, map(float, cells))
-        topics = fleet._sources[0]._topics  # type: ignore[union-attr]
-        if [len(topic.payloads) for _, topic in sorted(topics.items())] == [STEPS - 3, STEPS]:
-            (north / "wing-2").unlink(missing_ok=True)
-            (north / "wing-0" / "published").write_text("")
-            for lost in fleet._lost.values():
+        if self.notes and not self.is_published:
+            self.is_published = True
+            self.publish_logs()
+        topics = self.fleet._sources[0]._topics  # type: ignore[union-attr]
+        waiting = [len(topic.payloads) for _, topic in sorted(topics.items())]
+        if waiting == [STEPS - 3, STEPS]:
+            (self.north / "wing-2").unlink(missing_ok=True)
+            (self.north / "wing-0" / "published").write_text("")
+            for lost in self.fleet._lost.values():
                 lost.again = 0.0
 
-    def tell(_asset: WatchedAsset, decision: Decision) -> None:
-        told.append(decision["step"])
-        fleet.is_end_requested = len(told) in (2, 2 * STEPS + 1)  # one more decision for the late message
+    def publish_logs(self) -> None:
+        for number in (0, 2):
+            for row in log_of(self.folder, number).read_text().splitlines()[1:]:
+                step, control, *cells = row.split(",")
+                publish(self.publisher, f"wing-{number}", int(step), control, map(float, cells))
 
-    for wrong in (False, True):
-        notes: list[str] = []
-        fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
-        if wrong:
-            (north / "wing-2").write_text("no folder")
-        fleet.run(send)
-    for number in (0, 2):
-        name = f"wing-{number}"
-        ours, theirs = (journal(folder / name) for folder in (north, tmp_path / "alone"))
-        for record in [*ours, *theirs]:  # the broker sent again what the end left unacknowledged
-            del record["intake"], record["standing"]  # which has its place in the file
-        assert ours == theirs
-    assert {*heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
+
+def records_without_place(folder: Path) -> list[dict[str, Any]]:
+    """Return the records of a journal without what differs if the broker sends a message again."""
+    records = journal(folder)
+    for record in records:
+        del record["intake"]
+        del record["standing"]  # the place of the record in its file
+    return records
+
+
+def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    make_unwell(monkeypatch, "wing-0")
+    watched_topics = WatchedTopics(broker, tmp_path)
+    for name in ("wing-0", "wing-2"):
+        journal_of_fleet = records_without_place(watched_topics.north / name)
+        assert journal_of_fleet == records_without_place(tmp_path / "alone" / name)
+    assert {*watched_topics.heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
+    check_lost_and_taken_up(watched_topics.notes)
+
+
+def check_lost_and_taken_up(notes: list[str]) -> None:
+    """Check that both assets were told to be lost, and then to be watched again."""
     lost = [note.partition(": ")[0] for note in notes if "is not watched" in note]
     assert sorted(lost) == ["north/wing-0 is not watched", "north/wing-2 is not watched"]
     assert "north/wing-0 is not watched: ZeroDivisionError: division by zero" in notes
     assert sorted(notes[-2:]) == ["north/wing-0 is watched again.", "north/wing-2 is watched again."]
 
 
+class SilentAsset:
+    """A fleet of two assets, of which one is not heard after its first step.
+
+    The fleet is watched again, so that a decision that was never published is published then.
+    """
+
+    def __init__(self, broker: Mosquitto, folder: Path) -> None:
+        self.heard, self.notes = list[dict[str, Any]](), list[str]()
+        self.told = list[tuple[str, int, bool]]()
+        self.client = broker.client("client", self.heard)
+        self.client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
+        self.next_step = 0
+        self.states_at_extra_message: int | None = None
+        self.file, self.out = folder / "fleet.toml", folder / "out"
+
+    def run(self) -> None:
+        """Watch both assets until the silence of one is told."""
+        self.fleet = FleetWatch(load_fleet(self.file), self.out, self.tell, self.notes.append)
+        self.fleet.run(lambda: self.send() if self.notes else None)
+
+    def run_again(self) -> None:
+        """Watch them once more, as after a kill that kept the last decision from the broker."""
+        (self.out / "north" / "two" / "published").write_text("?")
+        planned = load_fleet(self.file)
+        self.again = FleetWatch(planned, self.out, lambda *_: None, self.notes.append, steps=1)
+        self.again.run(self.end)
+        topics = self.again._sources[0]._topics  # type: ignore[union-attr]
+        self.waiting = [len(topic.payloads) for topic in topics.values()]
+        wait_until(lambda: self.states()[-1] == "ended")
+        self.client.disconnect()
+
+    def seconds_of_silence(self, watch: Watch) -> float:
+        """Return seconds that pass with the decisions, and not with the clock of a machine that is busy."""
+        return 1.0 if watch.folder.name == "two" and len(self.told) > 5 else 0.0
+
+    def send(self) -> None:
+        """Publish a step of the first asset, and only the very first one of the second."""
+        names = ("one", "two") if self.next_step == 0 else ("one",)
+        for name in names:
+            publish(self.client, name, self.next_step)
+        self.next_step += 1
+
+    def tell(self, asset: WatchedAsset, decision: Decision) -> None:
+        is_quiet = any(notice["kind"] == "quiet" for notice in decision["notices"])
+        self.told.append((asset.name, decision["step"], is_quiet))
+        self.fleet.is_end_requested = self.told[-1] == ("north/two", 0, True)
+
+    def end(self) -> None:
+        """Ask for the end once the silence was published again, some heartbeats after a further message."""
+        if self.states_at_extra_message is None:
+            publish(self.client, "one", 999)  # an asset that has all steps is left alone
+            self.states_at_extra_message = len(self.states())
+        decisions = [record for record in self.heard if record.get("step") == 0]
+        kinds = [notice["kind"] for decision in decisions for notice in decision["notices"]]
+        has_waited = len(self.states()) > self.states_at_extra_message + 5
+        self.again.is_end_requested = kinds.count("quiet") >= 2 and has_waited
+
+    def states(self) -> list[str]:
+        return [record["state"] for record in self.heard if "state" in record]
+
+
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
-    """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
-    heard, notes, told = list[dict[str, Any]](), list[str](), list[tuple[str, int, bool]]()
-
-    def silence(watch: Watch) -> float:
-        """Return seconds that pass with the decisions, and not with the clock of a machine that is busy."""
-        return 1.0 if watch.folder.name == "two" and len(told) > 5 else 0.0
-
-    monkeypatch.setattr(Watch, "seconds_since_step", property(silence))
-    client, steps, further = broker.client("client", heard), iter(range(1000)), list[int]()
-    client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
-
-    def send() -> None:
-        step = next(steps)
-        for name in ("one", "two") if step == 0 else ("one",):
-            publish(client, name, step)
-
-    def tell(asset: WatchedAsset, decision: Decision) -> None:
-        quiet = any(notice["kind"] == "quiet" for notice in decision["notices"])
-        told.append((asset.name, decision["step"], quiet))
-        fleet.is_end_requested = told[-1] == ("north/two", 0, True)
-
-    def end() -> None:
-        """Ask for it once the silence was published again, which a kill could have kept from the broker."""
-        if not further:
-            publish(client, "one", 999)  # who has all steps is left alone
-            further.append(len(states()))
-        kinds = [notice["kind"] for one in heard if one.get("step") == 0 for notice in one["notices"]]
-        again.is_end_requested = kinds.count("quiet") >= 2 and len(states()) > further[0] + 5
-
-    def states() -> list[str]:
-        return [one["state"] for one in heard if "state" in one]
-
-    fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
-    fleet.run(lambda: send() if notes else None)
-    assert fleet.is_end_requested
-    assert fleet.failures == {}
-    (tmp_path / "out" / "north" / "two" / "published").write_text("?")
-    planned = load_fleet(tmp_path / "fleet.toml")
-    again = FleetWatch(planned, tmp_path / "out", lambda *_: None, notes.append, steps=1)
-    again.run(end)
-    topics = again._sources[0]._topics  # type: ignore[union-attr]
-    assert [len(topic.payloads) for topic in topics.values()] == [0, 0]
-    wait_until(lambda: states()[-1] == "ended")
-    client.disconnect()
-    silent = [said for said in told if said[0] == "north/two"]
-    assert silent == [("north/two", 0, False), ("north/two", 0, True)]
-    assert not any(quiet for name, _, quiet in told if name == "north/one")
-    assert states()[-1] == "ended"
-    assert max(one["quiet"] for one in heard if "quiet" in one) == 1
+    assets = SilentAsset(broker, tmp_path)
+    monkeypatch.setattr(Watch, "seconds_since_step", property(assets.seconds_of_silence))
+    assets.run()
+    check_silence_of_second_asset(assets)
+    assets.run_again()
+    check_heartbeats(assets)
 
 
-def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
-    """The store has what watches have and counts the notices that they gave."""
-    short = log_of(tmp_path, 0)
-    short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
-    fleet_of(tmp_path, LOGS, f"steps = {STEPS}")
-    outcome = fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
-    group, alarmed = open_fleet(outcome.folder)["north"], 0
-    for row, steps in enumerate((3, STEPS, STEPS)):
-        lines = journal(tmp_path / "alone" / f"wing-{row}")
-        last = {record["step"]: record for record in lines}
-        assert group["observed/control_index"].values[row].tolist() == FLOWN[:steps] + [-1] * (STEPS - steps)
-        assert np.isnan(group["filtered/log_evidence"].values[row, steps:]).all()
-        assert np.array_equal(
-            group["filtered/last_probability"].values[row], np.array(last[steps - 1]["filtered"], np.float32)
-        )
-        for step in range(steps):
-            evidence = group["filtered/log_evidence"].values[row, step]
-            late = row == 2 and step in (2, 3)  # written down before the late message came
-            assert late or evidence == np.float32(last[step]["log_evidence"])
-            seen = np.array(last[step]["observed"], np.float32)
-            assert late or np.array_equal(group["observed/strain"].values[row, step], seen, equal_nan=True)
-        told = [(line["step"], notice["kind"]) for line in lines for notice in line.get("notices", ())]
-        for place, kind in enumerate(("alarm", "gauge_left_out")):
-            noticed = [step for step, one in told if one == kind and step < steps]
-            if row != 2:  # whose late message tells of steps before it
-                assert group["notice/count"].values[row, place] == len(noticed)
-                assert group["notice/first_step"].values[row, place] == min(noticed, default=-1)
-        alarmed += bool(group["notice/count"].values[row, 0])
-    assert group["notice/count"].values[1, 1] >= 1
-    assert alarmed >= 1
-    figures = group_figures(group)
-    assert (figures["flown"], figures["raised an alarm"]) == (3, alarmed)
-    assert "early fallback" not in figures
-    learnt = learn_from_fleet(outcome.folder, tmp_path / "learnt.toml")["groups"]["north"]
-    assert learnt["probability"]["2g"]["flown"] is False
-    assert learnt["alarmed"] == alarmed
-    probability = tomllib.loads((tmp_path / "learnt.toml").read_text())["transition"]["probability"]
-    assert probability["2g"] == 0.05  # as it was assumed
-    assert probability["3g"] != 0.10
-    assert "raised an alarm, first in" in write_fleet_report(outcome.folder).read_text()
-    records = [asset.record() for asset in watched(fleet_file, tmp_path / "out").assets.values()]
-    assert sum(record["alarms"] > 0 for record in records) == alarmed
-    (tmp_path / "logs" / "wing-9.csv").write_text("step,control\n")
-    few = fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, "steps = 5")), tmp_path / "few", Engine(0)).failures
-    none = "its recording has no step yet."
-    long = "it has 6 steps, and 5 at most are flown: set `steps` of the group."
-    assert few == {"north/wing-1": long, "north/wing-2": long, "north/wing-9": none}
+def check_silence_of_second_asset(assets: SilentAsset) -> None:
+    """Check that the silence of the second asset alone was told, and that no asset failed."""
+    of_second_asset = [decision for decision in assets.told if decision[0] == "north/two"]
+    assert assets.fleet.is_end_requested
+    assert assets.fleet.failures == {}
+    assert of_second_asset == [("north/two", 0, False), ("north/two", 0, True)]
+    assert not any(is_quiet for name, _, is_quiet in assets.told if name == "north/one")
+
+
+def check_heartbeats(assets: SilentAsset) -> None:
+    """Check that nothing waits at the end, and that the heartbeats counted one silent asset."""
+    assert assets.waiting == [0, 0]
+    assert assets.states()[-1] == "ended"
+    assert max(record["quiet"] for record in assets.heard if "quiet" in record) == 1
 
 
 def leaving_soon(fleet_file: Path, folder: Path) -> Any:
@@ -361,16 +412,26 @@ def test_a_watched_asset_says_how_probably_it_leaves_its_control_as_the_store_do
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
 
 
-def test_of_an_asset_in_no_state_that_is_believed_a_fleet_tells_no_state(fleet_file, tmp_path):
-    """The recordings are noise, which no state explains."""
-    folder, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {STEPS}"), tmp_path / "flown")
-    assert np.isnan(soon).all()
-    records = watched_records(fleet_file, tmp_path / "out")
+@pytest.fixture
+def fleet_of_noise(fleet_file: Path, tmp_path: Path) -> Path:
+    """The fleet with recordings of noise, which no state explains."""
+    return fleet_of(tmp_path, LOGS, f"steps = {STEPS}")
+
+
+def test_a_flown_asset_in_no_state_that_is_believed_has_no_state(fleet_of_noise, tmp_path):
+    folder, leaving = leaving_soon(fleet_of_noise, tmp_path / "flown")
+    page = write_fleet_report(folder).read_text()
+    assert np.isnan(leaving).all()
+    assert page.count("not believed") >= 3
+    assert "worst off" not in page
+
+
+def test_a_watched_asset_in_no_state_that_is_believed_has_no_state(fleet_of_noise, tmp_path):
+    records = watched_records(fleet_of_noise, tmp_path / "out")
+    page = write_fleet_report(tmp_path / "out").read_text()
     assert [(record["leaving"], record["severity"]) for record in records] == [(None, None)] * 3
-    for fleet in (folder, tmp_path / "out"):
-        page = write_fleet_report(fleet).read_text()
-        assert page.count("not believed") >= 3
-        assert "worst off" not in page
+    assert page.count("not believed") >= 3
+    assert "worst off" not in page
 
 
 def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):
@@ -389,49 +450,100 @@ def test_a_fleet_with_an_asset_whose_messages_are_refused_ends_with_exit_code_1(
     assert "north/wing-0: The watch ended while messages were refused: the last 4 of 4" in done.stderr
 
 
-def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):
-    for name, text in {
-        "wing-0": "step,colour\n0,red\n", "not a name!": "step\n", "void": "", "wing-9": "step,control\n"
-    }.items():  # fmt: skip
-        (tmp_path / "logs" / f"{name}.csv").write_text(text)
-    failures = watched(fleet_file, tmp_path / "out").failures
+class PartlyLostFleet:
+    """A fleet that was watched, in which three of six assets cannot be, and one has no step yet."""
+
+    def __init__(self, library: Path, folder: Path) -> None:
+        fleet = write_fleet(library, folder)
+        self.alone = watch_alone(folder)
+        contents = {
+            "wing-0": "step,colour\n0,red\n",
+            "not a name!": "step\n",
+            "void": "",
+            "wing-9": "step,control\n",
+        }
+        for name, text in contents.items():
+            (folder / "logs" / f"{name}.csv").write_text(text)
+        self.out = folder / "out"
+        self.failures = watched(fleet, self.out).failures
+
+
+@pytest.fixture(scope="module")
+def partly_lost(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> PartlyLostFleet:
+    return PartlyLostFleet(library_file, tmp_path_factory.mktemp("lost"))
+
+
+@pytest.fixture
+def lost_folder(partly_lost: PartlyLostFleet, tmp_path: Path) -> Path:
+    """A copy of what was watched."""
+    return shutil.copytree(partly_lost.out, tmp_path / "out")
+
+
+def test_an_asset_is_lost_alone(partly_lost):
+    assert journals(partly_lost.out)[:2] == partly_lost.alone[1:]
+
+
+def test_a_lost_asset_has_its_reason(partly_lost):
+    failures = partly_lost.failures
     assert set(failures) == {"north/wing-0", "north/not a name!", "north/void"}
     assert "colour" in failures["north/wing-0"]
     assert "void.csv is empty" in failures["north/void"]
-    assert journals(tmp_path / "out")[:2] == alone[1:]
-    for line, words in ((LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")):
-        with pytest.raises(FleetError, match=words):
-            FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
 
-    address, ended, file = Queue[str](), Event(), tmp_path / "out" / "watched.json"
-    given = (tmp_path / "out", 0, address.put, lambda: not ended.is_set())
-    serving = Thread(target=serve_fleet, args=given)
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [(LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")],
+)
+def test_a_fleet_without_recordings_is_refused(fleet_file, tmp_path, line, sentence):
+    with pytest.raises(FleetError, match=sentence):
+        FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
+
+
+@pytest.fixture
+def port_of_page(lost_folder: Path) -> Iterator[int]:
+    """The port at which the page of that fleet is served."""
+    address, ended = Queue[str](), Event()
+    arguments = (lost_folder, 0, address.put, lambda: not ended.is_set())
+    serving = Thread(target=serve_fleet, args=arguments)
     serving.start()
-    port = int(address.get(timeout=300).rstrip("/").rpartition(":")[2])
-
     try:
-        status, page = served(port)
-        assert status == 200
-        for words in (
-            "wing-1",
-            "colour",  # why that one is not watched
-            "3 of 6 assets are not watched",
-            "Without a step yet: 1 asset (north/wing-9)",
-            "<strong>1</strong><span>messages refused",
-        ):
-            assert words in page
-        assert served(port, "/version") == (200, "0")
-        assert served(port, host="evil.example")[0] == 404
-        state = json.loads(file.read_text())
-        asset = state["assets"]["north/wing-1"]
-        asset["alarms"] = 1234
-        file.write_text(json.dumps(state))
-        wait_until(lambda: served(port, "/version") == (200, "1"))
-        assert "1234" in served(port)[1]
+        yield int(address.get(timeout=300).rstrip("/").rpartition(":")[2])
     finally:
         ended.set()
         serving.join()
-    del asset["last"]["health"]
-    file.write_text(json.dumps(state))
+
+
+def test_the_page_of_a_fleet_says_which_assets_are_lost(port_of_page):
+    status, page = served(port_of_page)
+    assert status == 200
+    for words in (
+        "wing-1",
+        "colour",  # why that one is not watched
+        "3 of 6 assets are not watched",
+        "Without a step yet: 1 asset (north/wing-9)",
+        "<strong>1</strong><span>messages refused",
+    ):
+        assert words in page
+
+
+def test_the_page_of_a_fleet_is_served_to_this_machine_alone(port_of_page):
+    assert served(port_of_page, host="evil.example")[0] == 404
+
+
+def test_the_page_of_a_fleet_follows_its_record(port_of_page, lost_folder):
+    file = lost_folder / "watched.json"
+    record = json.loads(file.read_text())
+    assert served(port_of_page, "/version") == (200, "0")
+    record["assets"]["north/wing-1"]["alarms"] = 1234
+    file.write_text(json.dumps(record))
+    wait_until(lambda: served(port_of_page, "/version") == (200, "1"))
+    assert "1234" in served(port_of_page)[1]
+
+
+def test_a_damaged_record_of_a_fleet_is_refused(lost_folder):
+    file = lost_folder / "watched.json"
+    record = json.loads(file.read_text())
+    del record["assets"]["north/wing-1"]["last"]["health"]
+    file.write_text(json.dumps(record))
     with pytest.raises(FleetError, match="out is damaged or of another version"):
-        fleet_page(tmp_path / "out", ATTENTION_ROWS)
+        fleet_page(lost_folder, ATTENTION_ROWS)
