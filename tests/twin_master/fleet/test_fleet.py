@@ -124,13 +124,11 @@ def test_states_of_a_belief_have_the_levels_of_their_regions(present_group):
     assert levels["z1"].dims == levels["z2"].dims == ("state",)
 
 
-def test_a_run_is_chosen_from_by_the_labels_of_a_fleet(library_file, whole, tmp_path):
-    options = {"strain_library": library_file}
-    run = open_run(new_run("growing_damage", tmp_path / "one", options).folder)
-    for tree in (run, open_fleet(whole)):
+def test_a_run_is_chosen_from_by_the_labels_of_a_fleet(single_run, whole):
+    for tree in (single_run, open_fleet(whole)):
         assert tree.sel(region="z1").sizes.get("region") is None
     for name in ("filtered", "smoothed", "predicted", "truth"):
-        assert "region" not in run[name].sel(region="z1").dims
+        assert "region" not in single_run[name].sel(region="z1").dims
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,11 @@
 """What a fleet teaches, against enumeration, closed forms and the truth."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,36 +126,62 @@ def grid_of(*counts: tuple[int, int]) -> LikelihoodGrid:
 SIMILAR, MANY = ((3, 47), (6, 44), (2, 48), (9, 41), (4, 46)), (22_500, 427_500)
 
 
-@pytest.mark.parametrize(
-    ("counts", "beside", "close"),
-    [
+class DenseSum:
+    """Groups with a beta-binomial law each, summed over a dense grid of shared mean and concentration."""
+
+    def __init__(self, counts: Sequence[tuple[int, int]]) -> None:
+        low, high = logit(np.array([LOWEST, HIGHEST]))
+        middles = np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401
+        concentrations = 10.0 ** (np.log10(3.0) + (np.arange(120) + 0.5) / 40.0)
+        self.mean, self.concentration = np.meshgrid(expit(middles), concentrations, indexing="ij")
+        self.a = self.mean * self.concentration
+        self.b = (1.0 - self.mean) * self.concentration
+        likelihoods = [betabinom.pmf(worsened, worsened + kept, self.a, self.b) for worsened, kept in counts]
+        weight = np.prod(likelihoods, axis=0)
+        self.weight = weight / weight.sum()
+
+    def expectation(self, values: np.ndarray) -> float:
+        """Return the posterior mean of values on the grid."""
+        return float((self.weight * values).sum())
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
         (SIMILAR, (), 1e-3),
         (SIMILAR, ((5, 95),), 1e-3),
         ((MANY, (1, 249)), (), 1e-2),
         ((MANY, (13, 237)), (), 1e-3),
     ],
 )
-def test_groups_share_what_a_dense_sum_says(counts, beside, close):
-    """Also beside another probability, which says nothing of it, and one of few twins beside one of many."""
-    posterior = shared_posterior([grid_of(own, *beside) for own in counts])
-    found, groups = posterior.hyperparameters[0], posterior.groups
-    low, high = logit(np.array([LOWEST, HIGHEST]))
-    m, kappa = np.meshgrid(
-        expit(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
-        10.0 ** (np.log10(3.0) + (np.arange(120) + 0.5) / 40.0),
-        indexing="ij",
-    )
-    a, b = m * kappa, (1.0 - m) * kappa
-    weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
-    weight /= weight.sum()
-    assert found["mean"] == pytest.approx(float((weight * m).sum()), rel=close)
-    assert found["log10_concentration"] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=close)
-    for (n, k), (marginal, *_) in zip(counts, groups, strict=True):
-        exact = float((weight * (a + n) / (kappa + n + k)).sum())
-        assert marginal.mean == pytest.approx(exact, rel=max(close, 2e-3))
-        for bound, reached in zip(marginal.interval(), (0.025, 0.975), strict=True):
-            below = float((weight * beta.cdf(bound, a + n, b + k)).sum())
-            assert below == pytest.approx(reached, abs=4e-3)
+def shared_groups(request: pytest.FixtureRequest) -> tuple[Any, Any, Any, float]:
+    """The counts of groups, their posterior, the dense sum, and the relative error that is allowed.
+
+    One case stands beside another probability, which says nothing of it; some have one group of few twins
+    beside one of many.
+    """
+    counts, counts_of_other_control, tolerance = request.param
+    posterior = shared_posterior([grid_of(own, *counts_of_other_control) for own in counts])
+    return counts, posterior, DenseSum(counts), tolerance
+
+
+def test_groups_share_the_hyperparameters_of_a_dense_sum(shared_groups):
+    _, posterior, dense, tolerance = shared_groups
+    shared = posterior.hyperparameters[0]
+    log10_concentration = dense.expectation(np.log10(dense.concentration))
+    assert shared["mean"] == pytest.approx(dense.expectation(dense.mean), rel=tolerance)
+    assert shared["log10_concentration"] == pytest.approx(log10_concentration, rel=tolerance)
+
+
+def test_groups_have_the_means_and_intervals_of_a_dense_sum(shared_groups):
+    counts, posterior, dense, tolerance = shared_groups
+    for (worsened, kept), (marginal, *_) in zip(counts, posterior.groups, strict=True):
+        a, b = dense.a + worsened, dense.b + kept
+        mean = dense.expectation(a / (a + b))
+        assert marginal.mean == pytest.approx(mean, rel=max(tolerance, 2e-3))
+        for bound, expected_probability in zip(marginal.interval(), (0.025, 0.975), strict=True):
+            probability = dense.expectation(beta.cdf(bound, a, b))
+            assert probability == pytest.approx(expected_probability, abs=4e-3)
 
 
 @pytest.mark.parametrize("members", [2, 5, 60])
@@ -186,40 +214,71 @@ def grown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
     return fleet, fly_fleet(fleet, folder / "fleet").folder
 
 
-def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
-    fleet, folder = grown
-    file = tmp_path / "learnt.toml"
-    record = learn_from_fleet(folder, file)["groups"]["growing_damage"]
-    for control, truth in (("2g", 0.05), ("3g", 0.1)):
-        rate = record["probability"][control]
-        assert abs(rate["mean"] - truth) < 4.0 * rate["standard_deviation"] < 0.1
-        assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
+@pytest.fixture(scope="module")
+def learnt_by_fleet(
+    grown: tuple[Fleet, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, Any], Path]:
+    """What the fleet teaches of its group, and the file with it."""
+    file = tmp_path_factory.mktemp("learnt") / "learnt.toml"
+    return learn_from_fleet(grown[1], file)["groups"]["growing_damage"], file
+
+
+@pytest.mark.parametrize(("control", "truth"), [("2g", 0.05), ("3g", 0.1)])
+def test_a_fleet_learns_its_rates(learnt_by_fleet, control, truth):
+    record, _ = learnt_by_fleet
+    rate = record["probability"][control]
+    assert abs(rate["mean"] - truth) < 4.0 * rate["standard_deviation"] < 0.1
+    assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
+
+
+def test_what_a_fleet_has_learnt_is_believed_and_leaves_the_truth(learnt_by_fleet):
+    record, file = learnt_by_fleet
     scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
     assert scenario.transition.probability["3g"] == record["probability"]["3g"]["mean"]
     assert scenario.truth.probability == {"2g": 0.05, "3g": 0.1}
+
+
+def test_the_noise_that_a_fleet_has_learnt_is_believed(grown, learnt_by_fleet):
+    fleet, _ = grown
+    record, file = learnt_by_fleet
+    scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
-    found = scenario.observation.standard_deviation
-    assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
+    expected = np.multiply(assumed, record["noise_factor"]["mean"])
+    assert scenario.observation.standard_deviation == pytest.approx(expected)
 
 
-def test_groups_share_their_rates_and_each_has_a_population_of_the_parameter(tmp_path):
-    """Of wings whose model tells the strains at any value of it."""
-    means, text = {"soft": 0.99, "stiff": 1.02}, 'format = 1\nfleet = { name = "two", seed = 5 }\n'
-    for name, mean in means.items():
+TRUE_MODULUS = {"soft": 0.99, "stiff": 1.02}
+"""Mean of the true modulus of each group, as a factor."""
+
+
+@pytest.fixture(scope="module")
+def learnt_by_two_groups(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What two groups teach, of wings whose model tells the strains at any value of the modulus."""
+    folder = tmp_path_factory.mktemp("two")
+    text = 'format = 1\nfleet = { name = "two", seed = 5 }\n'
+    for name, mean in TRUE_MODULUS.items():
         text += f'[[group]]\nname = "{name}"\nscenario = "growing_damage"\ncount = 8\nsteps = 12\n'
         text += f"parameters = {{ young_modulus_factor = {{ mean = {mean}, standard_deviation = 0.002 }} }}\n"
-    folder = fly_fleet(load_fleet(written(tmp_path, text)), tmp_path / "fleet").folder
-    record = learn_from_fleet(folder, tmp_path / "learnt.toml")
-    for name, mean in means.items():
-        group = record["groups"][name]
-        found = group["population"]["mean"]
-        assert group["population"]["parameter"] == "young_modulus_factor"
-        assert abs(found["mean"] - mean) < 4.0 * found["standard_deviation"] < 0.02
-        assert group["noise_factor"]["mean"] == pytest.approx(150.0 / 125.0, rel=0.03)
-    rates = [record["groups"][name]["probability"]["3g"]["mean"] for name in means]
-    assert min(rates) < record["shared"]["3g"]["mean"] < max(rates)
-    few = [record["groups"][name]["probability"]["2g"]["mean"] for name in means]
-    assert max(few) < 0.1  # alone, of few steps, they would be 0.19 and 0.45
+    flown = fly_fleet(load_fleet(written(folder, text)), folder / "fleet").folder
+    return learn_from_fleet(flown, folder / "learnt.toml")
+
+
+@pytest.mark.parametrize("name", TRUE_MODULUS)
+def test_each_group_has_a_population_of_the_parameter(learnt_by_two_groups, name):
+    group = learnt_by_two_groups["groups"][name]
+    mean = group["population"]["mean"]
+    assert group["population"]["parameter"] == "young_modulus_factor"
+    assert abs(mean["mean"] - TRUE_MODULUS[name]) < 4.0 * mean["standard_deviation"] < 0.02
+    assert group["noise_factor"]["mean"] == pytest.approx(150.0 / 125.0, rel=0.03)
+
+
+def test_groups_share_their_rates(learnt_by_two_groups):
+    """Alone, of few steps, the rates of 2g would be 0.19 and 0.45."""
+    groups = learnt_by_two_groups["groups"].values()
+    rates_of_3g = [group["probability"]["3g"]["mean"] for group in groups]
+    rates_of_2g = [group["probability"]["2g"]["mean"] for group in groups]
+    assert min(rates_of_3g) < learnt_by_two_groups["shared"]["3g"]["mean"] < max(rates_of_3g)
+    assert max(rates_of_2g) < 0.1
 
 
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
@@ -307,19 +366,39 @@ class Notes(Progress):
         self.notes.append(message)
 
 
-def test_a_fleet_of_table_transitions_teaches_its_noise_and_says_so_before_it_flies(grown, tmp_path):
-    fleet, folder = grown
-    (group,) = fleet.groups
-    tables = replace(group, scenarios=tuple(map(as_tables, group.scenarios)))
-    progress = Notes()
-    fly_fleet(replace(fleet, groups=(tables,)), tmp_path / "fleet", progress=progress)
-    assert any("`fleet learn` leaves the transitions as assumed" in note for note in progress.notes)
-    learnt = learn_from_fleet(tmp_path / "fleet", tmp_path / "learnt.toml")["groups"][group.name]
-    usual = learn_from_fleet(folder, tmp_path / "usual.toml")["groups"][group.name]
-    assert learnt["probability"] == {}
-    assert learnt["noise_factor"]["mean"] == pytest.approx(usual["noise_factor"]["mean"], rel=1e-6)
-    resolved = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=tmp_path / "learnt.toml"))
-    assert resolved.transition.probability == {"2g": 0.05, "3g": 0.1}
+class TableFleet:
+    """The fleet with transitions of tables, which no fleet learns; its notes, and what it teaches."""
+
+    def __init__(self, fleet: Fleet, folder: Path) -> None:
+        (group,) = fleet.groups
+        tables = replace(group, scenarios=tuple(map(as_tables, group.scenarios)))
+        progress = Notes()
+        fly_fleet(replace(fleet, groups=(tables,)), folder / "fleet", progress=progress)
+        self.notes = progress.notes
+        self.file = folder / "learnt.toml"
+        self.record = learn_from_fleet(folder / "fleet", self.file)["groups"][group.name]
+
+
+@pytest.fixture(scope="module")
+def table_fleet(grown: tuple[Fleet, Path], tmp_path_factory: pytest.TempPathFactory) -> TableFleet:
+    return TableFleet(grown[0], tmp_path_factory.mktemp("tables"))
+
+
+def test_a_fleet_of_table_transitions_says_before_it_flies_that_it_teaches_none(table_fleet):
+    sentence = "`fleet learn` leaves the transitions as assumed"
+    assert any(sentence in note for note in table_fleet.notes)
+
+
+def test_a_fleet_of_table_transitions_teaches_its_noise(table_fleet, learnt_by_fleet):
+    record, _ = learnt_by_fleet
+    noise_factor = record["noise_factor"]["mean"]
+    assert table_fleet.record["probability"] == {}
+    assert table_fleet.record["noise_factor"]["mean"] == pytest.approx(noise_factor, rel=1e-6)
+
+
+def test_what_table_transitions_teach_leaves_the_transitions_as_assumed(table_fleet):
+    scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=table_fleet.file))
+    assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
 
 
 def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(grown, tmp_path):
@@ -347,89 +426,141 @@ def test_states_of_other_units_count_alike_for_who_is_badly_off():
     np.testing.assert_allclose(found, [1.0, 1.25])
 
 
-def test_figures_of_a_fleet_have_standard_errors():
-    """Also of an asset that ended behind its first step; one that failed takes no part."""
-    random = np.random.default_rng(1)
-    error = random.standard_normal((52, 3, 2))
-    error[50, 1:] = np.nan
-    credible = np.r_[np.zeros(25), np.ones(25), 0.5, 1.0]
-    study = Outcomes.from_store(
-        {
-            "status": np.r_[np.ones(50), 3.0, 2.0],
-            "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(6, np.nan), 1.0],
-            "early": np.r_[np.ones(10), np.zeros(40), -1.0, 1.0],  # the last but one cannot be
-            "filtered/mean": error + 1.0,
-            "truth/state": np.ones((52, 3, 2)),
-            "filtered/log_evidence": error[..., 0],
-            "credible": credible,
-        }
-    )
+class DrawnOutcomes:
+    """Outcomes of 50 drawn assets, one that ended behind its first step, and one that failed."""
 
-    def of_missions(values: np.ndarray) -> Estimated:
-        return Estimated(pytest.approx(values.mean()), pytest.approx(values.std(ddof=1) / np.sqrt(51)))
-
-    bias, squared = (np.nanmean(error[:51] ** power, axis=1) for power in (1, 2))
-    assert study.bias[1] == of_missions(bias[:, 1])
-    assert study.log_evidence == of_missions(bias[:, 0])
-    assert study.credible_coverage == of_missions(credible[:51])
-    assert study.prompt_fallbacks == Estimated(pytest.approx(40 / 45), pytest.approx(beta(41, 6).std()))
-    assert study.early_fallbacks == Estimated(0.2, pytest.approx(beta(11, 41).std()))
-    again = [np.sqrt(np.mean(random.choice(squared[:, 0], 51))) for _ in range(4000)]  # the bootstrap
-    assert study.rms[0].value == pytest.approx(np.sqrt(squared[:, 0].mean()))
-    assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)
+    def __init__(self) -> None:
+        self.random = np.random.default_rng(1)
+        self.error = self.random.standard_normal((52, 3, 2))
+        self.error[50, 1:] = np.nan
+        self.credible = np.r_[np.zeros(25), np.ones(25), 0.5, 1.0]
+        self.outcomes = Outcomes.from_store(
+            {
+                "status": np.r_[np.ones(50), 3.0, 2.0],
+                "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(6, np.nan), 1.0],
+                "early": np.r_[np.ones(10), np.zeros(40), -1.0, 1.0],  # the last but one cannot be
+                "filtered/mean": self.error + 1.0,
+                "truth/state": np.ones((52, 3, 2)),
+                "filtered/log_evidence": self.error[..., 0],
+                "credible": self.credible,
+            }
+        )
+        self.mean_errors = np.nanmean(self.error[:51], axis=1)
+        self.mean_squares = np.nanmean(self.error[:51] ** 2, axis=1)
 
 
-def test_the_report_names_who_needs_probability_of_leaving(grown):
-    fleet, folder = grown
-    text = write_fleet_report(folder).read_text()
-    (group,) = open_fleet(folder).values()
-    delay = group["delay"].values[~np.isnan(group["delay"].values)]
-    control, mean = (
-        group["observed/control_index"].values[:, -1],
-        group["filtered/mean"].values[:, -1].astype(float),
-    )
+@pytest.fixture
+def drawn_outcomes() -> DrawnOutcomes:
+    return DrawnOutcomes()
+
+
+def mean_of_assets(values: np.ndarray) -> Estimated:
+    """Return the mean of the 51 assets that did not fail, with its standard error."""
+    error = values.std(ddof=1) / np.sqrt(51)
+    return Estimated(pytest.approx(values.mean()), pytest.approx(error))
+
+
+def test_means_over_a_fleet_have_standard_errors(drawn_outcomes):
+    drawn = drawn_outcomes
+    assert drawn.outcomes.bias[1] == mean_of_assets(drawn.mean_errors[:, 1])
+    assert drawn.outcomes.log_evidence == mean_of_assets(drawn.mean_errors[:, 0])
+    assert drawn.outcomes.credible_coverage == mean_of_assets(drawn.credible[:51])
+
+
+def test_fractions_of_a_fleet_have_standard_errors_of_a_beta_distribution(drawn_outcomes):
+    outcomes = drawn_outcomes.outcomes
+    error_of_prompt = pytest.approx(beta(41, 6).std())
+    error_of_early = pytest.approx(beta(11, 41).std())
+    assert outcomes.prompt_fallbacks == Estimated(pytest.approx(40 / 45), error_of_prompt)
+    assert outcomes.early_fallbacks == Estimated(0.2, error_of_early)
+
+
+def test_an_rms_error_of_a_fleet_has_the_standard_error_of_a_bootstrap(drawn_outcomes):
+    squares = drawn_outcomes.mean_squares[:, 0]
+    random = drawn_outcomes.random
+    resampled = [np.sqrt(np.mean(random.choice(squares, 51))) for _ in range(4000)]
+    assert drawn_outcomes.outcomes.rms[0].value == pytest.approx(np.sqrt(squares.mean()))
+    assert drawn_outcomes.outcomes.rms[0].error == pytest.approx(np.std(resampled), rel=0.1)
+
+
+class GrownGroup:
+    """The group of the grown fleet: its last controls and means, and what its twins know."""
+
+    def __init__(self, fleet: Fleet, folder: Path) -> None:
+        self.folder = folder
+        self.plan = fleet.groups[0]
+        self.scenario = self.plan.scenarios[0]
+        self.knowledge = load_knowledge(group_folder(folder, self.plan, 0), self.scenario)
+        (self.store,) = open_fleet(folder).values()
+        self.control = self.store["observed/control_index"].values[:, -1]
+        self.loss = self.store["filtered/mean"].values[:, -1].astype(float).sum(axis=1)
+
+    @property
+    def certain(self) -> np.ndarray:
+        """Return a belief for each state in which the state is certain."""
+        return np.eye(self.knowledge.model.states.size)
+
+
+@pytest.fixture(scope="module")
+def grown_group(grown: tuple[Fleet, Path]) -> GrownGroup:
+    return GrownGroup(*grown)
+
+
+def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
+    text = write_fleet_report(grown_group.folder).read_text()
+    delays = grown_group.store["delay"].values
+    delays = delays[~np.isnan(delays)]
+    worst_off = grown_group.plan.members[int(np.argmax(grown_group.loss))].name
     opening = (
-        f"60 of 60 assets have flown. In {len(delay)} assets the damage called for another control; the "
-        f"fallback came within 2 steps of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
-        f"{fleet.groups[0].members[int(np.argmax(mean.sum(axis=1)))].name} of growing_damage: "
+        f"60 of 60 assets have flown. In {len(delays)} assets the damage called for another control; the "
+        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%. The worst off is "
+        f"{worst_off} of growing_damage: "
     )
     for words in (opening, "60 assets in 1 group", "The assets by health", "Who needs attention next"):
         assert words in text
 
-    scenario = fleet.groups[0].scenarios[0]
-    knowledge = load_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
-    model, policy = knowledge.model, knowledge.plan.control_index
-    belief = np.eye(model.states.size)
-    always = replace(knowledge, policy=BeliefPolicy(np.ones((1, len(belief))), np.array([1])))
-    assert [probability_of_leaving(always, belief, one).tolist() for one in (1, 0)] == [
-        [0.0] * 25,
-        [1.0] * 25,
-    ]
-    found = probability_of_leaving(knowledge, belief, 1)
-    assert (found[policy != 1] == 1.0).all()
-    kept = policy == 1  # the damage moves under the control in force as long as it is kept
-    stays = model.transition.matrix[1][np.ix_(kept, kept)]
-    chance = 1.0 - np.linalg.matrix_power(stays, scenario.mission.prediction_steps - 1).sum(axis=1)
-    np.testing.assert_allclose(found[kept], chance, atol=1e-12)
-    assert np.ptp(chance) > 0.1
-    section = scenario.planner.model_copy(update={"decide_on": "predicted"})
-    ahead = replace(knowledge, scenario=scenario.model_copy(update={"planner": section}))
-    np.testing.assert_allclose(
-        probability_of_leaving(ahead, belief, 1), model.transition.matrix[1] @ found, atol=1e-12
-    )
 
-    # Who gave an alarm comes first, then who leaves soon; with the same percentage by its state.
-    beliefs, alarms = (
-        group["filtered/last_probability"].values.astype(float),
-        group["notice/count"].values[:, 0],
-    )
-    soon = [
-        probability_of_leaving(knowledge, own[None], int(u))[0]
-        for own, u in zip(beliefs, control, strict=True)
+def test_a_policy_of_one_control_is_never_left_or_at_once(grown_group):
+    certain = grown_group.certain
+    always = BeliefPolicy(np.ones((1, len(certain))), np.array([1]))
+    knowledge = replace(grown_group.knowledge, policy=always)
+    assert probability_of_leaving(knowledge, certain, 1).tolist() == [0.0] * 25
+    assert probability_of_leaving(knowledge, certain, 0).tolist() == [1.0] * 25
+
+
+def test_the_probability_of_leaving_a_control_is_that_of_the_states_without_it(grown_group):
+    """The damage moves under the control in force as long as it is kept."""
+    knowledge, scenario = grown_group.knowledge, grown_group.scenario
+    leaving = probability_of_leaving(knowledge, grown_group.certain, 1)
+    is_kept = knowledge.plan.control_index == 1
+    staying = knowledge.model.transition.matrix[1][np.ix_(is_kept, is_kept)]
+    later_steps = scenario.mission.prediction_steps - 1
+    expected = 1.0 - np.linalg.matrix_power(staying, later_steps).sum(axis=1)
+    assert (leaving[~is_kept] == 1.0).all()
+    np.testing.assert_allclose(leaving[is_kept], expected, atol=1e-12)
+    assert np.ptp(expected) > 0.1
+
+
+def test_a_twin_that_decides_on_predictions_leaves_a_control_a_step_earlier(grown_group):
+    knowledge, certain = grown_group.knowledge, grown_group.certain
+    planner = grown_group.scenario.planner.model_copy(update={"decide_on": "predicted"})
+    predicting = replace(knowledge, scenario=grown_group.scenario.model_copy(update={"planner": planner}))
+    expected = knowledge.model.transition.matrix[1] @ probability_of_leaving(knowledge, certain, 1)
+    np.testing.assert_allclose(probability_of_leaving(predicting, certain, 1), expected, atol=1e-12)
+
+
+def test_the_report_names_who_needs_attention(grown_group):
+    """First who gave an alarm, then who leaves soon; among equal percentages the worst state."""
+    beliefs = grown_group.store["filtered/last_probability"].values.astype(float)
+    alarms = grown_group.store["notice/count"].values[:, 0]
+    leaving = [
+        probability_of_leaving(grown_group.knowledge, belief[None], int(control))[0]
+        for belief, control in zip(beliefs, grown_group.control, strict=True)
     ]
-    printed = np.rint(100.0 * np.maximum(soon, 0.0))
-    worst = np.lexsort((-mean.sum(axis=1), -printed, -alarms))
-    assert max(soon) > min(soon) + 0.1
-    assert len(set(printed)) < len(set(soon))
-    table = fleet_page(folder, ATTENTION_ROWS).partition("Who needs attention next")[2]
-    assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
+    percentage = np.rint(100.0 * np.maximum(leaving, 0.0))
+    order = np.lexsort((-grown_group.loss, -percentage, -alarms))
+    page = fleet_page(grown_group.folder, ATTENTION_ROWS)
+    table = page.partition("Who needs attention next")[2]
+    assert max(leaving) > min(leaving) + 0.1
+    assert len(set(percentage)) < len(set(leaving))
+    assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in order[:50]]

@@ -74,119 +74,241 @@ def tutor(
     return Tutor(watch, search, wait=wait)
 
 
-def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
-    (tmp_path / "whole").mkdir()
-    watch = watchful(base, tmp_path / "whole" / "watch")
-    decisions = list[dict[str, Any]]()
-    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).teach)
-    records = journal(watch.folder)
-    (verdict,) = [record["verdict"] for record in records if "verdict" in record]
-    (model,) = [record["model"] for record in records if "model" in record]
-    alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
-    assert verdict["to_step"] == alarm["step"] + 10
+class TaughtWatch:
+    """A watch that sees a gauge come loose; a search names it, and its patch is tried and adopted."""
+
+    def __init__(self, base: Watch, recording: Path, folder: Path) -> None:
+        self.recording = recording
+        self.watch = watchful(base, folder / "watch")
+        self.decisions = list[dict[str, Any]]()
+        feed = CsvFeed(recording, self.watch.scenario)
+        self.watch.run(feed, self.decisions.append, tutor(self.watch, folder, "named", -0.3).teach)
+        self.records = journal(self.watch.folder)
+        (self.verdict,) = [record["verdict"] for record in self.records if "verdict" in record]
+        (self.adoption,) = [record for record in self.records if "model" in record]
+        self.model = self.adoption["model"]
+        notices = [notice for decision in self.decisions for notice in decision["notices"]]
+        self.sentences = [notice["sentence"] for notice in notices]
+
+
+@pytest.fixture(scope="module")
+def taught_watch(base: Watch, loose: Path, tmp_path_factory: pytest.TempPathFactory) -> TaughtWatch:
+    return TaughtWatch(base, loose, tmp_path_factory.mktemp("taught"))
+
+
+def test_the_cause_is_searched_in_the_steps_around_the_alarm(taught_watch):
+    verdict = taught_watch.verdict
+    alarm_step = next(
+        decision["step"]
+        for decision in taught_watch.decisions
+        for notice in decision["notices"]
+        if notice["kind"] == "alarm"
+    )
+    assert verdict["to_step"] == alarm_step + 10
     assert 12 <= verdict["from_step"] <= 18
-    assert model["from_step"] == verdict["from_step"]
-    (adopted,) = [record["step"] for record in records if "model" in record]
-    steps = {record["step"]: record["log_evidence"] for record in records if "filtered" in record}
-    evidence = [steps[step] for step in range(model["from_step"], adopted + 1)]
-    assert model["before"]["log_evidence"] == pytest.approx(sum(evidence))
+    assert taught_watch.model["from_step"] == verdict["from_step"]
+
+
+def test_an_adopted_patch_explains_more_than_the_model_before_it(taught_watch):
+    model = taught_watch.model
+    evidence = {
+        record["step"]: record["log_evidence"] for record in taught_watch.records if "filtered" in record
+    }
+    steps = range(model["from_step"], taught_watch.adoption["step"] + 1)
+    assert model["before"]["log_evidence"] == pytest.approx(sum(evidence[step] for step in steps))
     assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
-    said = [notice["sentence"] for d in decisions for notice in d["notices"]]
-    searched = [sentence for sentence in said if "belief and decision follow" not in sentence]
-    assert "named. It is so. The patch is tried" in searched[1]
-    assert "is believed from step" in searched[2]
-    assert len(searched) == 3
-    asked = decisions[verdict["to_step"]]  # before anything is taught the gauge is known to be off
-    assert asked["decided_by"] == "gauge 5 off"
-    assert asked["hypotheses"]["gauge 5 off"] > 0.9
-    assert [
-        notice.sentence for _, notice in notices_since(watch, 0)
-    ] == said  # in the report too, though filtered anew
-    assert (
-        notices_since(watch, asked["step"])[0] == notices_since(watch, 0)[0]
-    )  # the first alarm also in that of the last steps
-    # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
-    last = records[-1]["filtered"]
-    assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert viewed(watch.folder).drawings == []  # steps show no motion, and no force in it
-    # Stopped within the trial, and after the adoption: the same journal.
+
+
+def test_alarm_trial_and_adoption_are_told(taught_watch):
+    searching = [
+        sentence for sentence in taught_watch.sentences if "belief and decision follow" not in sentence
+    ]
+    _, trial, adoption = searching
+    assert "named. It is so. The patch is tried" in trial
+    assert "is believed from step" in adoption
+
+
+def test_before_anything_is_taught_the_loose_gauge_is_known_to_be_off(taught_watch):
+    decision = taught_watch.decisions[taught_watch.verdict["to_step"]]
+    assert decision["decided_by"] == "gauge 5 off"
+    assert decision["hypotheses"]["gauge 5 off"] > 0.9
+
+
+def test_the_report_has_the_notices_that_were_told_though_steps_are_filtered_anew(taught_watch):
+    notices = notices_since(taught_watch.watch, 0)
+    assert [notice.sentence for _, notice in notices] == taught_watch.sentences
+
+
+def test_the_report_of_the_last_steps_has_the_first_alarm_too(taught_watch):
+    watch, step = taught_watch.watch, taught_watch.verdict["to_step"]
+    assert notices_since(watch, step)[0] == notices_since(watch, 0)[0]
+
+
+def test_once_it_is_taught_a_twin_knows_the_wing_as_if_no_gauge_had_come_loose(taught_watch, mission):
+    last_belief = np.array(taught_watch.records[-1]["filtered"])
+    assert np.abs(last_belief - mission.filtered[-1]).max() < 0.2
+
+
+def test_a_view_of_steps_draws_no_missing_force(taught_watch):
+    """Steps show no motion, and no force in it."""
+    assert viewed(taught_watch.watch.folder).drawings == []
+
+
+def test_a_watch_that_was_stopped_within_the_trial_and_after_the_adoption_is_the_same(
+    taught_watch, base, tmp_path
+):
     stopped = watchful(base, tmp_path / "stopped")
-    asked = verdict["to_step"]
-    for end in (asked + 5, asked + 15, None):
+    to_step = taught_watch.verdict["to_step"]
+    for end in (to_step + 5, to_step + 15, None):
         teach = tutor(stopped, tmp_path, "named", -0.3).teach
-        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
+        stopped.run(CsvFeed(taught_watch.recording, stopped.scenario), str, teach, step_limit=end)
         again = watchful(stopped, tmp_path / f"{end}")
         check_same(again.folder, stopped.folder, JOURNAL_NAME)
         stopped = again
-    check_same(stopped.folder, watch.folder, JOURNAL_NAME)
+    check_same(stopped.folder, taught_watch.watch.folder, JOURNAL_NAME)
 
 
-def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(noticing, recorded, tmp_path):
-    folder = tmp_path / "verdict"  # as `discrepancy run` leaves one
+def verdict_with_picture(folder: Path) -> Path:
+    """Write a verdict with a patch and the picture of a missing force, as `discrepancy run` leaves it."""
     (folder / "figures").mkdir(parents=True)
     (folder / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
     (folder / "verdict.json").write_text(json.dumps({"verdict": {"sentence": "It is so."}}))
     of_gauge(folder, "patch.json", -0.3)
-    ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
-    flight = viewed(noticing.folder)
-    before, number = flight.beliefs_in(flight.records_of_steps(0, 5)).expected.mean, flight.number
-    assert flight.drawings == []  # steps are no motion
-    with pytest.raises(MissionInputError, match="--from-step names one of the 20 steps"):
-        noticing.run(CsvFeed(recorded, noticing.scenario), str, patch=GivenPatch(folder / "patch.json", 21))
-    given = GivenPatch(folder / "patch.json", 15)
-    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, step_limit=25, patch=given)
-    store_watch(noticing, counts, report=False)
-    run = open_run(noticing.folder)
-    assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
-    figures, residual = figures_of(noticing.folder), run["filtered"]["residual"].values
-    assert figures["gap_after_patch_15"] == pytest.approx(np.sqrt(np.nanmean(residual[15:20] ** 2)))
-    assert "gap_before_patch_15" in figures
-    before_both = noticing.trial_of(folder / "patch.json", 10)().record["before"]["rms_residual"]
-    assert before_both == pytest.approx(np.sqrt(np.nanmean(residual[10:] ** 2)))
-    believed, controls = run["filtered"]["probability"].values, run["observed"]["control_index"].values
-    for part, model in zip((slice(15), slice(15, None)), noticing.models, strict=True):
-        expected, _ = model.knowledge.sensor_model.moments(known_control(believed[part], controls[part], 2))
-        np.testing.assert_allclose(run["filtered"]["quantity_mean"].values[part], expected, rtol=1e-12)
-    shutil.rmtree(folder)
-    while flight.update():
-        pass
-    assert flight.number > number  # what a view has told is void
-    seen = flight.records_of_steps(0, 25)
-    shown = flight.beliefs_in(seen)
-    np.testing.assert_array_equal(shown.expected.mean[:5], before)  # as it was told
-    controls = [step["control_index"] for step in seen]
-    for part, model in zip((slice(20), slice(20, None)), noticing.models, strict=True):
-        joint = known_control(shown.probability[part], controls[part], 2)
-        expected, _ = model.knowledge.sensor_model.moments(joint)
-        np.testing.assert_allclose(shown.expected.mean[part], expected, rtol=1e-12)
-    np.testing.assert_array_equal(viewed(noticing.folder).beliefs_in(seen).expected.mean, shown.expected.mean)
-    (picture,) = flight.drawings
-    teller = FlightPage(flight)
+    return folder
+
+
+class PatchedWatch:
+    """A watch of 25 steps that believes a given patch from step 15 on; it is given behind step 20.
+
+    It is viewed before and after. The folder of the patch is removed in between.
+    """
+
+    def __init__(self, base: Watch, recording: Path, folder: Path) -> None:
+        self.watch = watchful(base, folder / "watch")
+        feed = CsvFeed(recording, self.watch.scenario)
+        verdict = verdict_with_picture(folder / "verdict")
+        ran(self.watch, feed, 20)
+        self.flight = viewed(self.watch.folder)
+        first_steps = self.flight.records_of_steps(0, 5)
+        self.first_means_before = self.flight.beliefs_in(first_steps).expected.mean
+        self.number_before = self.flight.number
+        self.drawings_before = [*self.flight.drawings]
+        with pytest.raises(MissionInputError, match="--from-step names one of the 20 steps"):
+            self.watch.run(feed, str, patch=GivenPatch(verdict / "patch.json", 21))
+        given = GivenPatch(verdict / "patch.json", 15)
+        counts = self.watch.run(feed, str, step_limit=25, patch=given)
+        store_watch(self.watch, counts, report=False)
+        self.trial_from_step_10 = self.watch.trial_of(verdict / "patch.json", 10)().record
+        shutil.rmtree(verdict)
+        while self.flight.update():
+            pass
+        self.run = open_run(self.watch.folder)
+        self.figures = figures_of(self.watch.folder)
+        self.residual = self.run["filtered"]["residual"].values
+        self.steps = self.flight.records_of_steps(0, 25)
+        self.shown = self.flight.beliefs_in(self.steps)
+
+    def expected_means(self, probability: np.ndarray, controls: Any, first_patched: int) -> np.ndarray:
+        """Return the means of the gauges by the models in force, of which the second one has the patch."""
+        means = []
+        for part, model in zip(
+            (slice(first_patched), slice(first_patched, None)), self.watch.models, strict=True
+        ):
+            joint = known_control(probability[part], controls[part], 2)
+            means.append(model.knowledge.sensor_model.moments(joint)[0])
+        return np.concatenate(means)
+
+
+@pytest.fixture(scope="module")
+def patched_watch(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> PatchedWatch:
+    return PatchedWatch(base, recorded, tmp_path_factory.mktemp("patched"))
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def test_the_store_names_the_patch_and_the_step_from_which_on_it_is_believed(patched_watch):
+    attributes = patched_watch.run.attrs
+    assert attributes["model_patch"] == "asset/model_patch_1.json"
+    assert attributes["model_patch_from_step"] == 15
+
+
+def test_figures_have_the_residual_before_and_after_a_patch(patched_watch):
+    after = root_mean_square(patched_watch.residual[15:20])
+    assert patched_watch.figures["gap_after_patch_15"] == pytest.approx(after)
+    assert "gap_before_patch_15" in patched_watch.figures
+
+
+def test_a_further_trial_compares_with_the_model_in_force(patched_watch):
+    before = patched_watch.trial_from_step_10["before"]["rms_residual"]
+    assert before == pytest.approx(root_mean_square(patched_watch.residual[10:]))
+
+
+def test_a_patch_is_believed_from_a_stated_step_on(patched_watch):
+    run = patched_watch.run
+    probability = run["filtered"]["probability"].values
+    controls = run["observed"]["control_index"].values
+    expected = patched_watch.expected_means(probability, controls, 15)
+    np.testing.assert_allclose(run["filtered"]["quantity_mean"].values, expected, rtol=1e-12)
+
+
+def test_a_view_tells_its_steps_anew_when_a_patch_is_given(patched_watch):
+    assert patched_watch.flight.number > patched_watch.number_before
+
+
+def test_a_view_shows_steps_as_they_were_told(patched_watch):
+    """Those before the patch was given, behind step 19, have the model without it."""
+    shown = patched_watch.shown
+    controls = [step["control_index"] for step in patched_watch.steps]
+    expected = patched_watch.expected_means(shown.probability, controls, 20)
+    np.testing.assert_array_equal(shown.expected.mean[:5], patched_watch.first_means_before)
+    np.testing.assert_allclose(shown.expected.mean, expected, rtol=1e-12)
+
+
+def test_a_new_view_shows_what_one_that_followed_shows(patched_watch):
+    new_view = viewed(patched_watch.watch.folder).beliefs_in(patched_watch.steps)
+    np.testing.assert_array_equal(new_view.expected.mean, patched_watch.shown.expected.mean)
+
+
+def test_a_view_shows_the_missing_force_of_a_patch_once_it_was_given(patched_watch):
+    page = FlightPage(patched_watch.flight)
+    request = Request(number=1, flight=-1, first=0, end=0, step=18, shown=-1, count=-1)
+    before = json.loads(str(page.answer(request)))
+    after = json.loads(str(page.answer(request.model_copy(update={"step": 19}))))
+    assert before["picture"] is None
+    assert after["picture"]["said"] == "It is so."
+
+
+def test_the_picture_of_a_patch_is_kept_beside_the_watch(patched_watch, tmp_path):
+    """Steps alone have none, as they are no motion; a verdict that says nothing has none either."""
+    folder = shutil.copytree(patched_watch.watch.folder, tmp_path / "watch")
+    (picture,) = viewed(folder).drawings
+    verdict = picture.path.parent.parent / "verdict.json"
+    assert patched_watch.drawings_before == []
     assert b"<svg" in picture.path.read_bytes()
-    asked = Request(number=1, flight=-1, first=0, end=0, step=18, shown=-1, count=-1)
-    assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
-    shown = json.loads(str(teller.answer(asked.model_copy(update={"step": 19}))))["picture"]
-    assert shown["said"] == "It is so."
-    (picture.path.parent.parent / "verdict.json").write_text("{}")
-    assert viewed(noticing.folder).drawings == []
+    verdict.write_text("{}")
+    assert viewed(folder).drawings == []
 
 
-def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
-    for kind, gain, sentence in (
+@pytest.mark.parametrize(
+    ("kind", "gain", "sentence"),
+    [
         ("named", 0.3, "and is not adopted."),
         ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
-    ):
-        watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(
-            CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).teach, step_limit=40
-        )
-        records = journal(watch.folder)
-        assert not any("model" in record for record in records)
-        notices = [n["sentence"] for record in records for n in record.get("notices", [])]
-        assert any(sentence in text for text in notices)
-        assert sum("searched for the cause" in text for text in notices) == 2
+    ],
+)
+def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path, kind, gain, sentence):
+    watch = watchful(base, tmp_path / "watch")
+    teach = tutor(watch, tmp_path, kind, gain).teach
+    watch.run(CsvFeed(loose, watch.scenario), str, teach, step_limit=40)
+    records = journal(watch.folder)
+    notices = [notice["sentence"] for record in records for notice in record.get("notices", [])]
+    assert not any("model" in record for record in records)
+    assert any(sentence in text for text in notices)
+    assert sum("searched for the cause" in text for text in notices) == 2
 
 
 def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
@@ -250,14 +372,21 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
     answer.write_text(json.dumps(["named", patch_record(SensorGain("*", -0.1, "strain"))]))
     watch = watchful(base, tmp_path / "watch")
     search = DiscrepancySearch(command=(sys.executable, str(script), str(answer), "-"))
-    teach = Tutor(watch, search, wait=True)
-    watch.run(CsvFeed(saturated, watch.scenario), str, teach.teach, step_limit=30)
+    tutor = Tutor(watch, search, wait=True)
+    watch.run(CsvFeed(saturated, watch.scenario), str, tutor.teach, step_limit=30)
     records = journal(watch.folder)
-    trial = next(n["sentence"] for r in records for n in r.get("notices", []) if n["kind"] == "trial")
+    notices = [notice for record in records for notice in record.get("notices", [])]
+    trial = next(notice["sentence"] for notice in notices if notice["kind"] == "trial")
     assert not any("model" in record for record in records)
-    assert "and is not adopted from its name alone, because many gauges raised the alarm" in trial
-    assert "uav-twin watch --resume --out DIR --model-patch DIR/teaching/steps_0_to_" in trial
-    assert " gained -" not in trial
+    check_sentence_of_unadopted_patch(trial)
+
+
+def check_sentence_of_unadopted_patch(sentence: str) -> None:
+    """Check that a trial says why the patch is not adopted, how it is believed all the same, and its gain."""
+    reason = "and is not adopted from its name alone, because many gauges raised the alarm"
+    assert reason in sentence
+    assert "uav-twin watch --resume --out DIR --model-patch DIR/teaching/steps_0_to_" in sentence
+    assert " gained -" not in sentence
 
 
 @pytest.fixture(scope="module")
@@ -272,9 +401,14 @@ def unbelieved(base, saturated, tmp_path_factory) -> tuple[Watch, list[dict[str,
 
 def test_a_decision_tells_no_state_that_is_not_believed(unbelieved):
     watch, decisions = unbelieved
-    health = {"mean": None, "standard_deviation": None, "unit": "1"}
-    assert (decisions[-1]["state_believed"], decisions[-1]["health"]) == (False, {"z1": health, "z2": health})
-    assert "no state is believed; next 2g" in decision_line(watch.scenario, decisions[-1])
+    last = decisions[-1]
+    unknown = {"mean": None, "standard_deviation": None, "unit": "1"}
+    assert (last["state_believed"], last["health"]) == (False, {"z1": unknown, "z2": unknown})
+    assert "no state is believed; next 2g" in decision_line(watch.scenario, last)
+
+
+def test_a_decision_tells_the_state_that_is_believed(unbelieved):
+    _, decisions = unbelieved
     assert decisions[0]["state_believed"]
     assert decisions[0]["health"]["z1"]["mean"] >= 0.0
 
@@ -307,42 +441,66 @@ def test_a_verdict_is_told_also_with_the_step_that_ends_a_silence_and_is_no_deci
     assert kinds == [["verdict", "heard"], []]
 
 
-def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
-    noticing, mission, loose, tmp_path, monkeypatch
+class LiveTeaching:
+    """A live watch whose search goes on until step 32, and whose patched model is built until step 45."""
+
+    def __init__(self, base: Watch, recording: Path, folder: Path) -> None:
+        self.watch = watchful(base, folder / "watch")
+        self.gate = folder / "gate"
+        self.tutor = tutor(self.watch, folder, "group", -0.3, str(self.gate), wait=False)
+        self.watch.run(CsvFeed(recording, self.watch.scenario), self.decide, self.tutor.teach)
+        self.records = journal(self.watch.folder)
+        self.adoption = next(record for record in self.records if "model" in record)
+        self.model = self.adoption["model"]
+        self.verdict = next(record["verdict"] for record in self.records if "verdict" in record)
+
+    def decide(self, decision: Any) -> None:
+        if decision["step"] == 32:
+            self.gate.touch()
+            wait_until(lambda: [*(self.watch.folder / "teaching").glob("steps*/verdict.json")])
+        if decision["step"] == 45:
+            wait_until(lambda: self.tutor.outcome is not None and self.tutor.outcome.done())
+
+
+@pytest.fixture(scope="module")
+def live_teaching(base: Watch, loose: Path, tmp_path_factory: pytest.TempPathFactory) -> LiveTeaching:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uav_twin.cause_search.NICENESS", 0)
+        return LiveTeaching(base, loose, tmp_path_factory.mktemp("live"))
+
+
+def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(live_teaching):
+    assert (live_teaching.verdict["step"], live_teaching.adoption["step"]) == (32, 45)
+    assert live_teaching.verdict["to_step"] < 32
+    assert live_teaching.model["from_step"] < 20
+
+
+def test_the_adoption_of_a_group_says_that_its_members_are_not_told_apart(live_teaching):
+    sentence = live_teaching.model["notice"]["sentence"]
+    assert sentence.endswith("which of them is true these data cannot tell.")
+
+
+def test_a_model_that_was_built_beside_live_steps_is_believed_from_its_step_on_to_the_bit(
+    live_teaching, mission
 ):
-    """It is built beside them, and believed behind the step that the journal says, to the bit."""
-    monkeypatch.setattr("uav_twin.cause_search.NICENESS", 0)
-    gate = tmp_path / "gate"
-    live = tutor(noticing, tmp_path, "group", -0.3, str(gate), wait=False)
-
-    def decide(decision: Any) -> None:
-        if decision["step"] == 32:  # the steps before were decided while the search went on
-            gate.touch()
-            wait_until(lambda: [*(noticing.folder / "teaching").glob("steps*/verdict.json")])
-        if decision["step"] == 45:  # and those behind the trial while the model was built
-            wait_until(lambda: live.outcome is not None and live.outcome.done())
-
-    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.teach)
-    model = next(record for record in journal(noticing.folder) if "model" in record)
-    verdict = next(record["verdict"] for record in journal(noticing.folder) if "verdict" in record)
-    assert (verdict["step"], model["step"]) == (32, 45)
-    assert verdict["to_step"] < 32
-    assert model["model"]["from_step"] < 20
-    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
-    twin, patched = (one.knowledge.twin() for one in noticing.models)
+    twin, patched = (model.knowledge.twin() for model in live_teaching.watch.models)
     for step, (row, control) in enumerate(zip(observed, mission.control_index.tolist(), strict=True)):
-        if step == model["model"]["from_step"]:
+        if step == live_teaching.model["from_step"]:
             patched.restore_state(twin.save_state())
             twin = patched
-        believed = twin.step(row, control).filtered.tolist()
-    assert journal(noticing.folder)[-1]["filtered"] == believed
-    again = watchful(noticing, tmp_path / "again")
-    twins = [
-        replay(one.journal_path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)
-    ]
-    assert twins[0].save_state() == twins[1].save_state()
+        belief = twin.step(row, control).filtered.tolist()
+    assert live_teaching.records[-1]["filtered"] == belief
+
+
+def test_a_watch_with_a_model_that_was_built_beside_live_steps_is_taken_up(live_teaching, tmp_path):
+    again = watchful(live_teaching.watch, tmp_path / "again")
+    first, second = (
+        replay(watch.journal_path, watch.models, watch.scenario.watch.lag)[0].twin
+        for watch in (again, live_teaching.watch)
+    )
+    assert first.save_state() == second.save_state()
 
 
 def test_a_policy_that_changes_is_told(base):
@@ -387,34 +545,72 @@ def test_gauges_taught_to_saturate_make_no_wing_healthier(base, tmp_path):
 
 
 def step(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
-    told = {"suspicion": {"log_evidence_none": evidence}, "filtered": [1.0]}
-    return {"step": number, "notices": list(alarms), **told}
+    """Return the record of a step with the evidence that no hypothesis is true."""
+    return {
+        "step": number,
+        "notices": list(alarms),
+        "suspicion": {"log_evidence_none": evidence},
+        "filtered": [1.0],
+    }
 
 
-def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_steps():
+ALARM = {"kind": "alarm", "sentence": "a", "since": 3}
+VERDICT = {"kind": "verdict", "sentence": "v"}
+HOLDING = 10.0
+"""Evidence of a step in which an alarm holds."""
+
+
+def take_steps(teaching: Teaching, first: int, end: int) -> None:
+    for number in range(first, end):
+        teaching.take_line(step(number, HOLDING))
+
+
+@pytest.fixture
+def alarmed() -> Teaching:
+    """An alarm in step 5, and the ten steps after it; in the last four of them it does not hold."""
     teaching = Teaching(100.0)
-    alarm = {"kind": "alarm", "sentence": "a", "since": 3}
-    for number in range(12):
-        teaching.take_line(step(number, 10.0, *([alarm] if number == 5 else [])))
+    take_steps(teaching, 0, 5)
+    teaching.take_line(step(5, HOLDING, ALARM))
+    take_steps(teaching, 6, 12)
     for number in (12, 13, 14, 15):
         teaching.take_line(step(number, math.log(100.0) - 0.1))
-    assert teaching.steps_to_search is None  # it did not hold ten steps after the alarm
-    teaching.take_line(step(16, math.log(100.0)))
-    assert teaching.steps_to_search == (3, 16)
-    told = {"kind": "verdict", "sentence": "v"}
-    teaching.take_line({"step": 16, "verdict": {"to_step": 16, "step": 16, "tried": False, "notice": told}})
-    assert teaching.steps_to_search is None
-    assert teaching.pending_notices == [told]
+    return teaching
+
+
+@pytest.fixture
+def searched(alarmed: Teaching) -> Teaching:
+    """The alarm held again in step 16; the search for its cause ended with a verdict."""
+    alarmed.take_line(step(16, math.log(100.0)))
+    alarmed.take_line({"step": 16, "verdict": {"to_step": 16, "step": 16, "tried": False, "notice": VERDICT}})
+    return alarmed
+
+
+def test_an_alarm_must_hold_ten_steps_after_it(alarmed):
+    assert alarmed.steps_to_search is None
+    alarmed.take_line(step(16, math.log(100.0)))
+    assert alarmed.steps_to_search == (3, 16)
+
+
+def test_a_verdict_is_told_with_the_next_step(searched):
+    assert searched.steps_to_search is None
+    assert searched.pending_notices == [VERDICT]
+    searched.take_line(step(17, HOLDING))
+    assert searched.pending_notices == []
+
+
+def test_the_cause_of_an_alarm_is_asked_again_with_twice_the_steps(searched):
     for number in range(17, 40):
-        teaching.take_line(step(number, 10.0))
-        assert (teaching.steps_to_search is not None) == (number >= 27)
-    assert teaching.steps_to_search == (3, 27)
-    assert teaching.pending_notices == []
-    teaching.take_line({"step": 40, "model": {"from_step": 8, "notice": told, "alarms": [alarm]}})
-    assert (teaching.steps_to_search, teaching.pending_notices) == (None, [told, alarm])
-    for number in range(41, 60):
-        teaching.take_line(step(number, 10.0))
-    assert teaching.steps_to_search == (8, 49)  # the alarm of the new model, and not before it was believed
+        searched.take_line(step(number, HOLDING))
+        assert (searched.steps_to_search is not None) == (number >= 27)
+    assert searched.steps_to_search == (3, 27)
+
+
+def test_the_alarm_of_a_new_model_is_asked_about_from_the_step_on_at_which_it_was_believed(searched):
+    take_steps(searched, 17, 40)
+    searched.take_line({"step": 40, "model": {"from_step": 8, "notice": VERDICT, "alarms": [ALARM]}})
+    assert (searched.steps_to_search, searched.pending_notices) == (None, [VERDICT, ALARM])
+    take_steps(searched, 41, 60)
+    assert searched.steps_to_search == (8, 49)
 
 
 def test_a_second_patch_stands_beside_the_first(tmp_path):
