@@ -2,6 +2,7 @@
 
 from functools import cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,25 +110,36 @@ def test_the_interval_of_a_state_is_not_learnt_as_noise():
     np.testing.assert_allclose(evidence, sensor.log_likelihood_sequence(seen, controls)[:, 0], atol=1e-10)
 
 
+def posterior_on_grid(values: Float) -> Learnt:
+    """Return the posterior of a parameter with prior N(0, 1) and likelihood N(0.61, 0.08) on some draws."""
+    prior = np.exp(-0.5 * values**2) / np.exp(-0.5 * values**2).sum()
+    weight = prior * np.exp(-0.5 * ((values - 0.61) / 0.08) ** 2)
+    return posterior_of_draws(values, prior, weight / weight.sum())
+
+
 def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie():
     """Draws wider apart than the posterior: the evidence between them is interpolated."""
-    fine, coarse = np.linspace(-3, 3, 2001), np.linspace(-3, 3, 25)
+    exact = posterior_on_grid(np.linspace(-3, 3, 2001))
+    coarse = posterior_on_grid(np.linspace(-3, 3, 25))
+    assert coarse.mean == pytest.approx(exact.mean, abs=0.005)
+    assert coarse.standard_deviation == pytest.approx(exact.standard_deviation, rel=0.05)
+    assert (coarse.lower, coarse.upper) == pytest.approx((exact.lower, exact.upper), abs=0.01)
 
-    def posterior(values: Float) -> Learnt:
-        prior = np.exp(-0.5 * values**2) / np.exp(-0.5 * values**2).sum()
-        weight = prior * np.exp(-0.5 * ((values - 0.61) / 0.08) ** 2)
-        return posterior_of_draws(values, prior, weight / weight.sum())
 
-    exact, rough = posterior(fine), posterior(coarse)
-    assert rough.mean == pytest.approx(exact.mean, abs=0.005)
-    assert rough.standard_deviation == pytest.approx(exact.standard_deviation, rel=0.05)
-    assert (rough.lower, rough.upper) == pytest.approx((exact.lower, exact.upper), abs=0.01)
-    spread = 0.08 / np.sqrt(1 + 0.08**2)
-    assert exact.standard_deviation == pytest.approx(spread, rel=0.01)
-    few = posterior_of_draws([2.0, 1.0, 2.0], [0.25, 0.5, 0.25], [0.4, 0.2, 0.4])  # or the same
-    assert (few.mean, few.lower, few.upper) == pytest.approx((1.8, 1.0, 2.0))
-    single = posterior_of_draws([2.0], [1.0], [1.0])
-    assert (single.mean, single.standard_deviation) == (2.0, 0.0)
+def test_the_posterior_of_many_draws_is_the_closed_form():
+    exact = posterior_on_grid(np.linspace(-3, 3, 2001))
+    standard_deviation = 0.08 / np.sqrt(1 + 0.08**2)
+    assert exact.standard_deviation == pytest.approx(standard_deviation, rel=0.01)
+
+
+def test_draws_may_be_few_and_the_same():
+    posterior = posterior_of_draws([2.0, 1.0, 2.0], [0.25, 0.5, 0.25], [0.4, 0.2, 0.4])
+    assert (posterior.mean, posterior.lower, posterior.upper) == pytest.approx((1.8, 1.0, 2.0))
+
+
+def test_a_single_draw_is_certain():
+    posterior = posterior_of_draws([2.0], [1.0], [1.0])
+    assert (posterior.mean, posterior.standard_deviation) == (2.0, 0.0)
 
 
 def test_a_belief_that_underflows_comes_back():
@@ -213,47 +225,105 @@ def test_predicted_follows_the_scenario_through_the_policy():
     assert found.reward_mean[0, 1, 1] == pytest.approx(asked)
 
 
-def test_gain_offset_and_noise_are_those_of_the_regression():
-    value = np.full((1, 1, 2, 1), 5.0)
-    value[0, 0, 1] = 8.0
-    sensor, one = GaussianSensorModel(value, [0.5]), model(levels=1)
-    priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=2.0)
-    learner = LearningFilter(one, sensor, priors)
-    controls = [0, 1, 1, 0, 1, 1, 0]
-    shown = value[0, 0, controls, 0]
-    seen = 1.5 + 0.93 * shown + np.array([0.1, -0.7, 0.4, 0.2, -0.1, np.nan, 0.9])
-    there = ~np.isnan(seen)
-    estimates = estimates_of(learner, seen[:, None], controls)
-    carried, learnt = [step.carried for step in estimates], estimates[-1].learnt
-    # Bayesian linear regression of (o - h) / sigma on (offset, gain) in their prior deviations.
-    design = np.stack([np.full(6, 2.0), 0.1 * shown[there]], axis=1) / 0.5
-    left = (seen - shown)[there] / 0.5
-    covariance = np.linalg.inv(np.eye(2) + design.T @ design)
-    mean = covariance @ design.T @ left
-    squares = 10.0 + left @ left - mean @ design.T @ left
-    scale2 = squares / (10.0 + 6.0 - 2.0)
-    for place, name, prior in ((0, "gauge_offset[1]", 2.0), (1, "gauge_gain[1]", 0.1)):
-        found, wide = learnt[name], prior * np.sqrt(scale2 * covariance[place, place])
-        assert (found.mean, found.standard_deviation) == pytest.approx((prior * mean[place], wide))
-        ends = norm(prior * mean[place], wide).ppf([0.05, 0.95])
-        assert (found.lower, found.upper) == pytest.approx(ends)
-    noise, squared = learnt["noise_scale[1]"], invgamma(8.0, scale=0.5 * squares)
+SIGMA = 0.5
+PRIOR = {"gauge_offset[1]": 2.0, "gauge_gain[1]": 0.1}
+"""Noise of the gauge, and prior standard deviations of its offset and gain."""
+
+
+class Regression:
+    """Readings of one gauge with an offset, a gain and noise: as they are learnt, and in closed form.
+
+    The closed form is the Bayesian linear regression of (o - h) / sigma on offset and gain in units of
+    their prior standard deviations, with the noise scale integrated out.
+    """
+
+    def __init__(self) -> None:
+        value = np.full((1, 1, 2, 1), 5.0)
+        value[0, 0, 1] = 8.0
+        controls = [0, 1, 1, 0, 1, 1, 0]
+        self.sensor = GaussianSensorModel(value, [SIGMA])
+        priors = Learning(noise_degrees=10.0, gauge_gain=0.1, gauge_offset=2.0)
+        self.learner = LearningFilter(model(levels=1), self.sensor, priors)
+        self.shown = value[0, 0, controls, 0]
+        errors = np.array([0.1, -0.7, 0.4, 0.2, -0.1, np.nan, 0.9])
+        self.observed = 1.5 + 0.93 * self.shown + errors
+        self.estimates = estimates_of(self.learner, self.observed[:, None], controls)
+        self.learnt = self.estimates[-1].learnt
+        self.solve()
+
+    def solve(self) -> None:
+        is_read = ~np.isnan(self.observed)
+        self.design = np.stack([np.full(6, 2.0), 0.1 * self.shown[is_read]], axis=1) / SIGMA
+        residual = (self.observed - self.shown)[is_read] / SIGMA
+        self.covariance = np.linalg.inv(np.eye(2) + self.design.T @ self.design)
+        self.mean = self.covariance @ self.design.T @ residual
+        self.squares = 10.0 + residual @ residual - self.mean @ self.design.T @ residual
+        self.squared_scale = self.squares / (10.0 + 6.0 - 2.0)
+
+    def last_prediction(self) -> tuple[float, float]:
+        """Return mean and standard deviation of the quantity under the last reading."""
+        row = self.design[-1]
+        variance = self.squared_scale * row @ self.covariance @ row
+        return self.shown[-1] + SIGMA * row @ self.mean, SIGMA * np.sqrt(variance)
+
+
+@pytest.fixture(scope="module")
+def regression() -> Regression:
+    return Regression()
+
+
+@pytest.mark.parametrize(("number", "name"), [*enumerate(PRIOR)])
+def test_offset_and_gain_are_those_of_the_regression(regression, number, name):
+    learnt, prior = regression.learnt[name], PRIOR[name]
+    mean = prior * regression.mean[number]
+    variance = regression.squared_scale * regression.covariance[number, number]
+    standard_deviation = prior * np.sqrt(variance)
+    interval = norm(mean, standard_deviation).ppf([0.05, 0.95])
+    assert (learnt.mean, learnt.standard_deviation) == pytest.approx((mean, standard_deviation))
+    assert (learnt.lower, learnt.upper) == pytest.approx(interval)
+
+
+def test_the_noise_is_that_of_the_regression(regression):
+    noise = regression.learnt["noise_scale[1]"]
+    squared = invgamma(8.0, scale=0.5 * regression.squares)
     assert noise.mean == pytest.approx(squared.expect(np.sqrt))
     assert (noise.lower, noise.upper) == pytest.approx(np.sqrt(squared.ppf([0.05, 0.95])))
-    row = design[-1]
-    rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
-    expectation = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]]))
-    found = expectation.filtered(carried, [step.filtered for step in estimates], seen[:, None])
-    spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
-    assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
-    assert found.standard_deviation[-1, 0] == pytest.approx(spread)
-    assert found.noise[-1, 0] == pytest.approx(0.5 * np.sqrt(scale2))
-    distance = abs(seen[-1] - found.mean[-1, 0])
-    folded = foldnorm(distance / spread, scale=spread)
-    assert found.reward_mean[-1, 2] == pytest.approx(-folded.mean() / 0.8)
-    assert found.reward_standard_deviation[-1, 2] == pytest.approx(folded.std() / 0.8)
-    low, high = norm(found.mean[-1, 0], spread).ppf([0.025, 0.975])
-    assert (found.lower[-1, 0], found.upper[-1, 0]) == pytest.approx((low, high), abs=1e-3 * spread)
+
+
+@pytest.fixture(scope="module")
+def expected_by_regression(regression: Regression) -> Any:
+    """What is expected of the gauge and of the reward from what was learnt."""
+    rewards = RewardModel(regression.sensor, 9.0, (0.0, 0.0), 0.8)
+    expectation = LearntExpectation(regression.learner, rewards, np.array([[1.0, 0.0]]))
+    carried = [step.carried for step in regression.estimates]
+    beliefs = [step.filtered for step in regression.estimates]
+    return expectation.filtered(carried, beliefs, regression.observed[:, None])
+
+
+def test_the_quantity_that_is_expected_is_that_of_the_regression(regression, expected_by_regression):
+    mean, standard_deviation = regression.last_prediction()
+    noise = SIGMA * np.sqrt(regression.squared_scale)
+    assert expected_by_regression.mean[-1, 0] == pytest.approx(mean)
+    assert expected_by_regression.standard_deviation[-1, 0] == pytest.approx(standard_deviation)
+    assert expected_by_regression.noise[-1, 0] == pytest.approx(noise)
+
+
+def test_the_reward_that_is_expected_is_that_of_a_folded_normal(regression, expected_by_regression):
+    _, standard_deviation = regression.last_prediction()
+    distance = abs(regression.observed[-1] - expected_by_regression.mean[-1, 0])
+    folded = foldnorm(distance / standard_deviation, scale=standard_deviation)
+    reward = expected_by_regression.reward_mean[-1, 2]
+    deviation = expected_by_regression.reward_standard_deviation[-1, 2]
+    assert reward == pytest.approx(-folded.mean() / 0.8)
+    assert deviation == pytest.approx(folded.std() / 0.8)
+
+
+def test_the_interval_that_is_expected_is_that_of_a_normal(regression, expected_by_regression):
+    _, standard_deviation = regression.last_prediction()
+    mean = expected_by_regression.mean[-1, 0]
+    interval = norm(mean, standard_deviation).ppf([0.025, 0.975])
+    found = (expected_by_regression.lower[-1, 0], expected_by_regression.upper[-1, 0])
+    assert found == pytest.approx(tuple(interval), abs=1e-3 * standard_deviation)
 
 
 def test_quantiles_are_those_of_the_mixture():

@@ -55,50 +55,96 @@ def drawn(random: np.random.Generator, steps: int, gauges: int = 3) -> Float:
     return np.array(rows)
 
 
-def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
-    model, sensors = small()
-    inner = ExactFilter(model, sensors)
-    seen = drawn(np.random.default_rng(3), 12)
-    seen[6:, 1] *= 1.4
-    words = NoticeWording(
-        names=("root", "spar", "tip"), command=""
-    )  # of an asset where none looks for causes
-    watched = estimates_of(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
-    for step, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
-        # The filter goes on as if it were alone, and the evidence is the model's.
-        np.testing.assert_array_equal(*(one.carried.arrays["log_filtered"] for one in (found, plain)))
-        assert found.log_evidence == plain.log_evidence
-        probability = {one.name: one.probability for one in found.hypotheses}
-        told = 1.0 - sum(probability.values())  # those that are left out are improbable
-        assert -1e-12 < told < 0.03
-        mixed = sum((one.probability * one.belief for one in found.hypotheses if one.belief is not None),
-                    np.zeros(3))  # fmt: skip
-        np.testing.assert_allclose(mixed / mixed.sum(), found.filtered, atol=2.0 * told + 1e-6)
-        if step < 6:
-            np.testing.assert_allclose(found.filtered, plain.filtered, atol=0.03)
+class LooseGauge:
+    """Twelve steps in which a gauge shows too much from step 6 on, of an asset where nobody looks for causes.
+
+    They are filtered by the model alone, and by the estimator that gives notice.
+    """
+
+    def __init__(self) -> None:
+        model, sensors = small()
+        self.filter = ExactFilter(model, sensors)
+        self.observed = drawn(np.random.default_rng(3), 12)
+        self.observed[6:, 1] *= 1.4
+        words = NoticeWording(names=("root", "spar", "tip"), command="")
+        watching = WatchfulEstimator(self.filter, sensors, DRAWS, words=words)
+        self.alone = estimates_of(self.filter, self.observed)
+        self.watched = estimates_of(watching, self.observed)
+        self.carried = [estimate.carried for estimate in self.watched]
+        self.last = self.watched[-1]
+
+
+@pytest.fixture(scope="module")
+def loose_gauge() -> LooseGauge:
+    return LooseGauge()
+
+
+def test_the_filter_goes_on_as_if_it_were_alone(loose_gauge):
+    """The evidence is the model's."""
+    for alone, watched in zip(loose_gauge.alone, loose_gauge.watched, strict=True):
+        filtered = (estimate.carried.arrays["log_filtered"] for estimate in (watched, alone))
+        np.testing.assert_array_equal(*filtered)
+        assert watched.log_evidence == alone.log_evidence
+
+
+def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state(loose_gauge):
+    """Hypotheses that are left out are improbable."""
+    for estimate in loose_gauge.watched:
+        left_out = 1.0 - sum(hypothesis.probability for hypothesis in estimate.hypotheses)
+        mixture = np.zeros(3)
+        for hypothesis in estimate.hypotheses:
+            if hypothesis.belief is not None:
+                mixture += hypothesis.probability * hypothesis.belief
+        assert -1e-12 < left_out < 0.03
+        np.testing.assert_allclose(mixture / mixture.sum(), estimate.filtered, atol=2.0 * left_out + 1e-6)
+
+
+def test_the_belief_is_that_of_the_filter_until_a_gauge_comes_loose(loose_gauge):
+    for alone, watched in zip(loose_gauge.alone[:6], loose_gauge.watched[:6], strict=True):
+        np.testing.assert_allclose(watched.filtered, alone.filtered, atol=0.03)
+    difference = loose_gauge.last.filtered - loose_gauge.alone[-1].filtered
+    assert np.abs(difference).max() > 0.1
+
+
+def test_the_loose_gauge_is_the_probable_hypothesis(loose_gauge):
+    probability = {hypothesis.name: hypothesis.probability for hypothesis in loose_gauge.last.hypotheses}
     assert probability["gauge 2 (spar) off"] > 0.9
-    assert found.suspicion.gauge_off > 0.9
-    (alarm,) = (notice for one in watched for notice in one.notices if notice.kind == "alarm")
-    assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
-    assert (
+    assert loose_gauge.last.suspicion.gauge_off > 0.9
+
+
+def test_an_alarm_names_the_gauge_and_the_step_from_which_on_it_is_off(loose_gauge):
+    notices = [notice for estimate in loose_gauge.watched for notice in estimate.notices]
+    (alarm,) = (notice for notice in notices if notice.kind == "alarm")
+    cause = (
         ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
         f"softened, since about step {alarm.since}"
-    ) in alarm.sentence
+    )
+    assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
+    assert cause in alarm.sentence
     assert alarm.sentence.endswith("alarm from 100)")
-    assert np.abs(found.filtered - plain.filtered).max() > 0.1
-    carried = [estimate.carried for estimate in watched]
-    smoothed = watchful().smoothed(carried)
-    np.testing.assert_allclose(smoothed[-1], found.filtered, atol=1e-6)
+
+
+def test_the_last_smoothed_belief_is_the_filtered_one(loose_gauge):
+    smoothed = watchful().smoothed(loose_gauge.carried)
+    np.testing.assert_allclose(smoothed[-1], loose_gauge.last.filtered, atol=1e-6)
     np.testing.assert_allclose(smoothed.sum(axis=1), 1.0)
-    right = carried[-1].arrays["notice/right"]
-    assert np.all(smoothed >= right * inner.smoothed(carried) - 1e-12)
     assert watchful().smoothed([]).shape == (0, 3)
-    # A model that takes the place of another begins without suspicion.
+
+
+def test_the_smoothed_belief_has_at_least_what_the_model_believes(loose_gauge):
+    smoothed = watchful().smoothed(loose_gauge.carried)
+    probability_of_model = loose_gauge.carried[-1].arrays["notice/right"]
+    by_model = loose_gauge.filter.smoothed(loose_gauge.carried)
+    assert np.all(smoothed >= probability_of_model * by_model - 1e-12)
+
+
+def test_a_model_that_takes_the_place_of_another_begins_without_suspicion(loose_gauge):
+    model, sensors = small()
     taught = GaussianSensorModel(sensors.value_per_draw * [[[[1.0, 1.4, 1.0]]]], 1.0)
-    other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
-    after = other.step(carried[-1], seen[-1], 0, 12)
-    assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
-    assert not after.notices
+    estimator = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
+    estimate = estimator.step(loose_gauge.carried[-1], loose_gauge.observed[-1], 0, 12)
+    assert max(estimate.suspicion.none_of_these, estimate.suspicion.gauge_off) < 0.05
+    assert not estimate.notices
 
 
 def test_shares_of_hypotheses_switch_as_their_chain_says():
@@ -260,25 +306,57 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
             encode_line(step_record(record))  # which holds no NaN and no infinity
 
 
-def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
-    """The twin believes what one believes that never had the reading."""
-    model, sensors = small()
-    twin, without = (
-        Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8) for _ in range(2)
-    )
-    seen, told = drawn(np.random.default_rng(5), 10), []
-    late, absurd = seen[5].copy(), seen.copy()
-    late[1], seen[5] = 1e9, np.nan
-    absurd[1:4, 2], seen[1:4, 2], absurd[5] = [1e9, np.nan, 1e16], np.nan, np.nan
-    for step, row in enumerate(absurd):
-        found, expected = twin.step(row, 0), without.step(seen[step], 0)
-        told += [(step, notice.kind, notice.sensors) for notice in found.notices]
-        assert bool(found.suspicion.left_out[2]) == (1 <= step < 4)
-        np.testing.assert_allclose(found.filtered, expected.filtered, rtol=1e-9)
-    assert told == [(1, "gauge_left_out", (3,)), (4, "gauge_back", (3,))]
-    revised = twin.revise(5, late)
+ABSURD_STEPS = range(1, 4)
+
+
+class AbsurdGauge:
+    """A twin to which gauge 3 shows absurd values in three steps, and a twin that never had them.
+
+    The reading of step 5 comes late.
+    """
+
+    def __init__(self) -> None:
+        model, sensors = small()
+        self.twin, self.twin_without = (
+            Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8) for _ in range(2)
+        )
+        observed = drawn(np.random.default_rng(5), 10)
+        self.late = observed[5].copy()
+        self.late[1] = 1e9
+        observed[5] = np.nan
+        without, absurd = observed.copy(), observed.copy()
+        without[1:4, 2] = np.nan
+        absurd[1:4, 2] = [1e9, np.nan, 1e16]
+        self.steps = [self.twin.step(row, 0) for row in absurd]
+        self.steps_without = [self.twin_without.step(row, 0) for row in without]
+
+
+@pytest.fixture
+def absurd_gauge() -> AbsurdGauge:
+    return AbsurdGauge()
+
+
+def test_an_absurd_gauge_is_left_out_and_told_once(absurd_gauge):
+    notices = [
+        (step, notice.kind, notice.sensors)
+        for step, estimate in enumerate(absurd_gauge.steps)
+        for notice in estimate.notices
+    ]
+    left_out = [bool(step.suspicion.left_out[2]) for step in absurd_gauge.steps]
+    assert left_out == [step in ABSURD_STEPS for step in range(10)]
+    assert notices == [(1, "gauge_left_out", (3,)), (4, "gauge_back", (3,))]
+
+
+def test_a_twin_believes_what_one_believes_that_never_had_the_absurd_reading(absurd_gauge):
+    for step, step_without in zip(absurd_gauge.steps, absurd_gauge.steps_without, strict=True):
+        np.testing.assert_allclose(step.filtered, step_without.filtered, rtol=1e-9)
+
+
+def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late(absurd_gauge):
+    revised = absurd_gauge.twin.revise(5, absurd_gauge.late)
+    notices = [(notice.kind, notice.sensors) for notice in revised.notices]
     assert revised.step == 9
-    assert [(n.kind, n.sensors) for n in revised.notices] == [("gauge_left_out", (2,)), ("gauge_back", (2,))]
+    assert notices == [("gauge_left_out", (2,)), ("gauge_back", (2,))]
     assert "Step 5: gauge 2 shows 1e+09" in revised.notices[0].sentence
 
 
@@ -311,73 +389,135 @@ def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
     assert alarms == alarmed
 
 
-@pytest.mark.parametrize("between", [False, True])
-def test_belief_and_decision_follow_what_holds_now(between):
-    """A gauge comes loose while damage grows and is mended; later half of the gauges are off for a while."""
-    wing = at_levels("paper_level_turns", between)
-    scenario = wing.scenario.model_copy(update={"notice": Noticing()})
-    known, random = replace(wing, scenario=scenario), np.random.default_rng(4)
-    states, gauges = known.model.states.coordinates, np.arange(24)
-    twins = {True: known.twin(lag=1), False: wing.twin(lag=1)}
-    course: dict[bool, list[TwinStep]] = {True: [], False: []}
-    truth = np.repeat([0.0, 0.2, 0.4, 0.6], [10, 10, 10, 60])
-    for step, z1 in enumerate(truth):
-        state = np.flatnonzero(np.isclose(states[:, 0], z1) & (states[:, 1] == 0.0))[0]
-        wrong = (gauges == 16) & (12 <= step < 46) | (gauges % 2 == 0) & (60 <= step < 80)
-        noise = 150e-6 * random.normal(size=24)
-        for watched, twin in twins.items():
-            control = course[watched][-1].next_control if step else 1
-            row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
-            course[watched].append(twin.step(row, control))
-    first = states[:, 0]
-    mean = {watched: np.array([found.filtered @ first for found in course[watched]]) for watched in course}
-    assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
-    assert mean[False][40:46].max() < 0.25  # the filter alone believes the gauge, flies on and wears the wing
-    assert {found.next_control for found in course[False][32:46]} == {1}
-    assert {found.next_control for found in course[True][32:]} == {0}
-    decided = [found.suspicion.decided_by for found in course[True] if found.suspicion]
-    assert {*decided[:11]} == {"model"}
-    assert {*decided[14:45]} == {"gauge 17 off"}
-    assert {*decided[50:60]} == {"model"}
-    assert {*decided[73:79]} == {"none of these"}
-    assert {*decided[84:]} == {"model"}
-    for found in course[True]:
-        none = found.suspicion.none_of_these
-        assert found.suspicion.hypotheses["none of these"] == pytest.approx(none, abs=1e-12)
-        mixed = (1.0 - none) * found.filtered @ known.plan.policy + none * np.array([1.0, 0.0])
-        np.testing.assert_allclose(found.decision_probability, mixed, atol=1e-12)
-        ahead = found.prediction
-        assert np.all(ahead.control_probability[:, 0] >= none - 1e-12)
-        np.testing.assert_allclose(ahead.joint.sum(axis=1), ahead.control_probability, atol=1e-12)
-    alarms = [notice for found in course[True] for notice in found.notices if notice.kind == "alarm"]
+class TwoFaults:
+    """Ninety steps in which damage grows, and two faults of gauges come and are mended.
+
+    Gauge 17 is loose from step 12 to 45, every second gauge is off from step 60 to 79. One twin is watched,
+    that is, it gives notice; the other one filters alone.
+    """
+
+    def __init__(self, between: bool) -> None:
+        wing = at_levels("paper_level_turns", between)
+        scenario = wing.scenario.model_copy(update={"notice": Noticing()})
+        self.knowledge = replace(wing, scenario=scenario)
+        self.truth = np.repeat([0.0, 0.2, 0.4, 0.6], [10, 10, 10, 60])
+        self.watched: list[TwinStep] = []
+        self.alone: list[TwinStep] = []
+        twins = ((self.knowledge.twin(lag=1), self.watched), (wing.twin(lag=1), self.alone))
+        random = np.random.default_rng(4)
+        levels = self.knowledge.model.states.coordinates
+        for step, loss in enumerate(self.truth):
+            (state,) = np.flatnonzero(np.isclose(levels[:, 0], loss) & (levels[:, 1] == 0.0))
+            gain = np.where(self.is_off(step), 0.67, 1.0)
+            noise = 150e-6 * random.normal(size=24)
+            for twin, course in twins:
+                control = course[-1].next_control if step else 1
+                row = self.knowledge.sensor_model.mean[state, control] * gain + noise
+                course.append(twin.step(row, control))
+        self.notices = [notice for step in self.watched for notice in step.notices]
+
+    def is_off(self, step: int) -> NDArray[np.bool_]:
+        """Return which gauges are off in a step."""
+        gauges = np.arange(24)
+        is_loose = (gauges == 16) & (12 <= step < 46)
+        return is_loose | (gauges % 2 == 0) & (60 <= step < 80)
+
+    def mean_loss(self, course: list[TwinStep]) -> Float:
+        """Return the believed loss of the first region in each step."""
+        levels = self.knowledge.model.states.coordinates[:, 0]
+        return np.array([step.filtered @ levels for step in course])
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["levels", "between levels"])
+def two_faults(request: pytest.FixtureRequest) -> TwoFaults:
+    return TwoFaults(request.param)
+
+
+def test_a_watched_twin_believes_what_holds_now(two_faults):
+    error = np.abs(two_faults.mean_loss(two_faults.watched) - two_faults.truth)
+    assert error[np.r_[14:20, 25:30, 35:90]].max() < 0.12
+    assert {step.next_control for step in two_faults.watched[32:]} == {0}
+
+
+def test_a_filter_alone_believes_the_loose_gauge_and_flies_on(two_faults):
+    """It wears the wing."""
+    assert two_faults.mean_loss(two_faults.alone)[40:46].max() < 0.25
+    assert {step.next_control for step in two_faults.alone[32:46]} == {1}
+
+
+def test_the_hypothesis_that_holds_now_decides(two_faults):
+    deciding = [step.suspicion.decided_by for step in two_faults.watched]
+    phases = [(0, 11), (14, 45), (50, 60), (73, 79), (84, 90)]
+    by_phase = [{*deciding[begin:end]} for begin, end in phases]
+    assert by_phase == [{"model"}, {"gauge 17 off"}, {"model"}, {"none of these"}, {"model"}]
+
+
+def test_without_a_believed_state_the_safest_control_is_decided_on(two_faults):
+    """By the probability that no hypothesis is true."""
+    for step in two_faults.watched:
+        none = step.suspicion.none_of_these
+        by_state = step.filtered @ two_faults.knowledge.plan.policy
+        expected = (1.0 - none) * by_state + none * np.array([1.0, 0.0])
+        assert step.suspicion.hypotheses["none of these"] == pytest.approx(none, abs=1e-12)
+        np.testing.assert_allclose(step.decision_probability, expected, atol=1e-12)
+
+
+def test_predictions_have_the_safest_control_as_probably_as_no_state_is_believed(two_faults):
+    for step in two_faults.watched:
+        prediction = step.prediction
+        assert np.all(prediction.control_probability[:, 0] >= step.suspicion.none_of_these - 1e-12)
+        of_joint = prediction.joint.sum(axis=1)
+        np.testing.assert_allclose(of_joint, prediction.control_probability, atol=1e-12)
+
+
+def test_each_fault_has_an_alarm(two_faults):
+    """Gauge 17 is among the gauges that are off in the second fault, too."""
+    alarms = [notice for notice in two_faults.notices if notice.kind == "alarm"]
     assert [alarm.sensors[0] for alarm in alarms] == [17, 17]
-    assert "least gauges 17 and " in alarms[1].sentence  # of those that are off it was, too
-    sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
+    assert "least gauges 17 and " in alarms[1].sentence
+
+
+def test_a_notice_says_what_belief_and_decision_follow(two_faults):
+    sentences = [notice.sentence for notice in two_faults.notices if notice.kind == "hypothesis"]
+    asset = "Or the asset near it is not as the model says, as where it has softened: these data"
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
-    assert (
-        "Or the asset near it is not as the model says, as where it has softened: these data" in sentences[0]
-    )
+    assert asset in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]
+
+
+def test_a_notice_says_that_no_state_is_believed_and_the_control_is_the_safest(two_faults):
+    sentences = [notice.sentence for notice in two_faults.notices if notice.kind == "hypothesis"]
     assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
 
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
     wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
-    assert wing.scenario.control_names[wing.safest_control] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
+    assert wing.scenario.control_names[wing.safest_control] == "2g"
     assert named.scenario.control_names[named.safest_control] == "3g"
+
+
+@pytest.fixture(scope="module")
+def wrong_from_the_start() -> list[TwinStep]:
+    """Six steps of a twin whose gauges are all wrong from the start; nothing is named as the safest."""
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
-    steps = [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
-    alarm = next(notice for step in steps for notice in step.notices if notice.kind == "alarm")
+    return [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
+
+
+def test_an_alarm_from_the_start_says_so_and_names_the_command(wrong_from_the_start):
+    notices = [notice for step in wrong_from_the_start for notice in step.notices]
+    alarm = next(notice for notice in notices if notice.kind == "alarm")
+    command = "uav-twin discrepancy run --from-run DIR"
     assert ", from the start " in alarm.sentence
-    assert alarm.sentence.endswith(
-        "alarm from 100); to find the cause: uav-twin discrepancy run --from-run DIR"
-    )
-    step = steps[-1]
-    assert step.suspicion.none_of_these > 0.5
-    np.testing.assert_allclose(step.decision_probability, [1.0])  # the policy decides where nothing is safest
+    assert alarm.sentence.endswith(f"alarm from 100); to find the cause: {command}")
+
+
+def test_the_policy_decides_where_nothing_is_safest(wrong_from_the_start):
+    last = wrong_from_the_start[-1]
+    assert last.suspicion.none_of_these > 0.5
+    np.testing.assert_allclose(last.decision_probability, [1.0])
 
 
 @pytest.fixture(scope="module")

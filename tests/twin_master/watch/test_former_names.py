@@ -35,31 +35,65 @@ def told_in(folder: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def test_a_journal_of_an_earlier_version_is_read_and_gone_on_with(base, loose, tmp_path):
-    """Also in the middle of a search, of the trial of a patch, and behind its adoption."""
-    (tmp_path / "whole").mkdir()
-    whole = watchful(base, tmp_path / "whole" / "watch")
-    whole.run(CsvFeed(loose, whole.scenario), str, tutor(whole, tmp_path, "named", -0.3).teach)
-    (asked,) = [line["verdict"]["to_step"] for line in journal(whole.folder) if "verdict" in line]
-    stopped = watchful(base, tmp_path / "stopped")
-    for number, end in enumerate((asked, asked + 5, asked + 15, None)):
-        teach = tutor(stopped, tmp_path, "named", -0.3).teach
-        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
-        with_former_names(stopped.folder)
-        with pytest.warns(FormerNameWarning, match=SENTENCE) as told:
-            stopped = watchful(stopped, tmp_path / str(number))
-        expected = told_in(whole.folder)[: len(told_in(stopped.folder))]
-        assert told_in(stopped.folder) == expected
-        assert len(told) == 1
-        assert str(stopped.folder / JOURNAL_NAME) in str(told[0].message)
-    assert len(told_in(stopped.folder)) == len(told_in(whole.folder))
-    former_names._sources_told.clear()
+class FormerJournal:
+    """A watch of a loose gauge that is stopped four times, and whose journal gets its former names each time.
+
+    It is stopped in the middle of a search, of the trial of a patch, and behind its adoption. Another watch
+    of the same recording is not stopped.
+    """
+
+    def __init__(self, base: Any, recording: Path, folder: Path) -> None:
+        (folder / "whole").mkdir()
+        self.whole = watchful(base, folder / "whole" / "watch")
+        feed = CsvFeed(recording, self.whole.scenario)
+        self.whole.run(feed, str, tutor(self.whole, folder, "named", -0.3).teach)
+        (asked,) = [line["verdict"]["to_step"] for line in journal(self.whole.folder) if "verdict" in line]
+        self.lines_of_whole = told_in(self.whole.folder)
+        self.lines_after_stops, self.warnings = [], []
+        self.stopped = watchful(base, folder / "stopped")
+        for number, end in enumerate((asked, asked + 5, asked + 15, None)):
+            teach = tutor(self.stopped, folder, "named", -0.3).teach
+            self.stopped.run(CsvFeed(recording, self.stopped.scenario), str, teach, step_limit=end)
+            with_former_names(self.stopped.folder)
+            with pytest.warns(FormerNameWarning, match=SENTENCE) as told:
+                self.stopped = watchful(self.stopped, folder / str(number))
+            self.lines_after_stops.append(told_in(self.stopped.folder))
+            self.warnings.append((self.stopped.folder / JOURNAL_NAME, [str(w.message) for w in told]))
+
+
+@pytest.fixture(scope="module")
+def former_journal(base, loose, tmp_path_factory) -> FormerJournal:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(former_names, "_sources_told", set())
+        return FormerJournal(base, loose, tmp_path_factory.mktemp("former_journal"))
+
+
+def test_a_journal_of_an_earlier_version_is_gone_on_with(former_journal):
+    for lines in former_journal.lines_after_stops:
+        assert lines == former_journal.lines_of_whole[: len(lines)]
+    assert len(former_journal.lines_after_stops[-1]) == len(former_journal.lines_of_whole)
+
+
+def test_a_journal_of_an_earlier_version_is_told_of_once(former_journal):
+    for path, sentences in former_journal.warnings:
+        (sentence,) = sentences
+        assert str(path) in sentence
+
+
+def test_a_journal_of_an_earlier_version_is_viewed(former_journal):
     with pytest.warns(FormerNameWarning, match=SENTENCE):
-        flight = viewed(stopped.folder)
+        flight = viewed(former_journal.stopped.folder)
+    flight_of_whole = viewed(former_journal.whole.folder)
     shown = [step["filtered"] for step in flight.records_of_steps(0, flight.steps)]
-    assert shown == [step["filtered"] for step in viewed(whole.folder).records_of_steps(0, flight.steps)]
-    messages = [message for message, _ in FolderFeed(stopped.folder, stopped.scenario).messages(None)]
-    assert [message.step for message in messages if isinstance(message, Message)] == [*range(flight.steps)]
+    assert shown == [step["filtered"] for step in flight_of_whole.records_of_steps(0, flight.steps)]
+
+
+def test_a_journal_of_an_earlier_version_is_watched_again(former_journal):
+    stopped = former_journal.stopped
+    with pytest.warns(FormerNameWarning, match=SENTENCE):
+        messages = [message for message, _ in FolderFeed(stopped.folder, stopped.scenario).messages(None)]
+    steps = [line["step"] for line in former_journal.lines_of_whole if "filtered" in line]
+    assert [message.step for message in messages if isinstance(message, Message)] == [*range(max(steps) + 1)]
 
 
 def test_a_recording_with_a_column_of_turns_is_read(base, mission, tmp_path):
@@ -76,13 +110,16 @@ def test_a_recording_with_a_column_of_turns_is_read(base, mission, tmp_path):
     np.testing.assert_array_equal(observed, [line["observed"] for line in told_in(expected.folder)])
 
 
-def test_a_message_that_says_turn_is_read(base):
+def test_messages_that_say_turn_are_read_with_one_sentence(base):
     reader = MessageReader(base.scenario)
     content = [json.dumps({"turn": turn, "strain_1": 1e-3}).encode() for turn in (4, 5)]
     with pytest.warns(FormerNameWarning, match=f"^A message: {SENTENCE}. The former name is still") as told:
         messages = [reader.read(text) for text in content]
     assert len(told) == 1
     assert [message.step for message in messages if isinstance(message, Message)] == [4, 5]
-    refusal = reader.read({"turn": 4, "step": 4, "strain_1": 1e-3})
+
+
+def test_a_message_that_says_turn_and_step_is_refused(base):
+    refusal = MessageReader(base.scenario).read({"turn": 4, "step": 4, "strain_1": 1e-3})
     assert isinstance(refusal, Refused)
     assert str(refusal) == f"A message: {SENTENCE}, and both are given."

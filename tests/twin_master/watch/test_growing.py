@@ -167,30 +167,49 @@ def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
-def test_half_rows_are_waited_for_a_copy_is_read_on_and_columns_of_a_new_file_are_read_again(begun_log):
-    """The copy as rsync makes it, which begins with the same rows; also behind several rotations."""
+def test_half_rows_are_waited_for(begun_log):
     path, messages = begun_log()
     for character in row(0)[:-1]:
         append(path, character)
         assert new(messages) == []
     append(path, "\n")
     assert new(messages) == [0]
-    fresh = path.with_name("fresh")
-    fresh.write_text(path.read_text() + row(1))
-    fresh.rename(path)
+
+
+def test_a_copy_that_begins_with_the_same_rows_is_read_on(begun_log):
+    """The copy is made as rsync makes it."""
+    path, messages = begun_log()
+    append(path, row(0))
+    assert new(messages) == [0]
+    copy = path.with_name("fresh")
+    copy.write_text(path.read_text() + row(1))
+    copy.rename(path)
     assert new(messages) == [1]
+
+
+def test_columns_of_a_new_file_are_read_again_also_behind_several_rotations(begun_log):
+    path, messages = begun_log()
     for step in (2, 3):
         append(path, row(step))
         renamed(path)
     append(path, "strain_2,step\n1e-4,4\n")
     *steps, message = (next(messages)[0] for _ in range(3))
+    assert [step.step for step in steps if isinstance(step, Message)] == [2, 3]
     assert isinstance(message, Message)
     assert (message.step, message.observed[1], np.isnan(message.observed[0])) == (4, 1e-4, True)
-    assert [told.step for told in steps if isinstance(told, Message)] == [2, 3]
-    append(path, "1e-4,5e")  # half a row of a dead writer ends with its file
+
+
+def test_half_a_row_of_a_dead_writer_ends_with_its_file(begun_log):
+    """The next file has no header: its first row must not be taken for the rest of the half row."""
+    path, messages = begun_log()
+    append(path, row(2))
+    renamed(path)
+    append(path, "strain_2,step\n1e-4,4\n")
+    assert new(messages) == [2, 4]
+    append(path, "1e-4,5e")
     assert new(messages) == []
     renamed(path)
-    append(path, "2e-4,6\n1e-4,7\n")  # without a header: it must not be taken for the rest of the row
+    append(path, "2e-4,6\n1e-4,7\n")
     assert new(messages) == ["1e-4,5e", 6, 7]
 
 

@@ -108,14 +108,23 @@ def test_a_gap_is_told_once_by_a_watch_that_ends_within(watch, mission, tmp_path
     assert decisions[-1]["step"] == 9
 
 
-def test_refusals_in_a_row_are_told_once_and_that_messages_are_taken_again(watch, mission):
+@pytest.fixture
+def refused_in_rows(watch, mission) -> list[dict[str, Any]]:
+    """The decisions of three messages, two refused ones after the first, and five after the second."""
     good = [line(mission, step, step=step) for step in range(3)]
     bad = {"step": "one"}
-    decisions = decisions_of(watch, [good[0], bad, bad, good[1], *[bad] * 5, good[2]])
-    assert kinds(decisions) == [(1, "refused"), (2, "taken")]
-    assert "Since step 1, 3 messages came, and all were refused" in sentence(decisions, "refused")
-    assert "after 5 were refused" in sentence(decisions, "taken")
-    assert decisions[2]["told_again"]  # the last decision, with the notice
+    return decisions_of(watch, [good[0], bad, bad, good[1], *[bad] * 5, good[2]])
+
+
+def test_refusals_in_a_row_are_told_once(refused_in_rows):
+    told = sentence(refused_in_rows, "refused")
+    assert kinds(refused_in_rows) == [(1, "refused"), (2, "taken")]
+    assert "Since step 1, 3 messages came, and all were refused" in told
+
+
+def test_it_is_told_with_the_last_decision_that_messages_are_taken_again(refused_in_rows, watch):
+    assert "after 5 were refused" in sentence(refused_in_rows, "taken")
+    assert refused_in_rows[2]["told_again"]
     assert watch.intake.complaint() == ""
 
 
@@ -215,14 +224,24 @@ def watched(scenario: LoadedScenario, folder: Path, messages: list[Mapping[str, 
         return command("watch", scenario.path, "--observations", "-", "--out", folder, "--no-report")
 
 
-def test_a_watch_of_messages_that_were_of_no_use_fails(scenario, mission, tmp_path):
-    bad = [{"step": step, "fields": {}} for step in range(2)]
-    done = watched(scenario, tmp_path / "bad", bad)
+REFUSED_LINES = [{"step": step, "fields": {}} for step in range(2)]
+
+
+def test_a_watch_whose_messages_were_refused_fails(scenario, tmp_path):
+    done = watched(scenario, tmp_path / "watch", REFUSED_LINES)
+    sentence = "The watch ended while messages were refused: the last 2 of 2 messages"
     assert done.returncode == 1
-    assert "The watch ended while messages were refused: the last 2 of 2 messages" in done.stderr
+    assert sentence in done.stderr
+
+
+def test_a_watch_without_a_reading_fails(scenario, tmp_path):
     blind = [{"step": step, "control": "3g"} for step in range(2)]
-    done = watched(scenario, tmp_path / "blind", blind)
+    done = watched(scenario, tmp_path / "watch", blind)
     assert done.returncode == 1
     assert "None of 2 messages has a reading of any gauge" in done.stderr
+
+
+def test_a_watch_with_refused_messages_among_others_succeeds(scenario, mission, tmp_path):
     good = [line(mission, step, step=step) for step in range(2)]
-    assert watched(scenario, tmp_path / "good", [bad[0], *good, bad[1]]).returncode == 0
+    before, after = REFUSED_LINES
+    assert watched(scenario, tmp_path / "watch", [before, *good, after]).returncode == 0
