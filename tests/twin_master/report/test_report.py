@@ -39,19 +39,27 @@ DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 
 def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
+    """Believed is the loss of the first region; the noise is 150 µε, and 125 is assumed."""
     decided, believed, explained = opening_sentences(run)
-    assert decided.startswith("The twin fell back from 3g to 2g at step 31, one step after")
-    both = np.where(run.model.states.coordinates.sum(axis=1) > 0.59, 0, 1)
-    left = opening_sentences(altered(run, policy__control_index=both))[0]
-    assert left == "The twin left 3g for 2g at step 31."  # by a policy of both states
     mean, deviation = (100 * run[f"filtered/{name}"][-1, 0] for name in ("mean", "standard_deviation"))
     low, high = max(mean - 2 * deviation, 0.0), min(mean + 2 * deviation, 80.0)
     interval = f"{mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)"
+    ratio = predictive_check(run).standard_deviation
+    assert decided.startswith("The twin fell back from 3g to 2g at step 31, one step after")
     assert f"puts the stiffness loss of region 1 at {interval}" in believed
-    # 150 µε of noise, 125 assumed
-    assert f"{predictive_check(run).standard_deviation:.3g} times as far as it assumes" in explained
-    text = html.unescape(report.render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
-    assert " ".join(opening_sentences(run)) in " ".join(text.split())
+    assert f"{ratio:.3g} times as far as it assumes" in explained
+
+
+def test_a_policy_of_both_regions_left_a_control(run):
+    is_sound = run.model.states.coordinates.sum(axis=1) > 0.59
+    policy = np.where(is_sound, 0, 1)
+    decided = opening_sentences(altered(run, policy__control_index=policy))[0]
+    assert decided == "The twin left 3g for 2g at step 31."
+
+
+def test_the_page_has_its_opening_sentences(run):
+    page = html.unescape(report.render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
+    assert " ".join(opening_sentences(run)) in " ".join(page.split())
 
 
 def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | None) -> str:
@@ -90,28 +98,55 @@ def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
     assert "truth" not in " ".join(opening_sentences(watched))
 
 
-def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
-    random, expected, noise = np.random.default_rng(3), run["filtered/quantity_mean"], 125e-6
-    known = altered(run, filtered__quantity_standard_deviation=np.zeros_like(expected))
-    draws = random.standard_normal(expected.shape)
+class ScatteredRun:
+    """The run with observations that scatter as they are told to around what the twin expects."""
 
-    def sentences(scatter: np.ndarray) -> tuple[str, ...]:
-        return tuple(opening_sentences(altered(known, observed__strain=expected + noise * scatter)))
+    def __init__(self, run: Run) -> None:
+        self.expected = run["filtered/quantity_mean"]
+        no_deviation = np.zeros_like(self.expected)
+        self.run = altered(run, filtered__quantity_standard_deviation=no_deviation)
+        self.draws = np.random.default_rng(3).standard_normal(self.expected.shape)
 
+    def sentences(self, scatter: np.ndarray) -> tuple[str, ...]:
+        """Return the opening for a scatter in the standard deviations that the twin assumes."""
+        observed = self.expected + 125e-6 * scatter
+        return tuple(opening_sentences(altered(self.run, observed__strain=observed)))
+
+
+@pytest.fixture
+def scattered(run: Run) -> ScatteredRun:
+    return ScatteredRun(run)
+
+
+def test_the_last_sentence_judges_the_scatter(scattered):
+    draws = scattered.draws
     within = "The twin's model explains the observations within the noise that it assumes: 9"
-    assert sentences(draws)[-1].startswith(within)
-    assert sentences(0.5 * draws)[-1].endswith("its intervals are wider than they need be.")
-    assert sentences(2.0 * draws)[-1].endswith("the noise is larger, or the model is off.")
-    draws[:, 6] += 1.4  # one gauge is off, and the others hide it
-    assert "intervals, but" in sentences(draws)[-1]
-    assert sentences(draws)[-1].endswith("% of those of gauge 7.")
-    assert len(sentences(np.full_like(draws, np.nan))) == 2
-    course, name = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1)), "Young modulus factor"
+    assert scattered.sentences(draws)[-1].startswith(within)
+    assert scattered.sentences(0.5 * draws)[-1].endswith("its intervals are wider than they need be.")
+    assert scattered.sentences(2.0 * draws)[-1].endswith("the noise is larger, or the model is off.")
+
+
+def test_the_last_sentence_names_a_gauge_that_the_others_hide(scattered):
+    draws = scattered.draws
+    draws[:, 6] += 1.4
+    sentence = scattered.sentences(draws)[-1]
+    assert "intervals, but" in sentence
+    assert sentence.endswith("% of those of gauge 7.")
+
+
+def test_without_observations_nothing_is_said_of_the_scatter(scattered):
+    nothing = np.full_like(scattered.draws, np.nan)
+    assert len(scattered.sentences(nothing)) == 2
+
+
+def test_the_opening_says_what_was_learnt(run):
+    course = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1))
+    name = "Young modulus factor"
     learnt = LearntQuantity("young_modulus_factor", name, "", course, course[0], np.array(1.025))
     changed = replace(run)
     vars(changed)["learnt_quantities"] = (learnt,)
-    said = opening_sentences(changed)[1]
-    assert said.endswith("; it learnt the Young modulus factor: 1.020 (1.012 to 1.028, truth 1.025).")
+    sentence = opening_sentences(changed)[1]
+    assert sentence.endswith("; it learnt the Young modulus factor: 1.020 (1.012 to 1.028, truth 1.025).")
 
 
 # ----------------------------------------------------------------------------------------- the page
@@ -124,44 +159,78 @@ def test_smoothing_up_to_a_step_equals_a_mission_that_ended_there(run, library_f
     assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"], atol=1e-12)
 
 
-def test_origins_and_references_are_told_where_there_are_any(run):
-    text = report.render_page(run, {}, {})
-    assert "model differ" not in text
-    assert "source of the reference" in text
-    figures = [figure | {"reference": None} for figure in run.summary["figures"]]
+def test_references_have_a_column_where_there_are_any(run):
+    without = [figure | {"reference": None} for figure in run.summary["figures"]]
+    page = report.render_page(run, {}, {})
+    page_without = report.render_page(replace(run, summary={**run.summary, "figures": without}), {}, {})
+    assert "source of the reference" in page
+    assert "reference</th>" not in page_without
+
+
+def test_an_asset_that_differs_from_the_model_is_told(run):
     origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
-    summary = {**run.summary, "figures": figures, **origin}
-    text = report.render_page(replace(run, summary=summary), {}, {})
-    assert "differ: flown was the strain library, and the twin believes the reduced model." in text
-    assert "reference</th>" not in text
+    page = report.render_page(run, {}, {})
+    page_of_other = report.render_page(replace(run, summary={**run.summary, **origin}), {}, {})
+    sentence = "differ: flown was the strain library, and the twin believes the reduced model."
+    assert "model differ" not in page
+    assert sentence in page_of_other
 
 
-def test_the_page_needs_nothing_from_outside_and_is_the_same_of_equal_runs(folder, tmp_path):
-    page = report.write_report(folder).read_bytes()
+@pytest.fixture(scope="module")
+def page(folder: Path) -> bytes:
+    """The page of the run with its figures, as it is written."""
+    return report.write_report(folder).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def text_of_page(page: bytes) -> str:
+    return page.decode("utf-8")
+
+
+def test_the_page_is_the_same_of_equal_runs(folder, page, tmp_path):
     equal = Path(shutil.copytree(folder, tmp_path / "equal"))
     (equal / "timing.json").write_text("{}")
     assert report.write_report(equal).read_bytes() == page
-    assert {path.name for path in (folder / "figures").iterdir()} == {
-        "mission_now.svg", "mission_now.png", "mission_whole.svg", "belief.svg", "policy.svg", "check.svg",
-        "calibration.svg", "network.svg",
-    }  # fmt: skip
-    text = page.decode("utf-8")
-    assert "http://" not in text
-    assert "https://" not in text
-    assert text.count("<script>") == text.count("<script") == 1
-    assert not re.search(r'(?:src|href)="(?!#|data:image/png;base64,)', text)
-    assert not re.search(r"url\((?!#)", text)
-    assert text.count("<figure") == 7
-    assert str(folder) not in text
-    assert re.search(r"largest tip displacement</td><td>0.18\sm<", text)
-    assert re.search(r"largest strain error bound</td><td>1.2\sµε<", text)
-    for word in (
+
+
+@pytest.mark.usefixtures("page")
+def test_the_report_writes_its_figures(folder):
+    names = {"belief", "policy", "check", "calibration", "network", "mission_now", "mission_whole"}
+    files = {path.name for path in (folder / "figures").iterdir()}
+    assert files == {f"{name}.svg" for name in names} | {"mission_now.png"}
+
+
+def test_the_page_needs_nothing_from_outside(text_of_page):
+    assert not re.search("https?://", text_of_page)
+    assert not re.search(r'(?:src|href)="(?!#|data:image/png;base64,)', text_of_page)
+    assert not re.search(r"url\((?!#)", text_of_page)
+
+
+def test_the_page_has_one_script_and_seven_figures(text_of_page):
+    assert text_of_page.count("<script>") == text_of_page.count("<script") == 1
+    assert text_of_page.count("<figure") == 7
+
+
+def test_the_page_does_not_say_in_which_folder_it_stands(text_of_page, folder):
+    assert str(folder) not in text_of_page
+
+
+def test_the_page_has_what_the_asset_monitored(text_of_page):
+    assert re.search(r"largest tip displacement</td><td>0.18\sm<", text_of_page)
+    assert re.search(r"largest strain error bound</td><td>1.2\sµε<", text_of_page)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
         "Kapteyn",
         "seed 2021",
         "stiffness loss of region 1 from which on the policy changes from 3g to 2g",
         "timing.json",
-    ):
-        assert word in text
+    ],
+)
+def test_the_page_has_sources_seed_and_figures(text_of_page, words):
+    assert words in text_of_page
 
 
 def test_the_present_is_chosen_before_the_first_change_of_control(run):
@@ -180,45 +249,80 @@ def test_short_missions(run, hold, tmp_path, steps, horizon):
     assert f"{steps} steps" in report.write_report(tmp_path).read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_lost_gauges_are_told_and_marked(run, hold, tmp_path):
-    """Also one that never reports, and a run without any observation."""
+@pytest.fixture(scope="module")
+def run_of_lost_gauges(run: Run) -> Run:
+    """The run without four gauges in some steps, and without any gauge in two steps."""
     observed = run.observations.copy()
-    observed[12:19, 16:20] = observed[3:5] = np.nan
-    lost = altered(run, observed__strain=observed)
-    assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at steps 12–18; all gauges at steps 3–4"
-    assert "the belief followed the dynamics alone" in report.render_page(lost, {}, {})
-    axes = panel(mission_figure(lost, 49, [16]), "Gauge 17")
+    observed[12:19, 16:20] = np.nan
+    observed[3:5] = np.nan
+    return altered(run, observed__strain=observed)
+
+
+def test_lost_gauges_are_told(run_of_lost_gauges):
+    page = report.render_page(run_of_lost_gauges, {}, {})
+    ranges = "gauges 17, 18, 19, 20 at steps 12–18; all gauges at steps 3–4"
+    assert lost_ranges(run_of_lost_gauges) == ranges
+    assert "the belief followed the dynamics alone" in page
+
+
+def test_lost_gauges_are_marked_and_not_counted(run_of_lost_gauges):
+    axes = panel(mission_figure(run_of_lost_gauges, 49, [16]), "Gauge 17")
     assert_array_equal(line(axes, "lost")[:, 0], [3, 4, *range(12, 19)])
-    assert predictive_check(lost).count[16] == 50 - 2 - 7
-    for sensors in (slice(4, 5), slice(None)):
-        observed[:, sensors] = np.nan
-        hold(altered(run, observed__strain=observed))
-        assert "Observations lost" in report.write_report(tmp_path).read_text(encoding="utf-8")
+    assert predictive_check(run_of_lost_gauges).count[16] == 50 - 2 - 7
 
 
-def test_a_calibration_file_shows_its_wing(run, make_calibration):
-    wing = make_calibration(young_modulus_factor=1.05)
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("sensors", [slice(4, 5), slice(None)], ids=["a gauge", "all gauges"])
+def test_gauges_that_never_report_are_told(run, hold, tmp_path, sensors):
+    observed = run.observations.copy()
+    observed[:, sensors] = np.nan
+    hold(altered(run, observed__strain=observed))
+    assert "Observations lost" in report.write_report(tmp_path).read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def wing(make_calibration):
+    return make_calibration(young_modulus_factor=1.05)
+
+
+@pytest.fixture
+def run_of_calibrated_wing(run, wing) -> Run:
+    """The run with the draws of a calibrated wing, whose FMU starts at their mean."""
     tree = altered(run).tree
-    tree["calibration"] = xr.Dataset({"draw_value": ("draw", wing.draws_of("young_modulus_factor"))})
-    kept = json.loads(to_json(run_record(wing, "young_modulus_factor")))
+    draws = wing.draws_of("young_modulus_factor")
+    tree["calibration"] = xr.Dataset({"draw_value": ("draw", draws)})
+    record = json.loads(to_json(run_record(wing, "young_modulus_factor")))
     scenario = load_scenario("level_turns").scenario
-    plain = replace(run, tree=tree, calibration=kept, scenario=scenario)
-    flown = rescripted(plain, asset={"design": "calibration", "parameters": {}})
-    mean, wide = wing.mean("young_modulus_factor"), wing.standard_deviation("young_modulus_factor")
-    assert true_value(flown) == mean  # the FMU starts at the mean
+    calibrated = replace(run, tree=tree, calibration=record, scenario=scenario)
+    return rescripted(calibrated, asset={"design": "calibration", "parameters": {}})
+
+
+def test_a_calibrated_wing_flies_at_the_mean(run_of_calibrated_wing, wing):
+    assert true_value(run_of_calibrated_wing) == wing.mean("young_modulus_factor")
+
+
+def test_a_calibration_file_shows_its_wing(run_of_calibrated_wing, wing):
     figures = {"calibration": ReportFigure("calibration", None, "", "")}
-    page = report.render_page(flown, {"calibration": DRAWING}, figures)
+    page = report.render_page(run_of_calibrated_wing, {"calibration": DRAWING}, figures)
+    without_headings = re.sub(' data-of="[^"]*"', "", page)  # those for narrow screens
+    mean, deviation = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
     assert "The calibrated wing: Wing 7 (é)" in page
-    page = re.sub(' data-of="[^"]*"', "", page)  # headings for narrow screens
-    servo = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
-    assert f'{number(servo[0])}</td><td class="number">{number(servo[1])}' in page
+    assert f'{number(mean)}</td><td class="number">{number(deviation)}' in without_headings
     assert "the model of another asset" not in page
-    other = rescripted(flown, asset={"parameters": {"young_modulus_factor": 1.0}})
-    assert true_value(other) == 1.0
+
+
+def test_a_wing_that_flies_beside_its_calibration_is_told(run_of_calibrated_wing, wing):
+    other = rescripted(run_of_calibrated_wing, asset={"parameters": {"young_modulus_factor": 1.0}})
     page = " ".join(report.render_page(other, {}, {}).split())
-    off = abs(1.0 - mean) / wide
-    sentence = f"The true Young modulus factor of the asset flown is 1, {off:.1f} standard deviations from"
+    mean, deviation = (
+        wing.mean("young_modulus_factor"),
+        wing.standard_deviation("young_modulus_factor"),
+    )
+    distance = abs(1.0 - mean) / deviation
+    sentence = (
+        f"The true Young modulus factor of the asset flown is 1, {distance:.1f} standard deviations from"
+    )
+    assert true_value(other) == 1.0
     assert sentence in page
     assert "the model of another asset" in page
 
@@ -247,32 +351,66 @@ def test_another_layout_gives_one_sentence(folder, tmp_path, missing):
     assert not (place / "figures").exists()
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_the_last_steps_of_a_watch_have_their_numbers_and_what_nobody_knows_is_left_out(run, hold, tmp_path):
+@pytest.fixture
+def last_steps(run, hold) -> Run:
+    """The run as the last 50 of 1050 steps of a watch, without a truth, and with lost gauges."""
     observed = run.observations.copy()
-    observed[7], observed[[8, 9], 2] = np.nan, np.nan
-    shifted = altered(run, observed__strain=observed, truth=None).tree.map_over_datasets(
+    observed[7] = np.nan
+    observed[[8, 9], 2] = np.nan
+    tree = altered(run, observed__strain=observed, truth=None).tree.map_over_datasets(
         lambda group: group.assign_coords(step=group["step"] + 1000) if "step" in group.coords else group
     )
-    watched = replace(run, tree=shifted, summary={})
+    watched = replace(run, tree=tree, summary={})
     hold(watched)
-    figures = {drawn.name: drawn for drawn in report.report_figures(tmp_path, 1020)}
-    assert "at step 1020" in figures["mission_now"].title
-    drawn = figures["mission_now"].figure
-    assert "now: 1020" in {text.get_text() for axes in drawn.axes for text in axes.texts}
-    for title, name, first in (
-        ("region 1", "past", 1000),
-        ("17", "observed", 1000),
-        ("17", "prediction", 1021),
-    ):
-        assert line(panel(drawn, title), name)[0, 0] == first
-    assert panel(drawn, "Control: flown").patches[-1].get_center()[0] == 1030
-    assert panel(figures["check"].figure, "Standardised").get_xlim() == (999.5, 1049.5)
-    assert "step 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
-    assert lost_ranges(watched) == "gauge 3 at steps 1008–1009; all gauges at step 1007"
-    for now in (49, 999, 1050):
-        with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
-            report.write_report(tmp_path, now=now)
-    text = report.render_page(watched, dict.fromkeys(figures, DRAWING), figures)
-    assert text.count("<figure") == 6
-    assert "truth" not in text.replace("the truth, which", "")
+    return watched
+
+
+@pytest.fixture
+def figures_of_last_steps(last_steps, tmp_path) -> dict[str, ReportFigure]:
+    return {figure.name: figure for figure in report.report_figures(tmp_path, 1020)}
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_the_present_of_a_watch_has_its_number(figures_of_last_steps):
+    now = figures_of_last_steps["mission_now"]
+    assert "at step 1020" in now.title
+    assert "now: 1020" in {text.get_text() for axes in now.figure.axes for text in axes.texts}
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize(
+    ("title", "name", "first"),
+    [("region 1", "past", 1000), ("17", "observed", 1000), ("17", "prediction", 1021)],
+)
+def test_curves_of_the_last_steps_begin_at_their_numbers(figures_of_last_steps, title, name, first):
+    figure = figures_of_last_steps["mission_now"].figure
+    assert line(panel(figure, title), name)[0, 0] == first
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_panels_of_the_last_steps_have_their_numbers(figures_of_last_steps):
+    controls = panel(figures_of_last_steps["mission_now"].figure, "Control: flown")
+    residuals = panel(figures_of_last_steps["check"].figure, "Standardised")
+    titles = [axes.get_title("left") for axes in figures_of_last_steps["belief"].figure.axes]
+    assert controls.patches[-1].get_center()[0] == 1030
+    assert residuals.get_xlim() == (999.5, 1049.5)
+    assert "step 1049" in titles
+
+
+def test_lost_gauges_of_the_last_steps_have_their_numbers(last_steps):
+    assert lost_ranges(last_steps) == "gauge 3 at steps 1008–1009; all gauges at step 1007"
+
+
+@pytest.mark.usefixtures("no_drawing", "last_steps")
+@pytest.mark.parametrize("now", [49, 999, 1050])
+def test_a_present_outside_the_last_steps_is_refused(tmp_path, now):
+    with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
+        report.write_report(tmp_path, now=now)
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_the_page_of_a_watch_leaves_out_what_nobody_knows(last_steps, figures_of_last_steps):
+    drawings = dict.fromkeys(figures_of_last_steps, DRAWING)
+    page = report.render_page(last_steps, drawings, figures_of_last_steps)
+    assert page.count("<figure") == 6
+    assert "truth" not in page.replace("the truth, which", "")

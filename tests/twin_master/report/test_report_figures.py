@@ -10,6 +10,7 @@ from matplotlib.transforms import Bbox
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
+from reporting.page import ReportFigure
 from tests.twin_master.report.conftest import altered, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
@@ -22,80 +23,127 @@ from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
 from twin_master.scenario.schema import Scenario
 
+NOW = 18
+GAUGES = [16, 3]
 
-def test_the_mission_figure_draws_the_stored_arrays(run):
-    now, sensors = 18, [16, 3]
-    figure = mission_figure(run, now, sensors)
-    belief, truth, observed = run.smoothed_until(now), run.true_state, run.observations
-    for factor in range(2):
-        axes = panel(figure, f"region {factor + 1}")
-        assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.model.states.coordinates)[:, factor])
-        assert_allclose(
-            line(axes, "as seen at the time")[:, 1], 100.0 * run["filtered/mean"][: now + 1, factor]
-        )
-        coming = line(axes, "prediction")
-        assert_array_equal(coming[:, 0], np.arange(19, 29))
-        assert_allclose(coming[:, 1], 100.0 * run["predicted/mean"][now, :, factor])
-        assert_allclose(line(axes, "truth")[:, 1], 100.0 * truth[:29, factor])
-    for sensor in sensors:
-        axes = panel(figure, f"Gauge {sensor + 1}")
-        assert_allclose(line(axes, "observed")[:, 1], 1e6 * observed[:19, sensor])
-        assert_allclose(line(axes, "observed later")[:, 1], 1e6 * observed[19:29, sensor])
-        assert_allclose(line(axes, "past")[:, 1], 1e6 * run["filtered/quantity_mean"][:19, sensor])
-        assert_allclose(line(axes, "prediction")[:, 1], 1e6 * run["predicted/quantity_mean"][now, :, sensor])
-    for index, name in enumerate(("Health", "Control", "Error")):
-        axes = panel(figure, f"{name} reward")
-        assert_allclose(line(axes, "past")[:, 1], run["filtered/reward_mean"][:19, index])
-        if name == "Error":  # of what nobody has seen yet there is none
-            assert "prediction" not in [drawn.get_label() for drawn in axes.get_lines()]
-        else:
-            assert_allclose(line(axes, "prediction")[:, 1], run["predicted/reward_mean"][now, :, index])
-    axes = panel(figure, "Control: flown")
-    for control, name in enumerate(run.controls):
-        (bars,) = [c for c in axes.containers if c.get_label() == f"_predicted {control}"]
-        heights = [bar.get_height() / 0.82 for bar in bars]
-        assert_allclose(heights, run["predicted/control_probability"][18, :, control])
-        assert [bar.get_y() for bar in bars] == [control] * 10
-        assert axes.get_yticklabels()[control].get_text() == name
-    # Bands are the stored intervals.
+
+@pytest.fixture(scope="module")
+def figure_now(run):
+    """The mission as it is known at a step, with two gauges."""
+    return mission_figure(run, NOW, GAUGES)
+
+
+@pytest.mark.parametrize("region", [0, 1])
+def test_the_mission_figure_draws_what_is_believed_of_a_region(run, figure_now, region):
+    axes = panel(figure_now, f"region {region + 1}")
+    belief = (run.smoothed_until(NOW) @ run.model.states.coordinates)[:, region]
+    prediction = line(axes, "prediction")
+    assert_allclose(line(axes, "past")[:, 1], 100.0 * belief)
+    at_the_time = line(axes, "as seen at the time")[:, 1]
+    assert_allclose(at_the_time, 100.0 * run["filtered/mean"][: NOW + 1, region])
+    assert_array_equal(prediction[:, 0], np.arange(19, 29))
+    assert_allclose(prediction[:, 1], 100.0 * run["predicted/mean"][NOW, :, region])
+    assert_allclose(line(axes, "truth")[:, 1], 100.0 * run.true_state[:29, region])
+
+
+@pytest.mark.parametrize("sensor", GAUGES)
+def test_the_mission_figure_draws_what_is_seen_and_expected_of_a_gauge(run, figure_now, sensor):
+    axes = panel(figure_now, f"Gauge {sensor + 1}")
+    expected = run["predicted/quantity_mean"][NOW, :, sensor]
+    assert_allclose(line(axes, "observed")[:, 1], 1e6 * run.observations[:19, sensor])
+    assert_allclose(line(axes, "observed later")[:, 1], 1e6 * run.observations[19:29, sensor])
+    assert_allclose(line(axes, "past")[:, 1], 1e6 * run["filtered/quantity_mean"][:19, sensor])
+    assert_allclose(line(axes, "prediction")[:, 1], 1e6 * expected)
+
+
+@pytest.mark.parametrize(("number", "name"), [(0, "Health"), (1, "Control"), (2, "Error")])
+def test_the_mission_figure_draws_past_rewards(run, figure_now, number, name):
+    axes = panel(figure_now, f"{name} reward")
+    assert_allclose(line(axes, "past")[:, 1], run["filtered/reward_mean"][:19, number])
+
+
+@pytest.mark.parametrize(("number", "name"), [(0, "Health"), (1, "Control")])
+def test_the_mission_figure_draws_expected_rewards(run, figure_now, number, name):
+    prediction = line(panel(figure_now, f"{name} reward"), "prediction")
+    assert_allclose(prediction[:, 1], run["predicted/reward_mean"][NOW, :, number])
+
+
+def test_the_mission_figure_predicts_no_error_of_what_nobody_has_seen_yet(figure_now):
+    labels = [curve.get_label() for curve in panel(figure_now, "Error reward").get_lines()]
+    assert "prediction" not in labels
+
+
+@pytest.mark.parametrize("control", [0, 1])
+def test_the_mission_figure_draws_the_probability_of_a_control(run, figure_now, control):
+    axes = panel(figure_now, "Control: flown")
+    (bars,) = [bars for bars in axes.containers if bars.get_label() == f"_predicted {control}"]
+    probability = [bar.get_height() / 0.82 for bar in bars]
+    assert_allclose(probability, run["predicted/control_probability"][NOW, :, control])
+    assert [bar.get_y() for bar in bars] == [control] * 10
+    assert axes.get_yticklabels()[control].get_text() == run.controls[control]
+
+
+def test_bands_are_the_stored_intervals(run):
     figure = mission_figure(run, 49, [16])
     band = panel(figure, "Gauge 17").collections[0].get_paths()[0].vertices
-    heights = band[band[:, 0] == 20][:, 1]
-    ends = (run[f"smoothed/quantity_{end}"][20, 16] for end in ("lower", "upper"))
-    assert_allclose([heights.min(), heights.max()], [1e6 * end for end in ends])
-    loss = panel(figure, "region 2").collections[0].get_paths()[0].vertices
-    assert 0.0 <= loss[:, 1].min() <= loss[:, 1].max() <= 80.0
-    # Worth a panel; built into the library: 17 is strained most, 5 answers to region 1 and 10 to region 2.
+    ends_in_step_20 = band[band[:, 0] == 20][:, 1]
+    low, high = (run[f"smoothed/quantity_{end}"][20, 16] for end in ("lower", "upper"))
+    loss = panel(figure, "region 2").collections[0].get_paths()[0].vertices[:, 1]
+    assert_allclose([ends_in_step_20.min(), ends_in_step_20.max()], [1e6 * low, 1e6 * high])
+    assert 0.0 <= loss.min() <= loss.max() <= 80.0
+
+
+def test_gauges_that_are_worth_a_panel_are_chosen(run):
+    """The library has gauge 17 strained most; 5 answers to region 1, and 10 to region 2."""
     assert choose_sensors(run) == [16, 0, 4, 9]
 
 
-def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_path):
+@pytest.fixture
+def figures_of_other_units(run, hold, tmp_path) -> dict[str, ReportFigure]:
+    """The figures of a run with a state in m2.K/W, a pressure, flows, and steps that are shifts."""
+    flows = range(2, 25)
     observation = {
-        "role": "operation", "unit": ["bar", *["L/min"] * 23], "standard_deviation": [2e-4] * 24,
-        "titles": ["pressure", *[f"flow {number}" for number in range(2, 25)]],
-    }  # fmt: skip
+        "role": "operation",
+        "unit": ["bar", *["L/min"] * 23],
+        "standard_deviation": [2e-4] * 24,
+        "titles": ["pressure", *[f"flow {number}" for number in flows]],
+    }
     other = rescripted(run, mission={"step_name": "shift"}, observation=observation)
     other.config["scenario"]["state"][0]["unit"] = "m2.K/W"
     tree = altered(run).tree
     for name in ("observed", "truth"):
         tree[name] = xr.DataTree(tree[name].to_dataset().rename({"strain": "operation"}))
     hold(replace(other, tree=tree, scenario=Scenario.model_validate(other.config["scenario"])))
-    figures = {figure.name: figure for figure in report.report_figures(tmp_path, 20)}
-    now = figures["mission_now"].figure
-    axes = panel(now, "Stiffness loss of region 1")
-    assert axes.get_ylabel() == "z₁ (m2.K/W)"
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["0", "0.2", "0.4", "0.6", "0.8"]
+    return {figure.name: figure for figure in report.report_figures(tmp_path, 20)}
+
+
+def test_states_have_units_of_their_own(run, figures_of_other_units):
+    figure = figures_of_other_units["mission_now"].figure
+    axes = panel(figure, "Stiffness loss of region 1")
+    ticks = [label.get_text() for label in axes.get_yticklabels()]
+    assert (axes.get_ylabel(), ticks) == ("z₁ (m2.K/W)", ["0", "0.2", "0.4", "0.6", "0.8"])
+    assert panel(figure, "Stiffness loss of region 2").get_ylabel() == "z₂ (%)"
     assert_array_equal(line(axes, "as seen at the time")[:, 1], run["filtered/mean"][:21, 0])
-    assert panel(now, "Stiffness loss of region 2").get_ylabel() == "z₂ (%)"
-    pressure = panel(now, "Pressure")
+
+
+def test_sensors_have_units_of_their_own(run, figures_of_other_units):
+    figure = figures_of_other_units["mission_now"].figure
+    pressure = panel(figure, "Pressure")
     assert pressure.get_ylabel() == "bar"
+    assert panel(figure, "Flow 4").get_ylabel() == "L/min"
     assert_array_equal(line(pressure, "observed")[:, 1], run.observations[:21, 0])
-    assert panel(now, "Flow 4").get_ylabel() == "L/min"
-    assert "in m2.K/W, percent; the past" in figures["mission_now"].caption
-    assert "0.0002 bar (pressure), 0.0002 L/min (flow 2)" in figures["check"].caption
-    words = " ".join(figure.caption + figure.title for figure in figures.values())
-    for word in ("step", "gauge", "microstrain", "µε", "strain"):
-        assert word not in words.lower(), word
+
+
+def test_captions_have_the_units_of_states_and_sensors(figures_of_other_units):
+    noise = "0.0002 bar (pressure), 0.0002 L/min (flow 2)"
+    assert "in m2.K/W, percent; the past" in figures_of_other_units["mission_now"].caption
+    assert noise in figures_of_other_units["check"].caption
+
+
+@pytest.mark.parametrize("word", ["step", "gauge", "microstrain", "µε", "strain"])
+def test_captions_and_titles_have_no_words_of_wings(figures_of_other_units, word):
+    texts = [figure.caption + figure.title for figure in figures_of_other_units.values()]
+    assert word not in " ".join(texts).lower()
 
 
 def test_numbers_beside_an_axis_are_short():
@@ -138,47 +186,78 @@ def test_states_of_another_number_of_factors_show_their_marginals(run, count):
     assert_allclose(first, np.stack([1 - 2 * mean, 2 * mean]), atol=1e-12)
 
 
+def run_with_model_error(run, error):
+    """Return the run of a twin that states an error of its model, which counts as noise."""
+    noise = np.hypot(125e-6, np.asarray(error) * run["filtered/quantity_mean"])
+    doubting = rescripted(run, observation={"model_error": error})
+    return altered(doubting, filtered__noise_standard_deviation=noise), noise
+
+
+def residual_by_hand(run, noise):
+    deviation = np.hypot(noise, run["filtered/quantity_standard_deviation"])
+    return (run.observations - run["filtered/quantity_mean"]) / deviation
+
+
 @pytest.mark.parametrize(
     ("error", "share"), [(0.0, ""), (0.03, "3 %"), ([0.01 * (gauge % 3) for gauge in range(24)], "0 to 2 %")]
 )
 def test_predictive_check_by_hand(run, error, share):
     """All that the twin leaves unsaid counts."""
-    doubting, mean = rescripted(run, observation={"model_error": error}), run["filtered/quantity_mean"]
-    unsaid = np.hypot(125e-6, np.asarray(error) * mean)
-    check = predictive_check(altered(doubting, filtered__noise_standard_deviation=unsaid))
-    expected = (run.observations - mean) / np.hypot(unsaid, run["filtered/quantity_standard_deviation"])
+    doubting, noise = run_with_model_error(run, error)
+    expected = residual_by_hand(run, noise)
+    check = predictive_check(doubting)
     assert_allclose(check.residual, expected)
     assert_allclose(check.coverage, np.mean(np.abs(expected) < 1.959964, axis=0))
     assert assumed_model_error(doubting) == share
-    if not share:
-        # the gauges have 150 microstrain and the twin assumes 125
-        assert 1.0 < check.standard_deviation < 1.25
-        assert check.transform.min() >= 0.0
-        assert check.transform.max() <= 1.0
-        old = altered(run, filtered__noise_standard_deviation=None)  # as earlier versions wrote it
-        assert_allclose(predictive_check(old).residual, expected)
 
 
-def test_calibration_shows_draws_posterior_and_measurements(run):
+def test_the_predictive_check_sees_that_there_is_more_noise_than_assumed(run):
+    """The gauges have 150 microstrain, and the twin assumes 125."""
+    check = predictive_check(run_with_model_error(run, 0.0)[0])
+    assert 1.0 < check.standard_deviation < 1.25
+    assert check.transform.min() >= 0.0
+    assert check.transform.max() <= 1.0
+
+
+def test_a_run_of_an_earlier_version_has_the_noise_of_its_scenario(run):
+    without_noise = altered(run, filtered__noise_standard_deviation=None)
+    assert_allclose(predictive_check(without_noise).residual, residual_by_hand(run, 125e-6))
+
+
+POSTERIOR_GRID = np.linspace(0.9, 1.1, 101)
+POSTERIOR_DENSITY = np.exp(-0.5 * ((POSTERIOR_GRID - 1.007) / 0.01) ** 2)
+LOAD_TEST = {
+    "prior": {"mean": 1.0, "standard_deviation": 0.0255},
+    "posterior": {"grid": list(POSTERIOR_GRID), "density": list(POSTERIOR_DENSITY)},
+    "data": {"load": [2.5, 5.0, 7.5], "displacement": [0.004, 0.008, 0.011]},
+    "tip_stiffness": {"mean": 681.1, "standard_deviation": 6.0, "unit": "N/m"},
+}
+
+
+def test_a_run_without_a_load_test_shows_its_draws(run):
     assert load_test(run) is None
     assert len(calibration_figure(run).axes) == 1
-    grid = np.linspace(0.9, 1.1, 101)
-    kept = {
-        "prior": {"mean": 1.0, "standard_deviation": 0.0255},
-        "posterior": {"grid": list(grid), "density": list(np.exp(-0.5 * ((grid - 1.007) / 0.01) ** 2))},
-        "data": {"load": [2.5, 5.0, 7.5], "displacement": [0.004, 0.008, 0.011]},
-        "tip_stiffness": {"mean": 681.1, "standard_deviation": 6.0, "unit": "N/m"},
-    }
-    pairs, density = calibration_figure(replace(run, calibration=kept)).axes
+
+
+def test_draws_that_are_all_alike_are_shown(run):
+    assert calibration_figure(altered(run, calibration__draw_value=np.ones(5))).axes
+
+
+def test_calibration_shows_posterior_and_measurements(run):
+    pairs, density = calibration_figure(replace(run, calibration=LOAD_TEST)).axes
+    posterior = line(density, "posterior")
+    expected = np.exp(-0.5 * ((posterior[:, 0] - 1.007) / 0.01) ** 2)
     assert_allclose(line(pairs, "measured"), [[2.5, 4.0], [5.0, 8.0], [7.5, 11.0]])
     assert_allclose(line(pairs, "calibrated")[1], [8.1, 1e3 * 8.1 / 681.1])
-    posterior = line(density, "posterior")
-    assert_allclose(posterior[:, 1], np.exp(-0.5 * ((posterior[:, 0] - 1.007) / 0.01) ** 2))
-    cut = kept | {"prior": {"mean": 1.0, "standard_deviation": 0.05, "range": [1.0, 1.02]}}
-    prior = line(calibration_figure(replace(run, calibration=cut)).axes[1], "prior")
+    assert_allclose(posterior[:, 1], expected)
+
+
+def test_a_prior_that_is_cut_off_is_shown_within_its_range(run):
+    cut_off = {"prior": {"mean": 1.0, "standard_deviation": 0.05, "range": [1.0, 1.02]}}
+    _, density = calibration_figure(replace(run, calibration=LOAD_TEST | cut_off)).axes
+    prior = line(density, "prior")
     assert (prior[0, 0], prior[-1, 0]) == (1.0, 1.02)
     assert np.trapezoid(prior[:, 1], prior[:, 0]) == pytest.approx(1.0, rel=1e-4)
-    assert calibration_figure(altered(run, calibration__draw_value=np.ones(5))).axes
 
 
 def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(run):

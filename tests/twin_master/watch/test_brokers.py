@@ -75,82 +75,132 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
     return client, heard
 
 
-@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
-def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
-    secure, steps = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
-    where = parse_broker(secure, broker.authority) if broker.tls else where_of(broker)
-    monkeypatch.setenv(PASSWORD_VARIABLE, "another")
-    with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
-        watch.run(MqttFeed(where, watch, str), str)
-    assert not [*watch.folder.glob("*.mqtt")]  # a client that never was in is no client that was forgotten
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    with watching(where, watch, steps):
-        listener, heard = heard_at(broker, "listener")
-        publisher = broker.client("publisher")
+class Hostilities:
+    """A mission that is watched over a broker which stops once, with a publisher that sends garbage, too."""
 
-        def send(first: int, last: int) -> None:
-            for step in range(first, last):
-                control = ("2g", "3g")[mission.control_index[step]]
-                record = {"step": step, "control": control, "strain": mission.observed[step].tolist()}
-                publisher.publish(TOPIC, json.dumps(record), qos=1).wait_for_publish(20)
+    def __init__(self, mission: Any, watch: Watch, broker: Mosquitto) -> None:
+        self.mission, self.watch, self.broker = mission, watch, broker
+        self.steps = len(mission.observed)
+        secure = f"mqtts://wing@localhost:{broker.port}/{TOPIC}"
+        self.where = parse_broker(secure, broker.authority) if broker.tls else where_of(broker)
 
-        send(0, 20)
+    def run(self) -> None:
+        """Watch the whole mission, and wait for its last decision."""
+        with watching(self.where, self.watch, self.steps):
+            listener, self.heard = heard_at(self.broker, "listener")
+            self.publisher = self.broker.client("publisher")
+            self.send(0, 20)
+            self.send_garbage()
+            self.send(15, 19)
+            if not self.broker.tls:
+                self.broker.again()
+                wait_until(self.publisher.is_connected)
+            self.send(20, self.steps)
+        wait_until(lambda: self.heard and self.heard[-1]["step"] == self.steps - 1)
+        self.publisher.disconnect()
+        listener.disconnect()
+
+    def send(self, first: int, end: int) -> None:
+        for step in range(first, end):
+            control = ("2g", "3g")[self.mission.control_index[step]]
+            record = {"step": step, "control": control, "strain": self.mission.observed[step].tolist()}
+            self.publisher.publish(TOPIC, json.dumps(record), qos=1).wait_for_publish(20)
+
+    def send_garbage(self) -> None:
         for number in range(1000):
-            publisher.publish(TOPIC, b"garbage %d" % number, qos=0)
-        publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
-        publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which step?
-        send(15, 19)
-        if not broker.tls:
-            broker.again()
-            wait_until(publisher.is_connected)
-        send(20, steps)
-    wait_until(lambda: heard and heard[-1]["step"] == steps - 1)
-    publisher.disconnect()
-    listener.disconnect()
-    last, expected = (journal(folder)[-1] for folder in (watch.folder, whole))
-    assert last["filtered"] == expected["filtered"]
-    counts = last["intake"]["counts"]
+            self.publisher.publish(TOPIC, b"garbage %d" % number, qos=0)
+        self.publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
+        self.publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which step?
+
+
+@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
+def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker):
+    hostilities = Hostilities(mission, watch, broker)
+    hostilities.run()
+    last, last_of_file = (journal(folder)[-1] for folder in (watch.folder, whole))
+    assert last["filtered"] == last_of_file["filtered"]
+    check_counts_of_garbage(last["intake"]["counts"])
+    check_decisions(hostilities.heard, hostilities.steps)
+
+
+def check_counts_of_garbage(counts: dict[str, int]) -> None:
+    """Check that four steps came twice, and that garbage was refused; a broker may lose or repeat some."""
     assert counts["late"] == 0
     assert counts["duplicates"] >= 4
-    assert 1 <= counts["rejected"] < 1010  # a broker may lose or repeat some
+    assert 1 <= counts["rejected"] < 1010
+
+
+def check_decisions(heard: list[Told], steps: int) -> None:
+    """Check that the decision of each step was heard."""
     assert {decision["step"] for decision in heard} == set(range(steps))
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
-def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
-    """Of each kill the broker tells that the watch was lost."""
-    steps, chance, where = 60 * kills, random.Random(kills), where_of(broker)
-    listener, heard = heard_at(broker, "listener")
+@pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
+def test_a_twin_that_the_broker_does_not_know_is_refused(watch, mission, broker, monkeypatch):
+    """A client that never was in is no client that was forgotten."""
+    monkeypatch.setenv(PASSWORD_VARIABLE, "another")
+    where = Hostilities(mission, watch, broker).where
+    with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
+        watch.run(MqttFeed(where, watch, str), str)
+    assert not [*watch.folder.glob("*.mqtt")]
 
-    def run(steps: int, note: Any = str) -> None:
-        feed = MqttFeed(where, watch, note)
-        watch.run(feed, str, step_limit=steps)
+
+class KilledWatch:
+    """A watch over a broker with a backlog of messages, which is killed at random moments of its journal.
+
+    Of each kill the broker tells that the watch was lost.
+    """
+
+    def __init__(self, watch: Watch, broker: Mosquitto, kills: int) -> None:
+        self.watch, self.broker, self.kills = watch, broker, kills
+        self.steps = 60 * kills
+        self.chance = random.Random(kills)
+        self.killed = 0
+        listener, self.heard = heard_at(broker, "listener")
+        # All messages but the first wait at the broker.
+        self.run(1, lambda _note: publish(listener, *range(self.steps)))
+        listener.disconnect()
+        listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
+        while killed_at(watch, self.next_end(), lambda: self.run(self.steps)):
+            self.killed += 1
+            self.wait_for_loss()
+        listener = broker.client("listener", self.heard)
+        wait_until(lambda: self.heard and self.heard[-1]["step"] == self.steps - 1)
+        listener.disconnect()
+
+    def run(self, steps: int, note: Any = str) -> None:
+        feed = MqttFeed(where_of(self.broker), self.watch, note)
+        self.watch.run(feed, str, step_limit=steps)
         feed.close()
 
-    run(1, lambda _note: publish(listener, *range(steps)))  # all but the first wait at the broker
-    listener.disconnect()
-    listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
-    met = 0
+    def next_end(self) -> int:
+        """Return the size of the journal at which the watch is killed, or more than it will have."""
+        lines = self.chance.randrange(40) if self.killed < self.kills else 2 * self.steps
+        return (self.watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
 
-    def next_end() -> int:
-        lines = chance.randrange(40) if met < kills else 2 * steps
-        return (watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
-
-    while killed_at(watch, next_end(), lambda: run(steps)):
-        met += 1
-        asker, states = heard_at(broker, "asker", f"{TOPIC}/heartbeat")
-        wait_until(lambda states=states: states and states[-1]["state"] == "lost")
+    def wait_for_loss(self) -> None:
+        asker, states = heard_at(self.broker, "asker", f"{TOPIC}/heartbeat")
+        wait_until(lambda: states and states[-1]["state"] == "lost")
         asker.disconnect()
         asker.loop_stop()
-    assert met == kills
-    listener = broker.client("listener", heard)
-    wait_until(lambda: heard and heard[-1]["step"] == steps - 1)
-    listener.disconnect()
-    assert [line["step"] for line in journal(watch.folder)] == list(range(steps))
-    assert {decision["step"] for decision in heard} == set(range(steps))
-    assert len([decision for decision in heard if decision.get("told_again")]) >= kills
-    assert len(heard) < steps + 100 * kills
+
+
+@pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
+def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
+    killed = KilledWatch(watch, broker, kills)
+    steps = list(range(killed.steps))
+    assert killed.killed == kills
+    assert [line["step"] for line in journal(watch.folder)] == steps
+    check_published_decisions(killed.heard, steps, kills)
+
+
+def check_published_decisions(heard: list[Told], steps: list[int], kills: int) -> None:
+    """Check that each decision was heard, and those around each kill again."""
+    told_again = [decision for decision in heard if decision.get("told_again")]
+    assert {decision["step"] for decision in heard} == set(steps)
+    assert len(told_again) >= kills
+    assert len(heard) < len(steps) + 100 * kills
 
 
 def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
@@ -173,68 +223,138 @@ def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watc
     assert [decision["step"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
-def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
-    scenario, base, watch, broker, tmp_path, monkeypatch
-):
-    publisher, notes = broker.client("publisher"), list[str]()
+class Station:
+    """A publisher that sends steps once a watch is connected."""
 
-    def watched(watch: Watch, steps: int, *sent: int) -> Counts:
+    def __init__(self, broker: Mosquitto) -> None:
+        self.broker = broker
+        self.publisher = broker.client("publisher")
+        self.notes = list[str]()
+
+    def watch(self, watch: Watch, limit: int, *steps: int) -> Counts:
+        """Watch up to a number of steps, of which some are sent once the twin is connected."""
+
         def note(text: str) -> None:
-            notes.append(text)
-            publish(publisher, *sent)
+            self.notes.append(text)
+            publish(self.publisher, *steps)
 
-        feed = MqttFeed(where_of(broker), watch, note)
-        counts = watch.run(feed, str, step_limit=steps)
+        feed = MqttFeed(where_of(self.broker), watch, note)
+        counts = watch.run(feed, str, step_limit=limit)
         feed.close()
         return counts
 
-    assert watched(watch, 3, 0, 1, 2).received == 3
-    assert watched(watch, 4, 3) == Counts(received=4)  # the third does not come again
-    assert watched(watch, 5, 5).missing == 1  # the end is asked for within the gap before it: it comes again
-    assert watched(watch, 7, 6) == Counts(received=6, missing=1)
-    heard = list[Told]()
-    publisher.on_message = lambda _client, _data, one: heard.append(json.loads(one.payload))
-    publisher.subscribe([(DECISION, 1), (f"{TOPIC}/heartbeat", 1)])
+    def hear(self) -> list[Told]:
+        """Return what is heard of decisions and heartbeats from now on."""
+        heard = list[Told]()
+        self.publisher.on_message = lambda _client, _data, told: heard.append(json.loads(told.payload))
+        self.publisher.subscribe([(DECISION, 1), (f"{TOPIC}/heartbeat", 1)])
+        return heard
+
+
+@pytest.fixture
+def station(broker: Mosquitto) -> Iterator[Station]:
+    station = Station(broker)
+    yield station
+    station.publisher.disconnect()
+
+
+def test_what_was_acknowledged_before_an_orderly_end_does_not_come_again(station, watch):
+    counts_at_first_end = station.watch(watch, 3, 0, 1, 2)
+    counts_at_second_end = station.watch(watch, 4, 3)
+    assert counts_at_first_end.received == 3
+    assert counts_at_second_end == Counts(received=4)
+    assert all(note.startswith("Connected") for note in station.notes)
+
+
+def test_the_step_behind_a_gap_comes_again_if_the_end_is_asked_for_within_the_gap(station, watch):
+    station.watch(watch, 4, 0, 1, 2, 3)
+    counts_within_gap = station.watch(watch, 5, 5)
+    counts_behind_gap = station.watch(watch, 7, 6)
+    assert counts_within_gap.missing == 1
+    assert counts_behind_gap == Counts(received=6, missing=1)
+
+
+def test_what_was_not_published_before_an_end_is_published_by_the_next_watch(station, watch):
+    """Nothing more is wanted of it, and it ends."""
+    station.watch(watch, 7, *range(7))
+    heard = station.hear()
     (watch.folder / "published").write_text("0" * 20)
-    watched(watch, 7)  # nothing more is wanted, and what was not published is
-    wait_until(lambda: len([one for one in heard if "control" in one]) >= 7)
-    assert {one["step"] for one in heard if one.get("told_again")} == {*range(7)}
+    station.watch(watch, 7)
+    wait_until(lambda: len([told for told in heard if "control" in told]) >= 7)
     wait_until(lambda: heard[-1].get("state") == "ended")
-    assert [heard[-1][key] for key in ("step", "lag", "received", "refused")] == [6, 0, 6, 0]
-    feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 7))
+    assert {told["step"] for told in heard if told.get("told_again")} == {*range(7)}
+    assert [heard[-1][key] for key in ("step", "lag", "received", "refused")] == [6, 0, 7, 0]
+
+
+def test_a_watch_that_fails_is_told_to_be_lost(station, watch, broker):
+    station.watch(watch, 1, 0)
+    heard = station.hear()
+    feed = MqttFeed(where_of(broker), watch, lambda _note: publish(station.publisher, 1))
     with pytest.raises(ZeroDivisionError), closing(feed):
         watch.run(feed, lambda decision: decision["step"] // 0)
     wait_until(lambda: heard[-1].get("state") == "lost")
+    assert heard[-1]["state"] == "lost"
+
+
+def client_names(watch: Watch) -> list[str]:
+    return [path.read_text() for path in watch.folder.glob("*.mqtt")]
+
+
+def test_each_watch_has_a_client_name_that_nobody_can_guess(station, base, watch, tmp_path):
+    """Nobody who knows the folder can."""
     other = begun(base, tmp_path / "other")
-    watched(other, 1, 0)
-    files = [[*one.folder.glob("*.mqtt")] for one in (watch, other)]
-    names = [path.read_text() for own in files for path in own]
-    assert len({*names}) == len(names) == 2  # nobody who knows the folder can guess it
-    publish(publisher, 599)  # to a watch that is no more
-    publisher.publish(TOPIC, message(598), qos=1, retain=True).wait_for_publish(20)
-    listener, states = heard_at(broker, "listener", f"{TOPIC}/heartbeat")
-    wait_until(lambda: states)
+    station.watch(watch, 1, 0)
+    station.watch(other, 1, 0)
+    names = client_names(watch) + client_names(other)
+    assert len({*names}) == len(names) == 2
 
-    def begin() -> None:
-        wait_until(lambda: states[-1]["state"] == "watching")
-        publish(publisher, 0)
 
-    beginning = threading.Thread(target=begin)
-    beginning.start()
-    words = ("watch", scenario.path, "--observations", address(broker), "--out", watch.folder, "--steps", 1)
-    monkeypatch.setenv(PASSWORD_VARIABLE, "another")  # the first attempt fails, and the wish is kept
-    failed = command(*words, "--no-report", "--replace").stderr
-    assert "refuses the twin" in failed
-    assert "Nothing was observed yet: once this is mended" in failed
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    done = command(*words, "--no-report", "--resume")
-    beginning.join()
-    assert [json.loads(line)["step"] for line in done.stdout.splitlines()] == [0]
-    assert "1 message." in done.stderr
-    assert [path.read_text() for path in watch.folder.glob("*.mqtt")] == names[:1]
-    assert all(note.startswith("Connected") for note in notes)
-    listener.disconnect()
-    publisher.disconnect()
+class Replacement:
+    """The command that replaces a watch: at first the broker refuses it, and then it is resumed.
+
+    Messages to the former watch, and a message that the broker retains, are none of the new one.
+    """
+
+    def __init__(self, station: Station, scenario: Any, watch: Watch) -> None:
+        station.watch(watch, 1, 0)
+        self.name_before = client_names(watch)
+        self.publisher = station.publisher
+        publish(self.publisher, 599)
+        retained = self.publisher.publish(TOPIC, message(598), qos=1, retain=True)
+        retained.wait_for_publish(20)
+        listener, self.states = heard_at(station.broker, "listener", f"{TOPIC}/heartbeat")
+        wait_until(lambda: self.states)
+        beginning = threading.Thread(target=self.begin)
+        beginning.start()
+        where = ("--observations", address(station.broker), "--out", watch.folder)
+        words = ("watch", scenario.path, *where, "--steps", 1, "--no-report")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(PASSWORD_VARIABLE, "another")
+            self.refusal = command(*words, "--replace").stderr
+        self.resumed = command(*words, "--resume")
+        beginning.join()
+        self.name = client_names(watch)
+        listener.disconnect()
+
+    def begin(self) -> None:
+        """Publish the first step once the new watch is there."""
+        wait_until(lambda: self.states[-1]["state"] == "watching")
+        publish(self.publisher, 0)
+
+
+def test_a_watch_that_takes_the_place_of_another_takes_up_nothing_of_it(station, scenario, watch):
+    """It keeps the name of its client. The first attempt fails, and the wish to replace is kept."""
+    replacement = Replacement(station, scenario, watch)
+    steps = [json.loads(line)["step"] for line in replacement.resumed.stdout.splitlines()]
+    assert (steps, "1 message." in replacement.resumed.stderr) == ([0], True)
+    assert replacement.name == replacement.name_before
+    check_refusal_before_the_first_step(replacement.refusal)
+
+
+def check_refusal_before_the_first_step(sentence: str) -> None:
+    """Check that a refused watch says how to begin once its cause is mended."""
+    assert "refuses the twin" in sentence
+    assert "Nothing was observed yet: once this is mended" in sentence
 
 
 def test_a_broker_that_refuses_what_it_allowed_before(watch, broker, tmp_path):
