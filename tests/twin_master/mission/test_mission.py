@@ -67,23 +67,57 @@ def part(known: Known, folder: Path, config_hash: str = "abc", kind: type[Plant]
         return fly(knowledge.scenario, before.twin, plant, journal_sink(file, plant), history=before)
 
 
-@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
-def test_resuming_after_any_step_is_bit_identical(name, library_file, tmp_path):
-    known = of_library(name, library_file)
-    whole = part(known, tmp_path)
-    assert len(journal(tmp_path)) == 50
-    content = (tmp_path / JOURNAL_NAME).read_bytes()
-    for steps in (17, 50):
-        kept = content.splitlines(keepends=True)[: steps + 1]
-        (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
-        rest = part(known, tmp_path)
-        assert rest.resumed_at == steps
-        assert (tmp_path / JOURNAL_NAME).read_bytes() == content
-        assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= steps))
-        assert rest.notices == whole.notices
-        for array in ARRAYS:
-            np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
-    assert whole.notices or name != "failing_gauges"
+RESUMED = ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"]
+
+
+class WholeFlight:
+    """A mission that was flown in one go, with its journal."""
+
+    def __init__(self, name: str, library: Path, folder: Path) -> None:
+        self.known = of_library(name, library)
+        self.flight = part(self.known, folder)
+        self.journal = (folder / JOURNAL_NAME).read_bytes()
+        self.folder = folder
+
+    def resume_after(self, steps: int) -> History:
+        """Return the mission of which a kill left so many steps."""
+        lines = self.journal.splitlines(keepends=True)[: steps + 1]
+        (self.folder / JOURNAL_NAME).write_bytes(b"".join(lines))
+        return part(self.known, self.folder)
+
+
+@pytest.fixture(scope="module", params=RESUMED)
+def whole_flight(
+    request: pytest.FixtureRequest, library_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> WholeFlight:
+    return WholeFlight(request.param, library_file, tmp_path_factory.mktemp(request.param))
+
+
+@pytest.mark.parametrize("steps", [17, 50])
+def test_resuming_after_any_step_is_bit_identical(whole_flight, steps):
+    resumed = whole_flight.resume_after(steps)
+    assert (whole_flight.folder / JOURNAL_NAME).read_bytes() == whole_flight.journal
+    assert resumed.notices == whole_flight.flight.notices
+    for array in ARRAYS:
+        np.testing.assert_array_equal(getattr(resumed, array), getattr(whole_flight.flight, array))
+
+
+@pytest.mark.parametrize("steps", [17, 50])
+def test_a_resumed_mission_flies_the_remaining_steps_alone(whole_flight, steps):
+    resumed = whole_flight.resume_after(steps)
+    is_flown = (resumed.seconds > 0.0).any(axis=1)
+    assert resumed.resumed_at == steps
+    assert np.all(is_flown == (np.arange(50) >= steps))
+
+
+def test_the_journal_has_each_step(whole_flight):
+    whole_flight.resume_after(50)
+    assert len(journal(whole_flight.folder)) == 50
+
+
+@pytest.mark.parametrize("whole_flight", ["failing_gauges"], indirect=True)
+def test_failing_gauges_are_noticed(whole_flight):
+    assert whole_flight.flight.notices
 
 
 WITHOUT = "import sys; sys.modules['numba'] = None; from uav_twin import cli; cli.main()"
@@ -164,22 +198,35 @@ def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():
     assert len({generator(3, purpose).random() for purpose in PURPOSES}) == len(PURPOSES)
 
 
-def test_faults():
-    truth = truth_of("failing_gauges")
-    lost, healthy = SensorStatus.LOST, SensorStatus.HEALTHY
-    for part, status in (
-        (np.s_[36:38], lost), (np.s_[12:19, 16:20], lost), (np.s_[28:, 0], lost), (np.s_[:12, 16], healthy),
-        (np.s_[8, 11], SensorStatus.DRIFTING), (np.s_[36, 11], lost),
-    ):  # fmt: skip
-        assert np.all(truth.status[part] == status)
-    np.testing.assert_allclose(truth.drift[:10, 11], [0] * 8 + [6e-6, 12e-6])
-    quiet = changed_scenario("failing_gauges", {"truth": {"noise": {"standard_deviation_microstrain": 0}}})
-    truth, value = truth_of(quiet.scenario), np.full(24, 1e-3)
-    sensed = truth.sense(13, value)
+@pytest.mark.parametrize(
+    ("part", "status"),
+    [
+        (np.s_[36:38], SensorStatus.LOST),
+        (np.s_[12:19, 16:20], SensorStatus.LOST),
+        (np.s_[28:, 0], SensorStatus.LOST),
+        (np.s_[:12, 16], SensorStatus.HEALTHY),
+        (np.s_[8, 11], SensorStatus.DRIFTING),
+        (np.s_[36, 11], SensorStatus.LOST),
+    ],
+)
+def test_gauges_have_the_faults_of_the_scenario(part, status):
+    assert np.all(truth_of("failing_gauges").status[part] == status)
+
+
+def test_a_gauge_drifts_at_its_rate():
+    drift = truth_of("failing_gauges").drift
+    np.testing.assert_allclose(drift[:10, 11], [0] * 8 + [6e-6, 12e-6])
+
+
+def test_faults_of_gauges_are_sensed_and_leave_the_quantity():
+    without_noise = {"truth": {"noise": {"standard_deviation_microstrain": 0}}}
+    truth = truth_of(changed_scenario("failing_gauges", without_noise).scenario)
+    quantity = np.full(24, 1e-3)
+    sensed = truth.sense(13, quantity)
     assert np.isnan(sensed[16:20]).all()
     assert sensed[11] == pytest.approx(1e-3 + 36e-6)
-    assert np.all(value == 1e-3)
-    assert np.isnan(truth.sense(36, value)).all()
+    assert np.isnan(truth.sense(36, quantity)).all()
+    np.testing.assert_array_equal(quantity, 1e-3)
 
 
 class Heavy(Plant):
@@ -241,12 +288,13 @@ def test_large_states_are_kept_less_often_and_their_steps_flown_again(known, tmp
     monkeypatch.setattr(loop, "STATE_ALLOWANCE", 5000)
     monkeypatch.setattr(loop, "STATE_SHARE", 50)
     part(known, tmp_path, kind=Heavy)
-    whole, kept = (tmp_path / JOURNAL_NAME).read_bytes(), [n["asset_state"] for n in journal(tmp_path)]
-    last = max(number for number, state in enumerate(kept) if state is not None)
-    assert [state is None for state in kept[-6:]].count(True) == 4
-    assert last < 11
-    assert part(known, tmp_path, kind=Heavy).resumed_at == last + 1
-    assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
+    journal_before = (tmp_path / JOURNAL_NAME).read_bytes()
+    has_state = [record["asset_state"] is not None for record in journal(tmp_path)]
+    last_state = max(step for step, is_kept in enumerate(has_state) if is_kept)
+    resumed = part(known, tmp_path, kind=Heavy)
+    assert (has_state[-6:].count(False), last_state < 11) == (4, True)
+    assert resumed.resumed_at == last_state + 1
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == journal_before
 
 
 # ---------------------------------------------------------------- an FMU that hangs or ends
@@ -277,38 +325,88 @@ def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypa
     check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
 
 
-def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
-    foreign_fmu, tmp_path, monkeypatch
-):
-    """In a run, a fleet and an environment."""
-    fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
-    monkeypatch.setenv("HOSTILE_FLAG", str(flag))
-    loaded = hostile(tmp_path, fmu)
-    whole = new_run(loaded, tmp_path / "whole")
-    assert whole.notices == ()
-    flag.touch()
-    part = new_run(loaded, tmp_path / "part")
-    (said,) = part.notices
-    assert said.startswith("The asset ended the mission after 20 of 30 steps: ")
-    assert "The FMU asked to end the simulation in the step from t = 20 s" in said
-    with xr.open_datatree(whole.folder / "run.nc") as long, xr.open_datatree(part.folder / "run.nc") as short:
-        for name in ("observed/y", "truth/y", "truth/state", "truth/sensor_status", "filtered/belief"):
-            if name in long:
-                np.testing.assert_array_equal(short[name].values, long[name].values[:20])
-        assert short["truth/sensor_status"].shape == (20, 1)
-    assert resume(part.folder).notices == part.notices
-    fleet = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
-    assert fleet.failures == {}
-    assert [*fleet.ended.values()] == [said.replace(f"{part.folder}/", "")]
-    (group,) = open_fleet(fleet.folder).values()
+class EndedMission:
+    """A mission whose FMU ends its simulation after 20 of 30 steps, and one whose FMU does not."""
+
+    def __init__(self, fmu: Path, folder: Path) -> None:
+        self.flag = folder / "flag"
+        self.scenario_file = folder / "scenario.toml"
+        self.loaded = hostile(folder, fmu)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("HOSTILE_FLAG", str(self.flag))
+            self.whole = new_run(self.loaded, folder / "whole")
+            self.flag.touch()
+            self.part = new_run(self.loaded, folder / "part")
+
+
+@pytest.fixture(scope="module")
+def ended_mission(foreign_fmu, no_report, tmp_path_factory) -> EndedMission:
+    fmu = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20")
+    return EndedMission(fmu, tmp_path_factory.mktemp("ended"))
+
+
+@pytest.fixture
+def is_ending(ended_mission: EndedMission, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the FMU end its simulation."""
+    monkeypatch.setenv("HOSTILE_FLAG", str(ended_mission.flag))
+
+
+def test_a_mission_says_that_its_fmu_ended_the_simulation(ended_mission):
+    (sentence,) = ended_mission.part.notices
+    assert ended_mission.whole.notices == ()
+    assert sentence.startswith("The asset ended the mission after 20 of 30 steps: ")
+    assert "The FMU asked to end the simulation in the step from t = 20 s" in sentence
+
+
+def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(ended_mission):
+    names = ("observed/y", "truth/y", "truth/state", "truth/sensor_status", "filtered/belief")
+    whole_store, part_store = ended_mission.whole.folder / "run.nc", ended_mission.part.folder / "run.nc"
+    with xr.open_datatree(whole_store) as whole, xr.open_datatree(part_store) as part:
+        for name in names:
+            if name in whole:
+                np.testing.assert_array_equal(part[name].values, whole[name].values[:20])
+        assert part["truth/sensor_status"].shape == (20, 1)
+
+
+@pytest.mark.usefixtures("is_ending")
+def test_a_mission_that_ended_is_resumed_to_the_same_end(ended_mission):
+    assert resume(ended_mission.part.folder).notices == ended_mission.part.notices
+
+
+@pytest.fixture(scope="module")
+def ended_fleet(ended_mission: EndedMission, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A fleet of one asset, which ends its simulation as well."""
+    fleet = ensemble(str(ended_mission.scenario_file), range(4, 5))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOSTILE_FLAG", str(ended_mission.flag))
+        return fly_fleet(fleet, tmp_path_factory.mktemp("ended_fleet") / "fleet")
+
+
+def test_an_asset_of_a_fleet_that_ends_is_no_failure(ended_mission, ended_fleet):
+    (sentence,) = ended_mission.part.notices
+    without_folder = sentence.replace(f"{ended_mission.part.folder}/", "")
+    assert ended_fleet.failures == {}
+    assert [*ended_fleet.ended.values()] == [without_folder]
+
+
+def test_an_asset_of_a_fleet_that_ends_keeps_what_it_has_flown(ended_fleet):
+    (group,) = open_fleet(ended_fleet.folder).values()
     assert group["status"].values.tolist() == [ENDED]
     assert (group["observed/control_index"].values >= 0).sum() == 20
-    assert "1 of 1 assets ended their simulation" in write_fleet_report(fleet.folder).read_text()
-    with ScenarioEnvironment(loaded) as environment:
+
+
+def test_the_report_of_a_fleet_counts_assets_that_ended(ended_fleet):
+    page = write_fleet_report(ended_fleet.folder).read_text()
+    assert "1 of 1 assets ended their simulation" in page
+
+
+@pytest.mark.usefixtures("is_ending")
+def test_an_fmu_that_ends_its_simulation_terminates_an_episode(ended_mission):
+    with ScenarioEnvironment(ended_mission.loaded) as environment:
         environment.reset(seed=4)
-        seen = [environment.step(0) for _ in range(20)]
-        assert [terminated for _, _, terminated, _, _ in seen] == [False] * 19 + [True]
-        assert "asked to end" in seen[-1][4]["ended"]
+        steps = [environment.step(0) for _ in range(20)]
+        assert [terminated for _, _, terminated, _, _ in steps] == [False] * 19 + [True]
+        assert "asked to end" in steps[-1][4]["ended"]
         with pytest.raises(gymnasium.error.ResetNeeded):
             environment.step(0)
 

@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from reporting.page import ReportFigure
 from tests.twin_master.runs import changed_scenario
 from twin_master.report import page as report
 from twin_master.report.reading import Run, read_run
@@ -83,6 +84,13 @@ def run(folder: Path) -> Run:
 def hold(monkeypatch: pytest.MonkeyPatch) -> Callable[[Run], None]:
     """What lets a report find a run that is not written: NetCDF takes a second each way."""
     return lambda run: monkeypatch.setattr(report, "read_run", lambda _folder: run)
+
+
+def figures_of_unwritten(run: Run, now: int) -> dict[str, ReportFigure]:
+    """Return the figures of the report of a run that is not written, by their names."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "read_run", lambda _folder: run)
+        return {figure.name: figure for figure in report.report_figures(Path("unwritten"), now)}
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from calibration.result.file import run_record
 from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs, refused
-from tests.twin_master.report.conftest import altered, flown, line, panel, rescripted
+from tests.twin_master.report.conftest import altered, figures_of_unwritten, flown, line, panel, rescripted
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
 from twin_master.report.calibration import true_value
@@ -351,8 +351,8 @@ def test_another_layout_gives_one_sentence(folder, tmp_path, missing):
     assert not (place / "figures").exists()
 
 
-@pytest.fixture
-def last_steps(run, hold) -> Run:
+@pytest.fixture(scope="module")
+def last_steps(run: Run) -> Run:
     """The run as the last 50 of 1050 steps of a watch, without a truth, and with lost gauges."""
     observed = run.observations.copy()
     observed[7] = np.nan
@@ -360,14 +360,12 @@ def last_steps(run, hold) -> Run:
     tree = altered(run, observed__strain=observed, truth=None).tree.map_over_datasets(
         lambda group: group.assign_coords(step=group["step"] + 1000) if "step" in group.coords else group
     )
-    watched = replace(run, tree=tree, summary={})
-    hold(watched)
-    return watched
+    return replace(run, tree=tree, summary={})
 
 
-@pytest.fixture
-def figures_of_last_steps(last_steps, tmp_path) -> dict[str, ReportFigure]:
-    return {figure.name: figure for figure in report.report_figures(tmp_path, 1020)}
+@pytest.fixture(scope="module")
+def figures_of_last_steps(last_steps: Run) -> dict[str, ReportFigure]:
+    return figures_of_unwritten(last_steps, 1020)
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -401,9 +399,10 @@ def test_lost_gauges_of_the_last_steps_have_their_numbers(last_steps):
     assert lost_ranges(last_steps) == "gauge 3 at steps 1008–1009; all gauges at step 1007"
 
 
-@pytest.mark.usefixtures("no_drawing", "last_steps")
+@pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("now", [49, 999, 1050])
-def test_a_present_outside_the_last_steps_is_refused(tmp_path, now):
+def test_a_present_outside_the_last_steps_is_refused(last_steps, hold, tmp_path, now):
+    hold(last_steps)
     with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
         report.write_report(tmp_path, now=now)
 

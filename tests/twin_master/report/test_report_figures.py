@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from reporting.page import ReportFigure
-from tests.twin_master.report.conftest import altered, line, panel, rescripted
+from tests.twin_master.report.conftest import altered, figures_of_unwritten, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.belief import belief_figure, belief_steps, policy_figure
@@ -98,8 +98,8 @@ def test_gauges_that_are_worth_a_panel_are_chosen(run):
     assert choose_sensors(run) == [16, 0, 4, 9]
 
 
-@pytest.fixture
-def figures_of_other_units(run, hold, tmp_path) -> dict[str, ReportFigure]:
+@pytest.fixture(scope="module")
+def figures_of_other_units(run) -> dict[str, ReportFigure]:
     """The figures of a run with a state in m2.K/W, a pressure, flows, and steps that are shifts."""
     flows = range(2, 25)
     observation = {
@@ -113,8 +113,8 @@ def figures_of_other_units(run, hold, tmp_path) -> dict[str, ReportFigure]:
     tree = altered(run).tree
     for name in ("observed", "truth"):
         tree[name] = xr.DataTree(tree[name].to_dataset().rename({"strain": "operation"}))
-    hold(replace(other, tree=tree, scenario=Scenario.model_validate(other.config["scenario"])))
-    return {figure.name: figure for figure in report.report_figures(tmp_path, 20)}
+    scenario = Scenario.model_validate(other.config["scenario"])
+    return figures_of_unwritten(replace(other, tree=tree, scenario=scenario), 20)
 
 
 def test_states_have_units_of_their_own(run, figures_of_other_units):
