@@ -43,65 +43,120 @@ def make(folder: Path, name: str, *, replace: bool = False) -> None:
         pass
 
 
-def test_a_run_that_flies_is_not_replaced_nor_anything_that_is_no_run(tmp_path):
+def test_a_run_that_flies_is_not_replaced(tmp_path):
     folder = tmp_path / "run"
     with create_run_folder(folder, {"kind": KIND, "name": "first"}):
         with pytest.raises(RunFolderError, match="another process is flying"):
             make(folder, "second", replace=True)
         with pytest.raises(RunFolderError, match="another process is flying"):
             lock_run_folder(folder)
-    written(folder, "mine", name="notes.txt")
+
+
+def test_a_run_is_replaced_only_on_demand(tmp_path):
+    folder = tmp_path / "run"
+    make(folder, "first")
     with pytest.raises(RunFolderError, match="--resume"):
         make(folder, "second")
     assert "first" in (folder / "config.json").read_text(encoding="utf-8")
+
+
+def test_a_run_that_is_replaced_leaves_nothing(tmp_path):
+    folder = tmp_path / "run"
+    make(folder, "first")
+    written(folder, "mine", name="notes.txt")
     make(folder, "second", replace=True)
     assert "second" in (folder / "config.json").read_text(encoding="utf-8")
     assert not (folder / "notes.txt").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    make(mine, "first", replace=True)  # an empty folder
-    (mine / "config.json").unlink()
-    thesis = written(mine, "important", name="thesis.txt")
-    for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
-        with pytest.raises(RunFolderError, match=sentence):
-            make(place, "second", replace=True)
+
+
+def test_an_empty_folder_is_replaced(tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    make(folder, "first", replace=True)
+    assert (folder / "config.json").is_file()
+
+
+@pytest.mark.parametrize(("name", "sentence"), [(".", "not touched"), ("thesis.txt", "no folder")])
+def test_what_is_no_run_is_not_replaced(tmp_path, name, sentence):
+    thesis = written(tmp_path, "important", name="thesis.txt")
+    with pytest.raises(RunFolderError, match=sentence):
+        make(tmp_path / name, "second", replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"
 
 
-@pytest.mark.parametrize("moves", [1, 2, 3])
-def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path, library_file, monkeypatch, moves):
-    folder, rename, moved = tmp_path / "run[1]", Path.rename, list[Path]()
-    make(folder, "first")
-    written(folder, "mine", name="notes.txt")
+class KilledReplacement:
+    """A run with a note of the user's, whose replacement was killed behind some of its moves."""
 
-    def killing(path: Path, target: Path) -> Path:
-        moved.append(rename(path, target))
-        if len(moved) == moves:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return target
+    def __init__(self, parent: Path, moves: int) -> None:
+        self.parent = parent
+        self.folder = parent / "run[1]"
+        self.was_moved_aside = moves == 1  # later moves have put the second run in its place
+        make(self.folder, "first")
+        written(self.folder, "mine", name="notes.txt")
+        child = os.fork()
+        if not child:
+            try:
+                self.replace(moves)
+            finally:
+                os._exit(1)
+        self.status = os.waitpid(child, 0)[1]
 
-    if not (child := os.fork()):
-        try:
-            monkeypatch.setattr(Path, "rename", killing)
-            make(folder, "second", replace=True)
-        finally:
-            os._exit(1)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    if moves == 1:
-        (aside,) = tmp_path.glob(".*/run*")
-        lock = lock_run_folder(aside)  # it is being replaced
-        assert restore_folder(folder) is False
-        os.close(lock)
-    notes = noted(monkeypatch)
+    def replace(self, moves: int) -> None:
+        """Replace the run, and kill this process behind so many moves."""
+        rename = Path.rename
+        moved = list[Path]()
+
+        def killing(path: Path, target: Path) -> Path:
+            moved.append(rename(path, target))
+            if len(moved) == moves:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return target
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Path, "rename", killing)
+            make(self.folder, "second", replace=True)
+
+    def text(self) -> str:
+        return (self.folder / "config.json").read_text(encoding="utf-8")
+
+
+@pytest.fixture(params=[1, 2, 3], ids=lambda moves: f"{moves} moves")
+def killed_replacement(request: pytest.FixtureRequest, tmp_path: Path) -> KilledReplacement:
+    killed = KilledReplacement(tmp_path, request.param)
+    assert killed.status == signal.SIGKILL
+    return killed
+
+
+@pytest.mark.parametrize("killed_replacement", [1], indirect=True)
+def test_a_run_that_is_being_replaced_is_not_put_back(killed_replacement):
+    (aside,) = killed_replacement.parent.glob(".*/run*")
+    lock = lock_run_folder(aside)
+    assert restore_folder(killed_replacement.folder) is False
+    os.close(lock)
+
+
+def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(killed_replacement, library_file):
+    killed = killed_replacement
     with pytest.raises(RunFolderError, match="holds a run already"):
-        fly(folder, library_file)
-    assert [note.endswith("the run that was there is back.") for note in notes] == [True] * (moves == 1)
-    kept = "first" if moves == 1 else "second"
-    assert kept in (folder / "config.json").read_text(encoding="utf-8")
-    assert (folder / "notes.txt").exists() is (moves == 1)
-    assert not list(tmp_path.glob(".*"))
-    assert restore_folder(folder) is False
+        fly(killed.folder, library_file)
+    assert ("first" if killed.was_moved_aside else "second") in killed.text()
+    assert (killed.folder / "notes.txt").exists() is killed.was_moved_aside
+
+
+def test_a_run_that_was_moved_aside_is_told_to_be_back(killed_replacement, library_file, monkeypatch):
+    notes = noted(monkeypatch)
+    with pytest.raises(RunFolderError):
+        fly(killed_replacement.folder, library_file)
+    is_back = [note.endswith("the run that was there is back.") for note in notes]
+    assert is_back == ([True] if killed_replacement.was_moved_aside else [])
+
+
+def test_a_killed_replacement_leaves_nothing_hidden(killed_replacement, library_file):
+    with pytest.raises(RunFolderError):
+        fly(killed_replacement.folder, library_file)
+    assert not list(killed_replacement.parent.glob(".*"))
+    assert restore_folder(killed_replacement.folder) is False
 
 
 DEEP = '{"a":' * 5000 + "1" + "}" * 5000
@@ -132,28 +187,50 @@ def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     assert seen == [{"z1": 0.8, "z2": 0.3}]
 
 
-@pytest.mark.parametrize("steps", [1, 50])
-def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, steps):
-    """Though its folder was moved and the files that were given are gone."""
-    library = written(tmp_path, library_file.read_text(encoding="utf-8"), name="é.json")
+def fly_until(steps: int, folder: Path, library: Path) -> None:
+    """Fly a mission that dies after some steps, and remove the library that it was given."""
     with cut_off_after(steps):
-        fly(tmp_path / "part", library)
-    assert not (tmp_path / "part" / "run.nc").exists()
+        fly(folder, library)
+    assert not (folder / "run.nc").exists()
     library.unlink()
+
+
+@pytest.fixture
+def copied_library(tmp_path: Path, library_file: Path) -> Path:
+    return written(tmp_path, library_file.read_text(encoding="utf-8"), name="é.json")
+
+
+@pytest.mark.parametrize("steps", [1, 50])
+def test_a_resumed_run_is_bit_identical(flown, tmp_path, copied_library, steps):
+    """Though its folder was moved and the files that were given are gone; also if it is resumed once more."""
+    fly_until(steps, tmp_path / "part", copied_library)
     moved = (tmp_path / "part").rename(tmp_path / "moved é")
-    (moved / f".{FIELD_NAME}.ab12").mkdir()
-    for left in (f".{FIELD_NAME}.ab12/wing.vtu", f".{FIELD_NAME}.cd34", "csv/.1-2.partial.csv", ".mine"):
-        (moved / left).parent.mkdir(exist_ok=True)
-        (moved / left).write_bytes(b"left by a killed process, or the user's")
-    resume_run(moved, load_scenario("failing_gauges"))
-    check_same(moved, flown.folder, *SAME)
-    assert [path.name for path in moved.rglob(".*")] == [".mine"]
-    resume_run(moved)  # a finished run may be resumed; nothing changes
-    check_same(moved, flown.folder, *SAME)
-    for path in moved.rglob("*"):
+    for _ in range(2):
+        resume_run(moved, load_scenario("failing_gauges"))
+        check_same(moved, flown.folder, *SAME)
+
+
+def test_a_resumed_run_does_not_say_in_which_folder_it_stands(tmp_path, copied_library):
+    fly_until(50, tmp_path / "part", copied_library)
+    resume_run(tmp_path / "part")
+    for path in (tmp_path / "part").rglob("*"):
         assert path.is_dir() or str(tmp_path).encode() not in path.read_bytes(), path
+
+
+def test_a_resumed_run_removes_what_a_killed_process_left_and_nothing_of_the_users(tmp_path, copied_library):
+    folder = tmp_path / "part"
+    fly_until(50, folder, copied_library)
+    (folder / f".{FIELD_NAME}.ab12").mkdir()
+    (folder / "csv").mkdir(exist_ok=True)
+    for name in (f".{FIELD_NAME}.ab12/wing.vtu", f".{FIELD_NAME}.cd34", "csv/.1-2.partial.csv", ".mine"):
+        (folder / name).write_bytes(b"left by a killed process, or the user's")
+    resume_run(folder)
+    assert [path.name for path in folder.rglob(".*")] == [".mine"]
+
+
+def test_a_mission_without_its_library_is_not_begun(tmp_path):
     with pytest.raises(MissionInputError):
-        fly(tmp_path / "never", library)
+        fly(tmp_path / "never", tmp_path / "é.json")
     assert not (tmp_path / "never").exists()
 
 
@@ -172,28 +249,42 @@ def test_a_run_of_an_earlier_version_is_taken_up_with_a_sentence_for_each_file(f
     check_same(tmp_path / "run", flown.folder, "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
 
 
-def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):
-    whole = Path(shutil.copytree(flown.folder, tmp_path / "whole"))
+@pytest.fixture
+def finished(flown: RunOutcome, tmp_path: Path) -> Path:
+    """A copy of the folder of the run."""
+    return Path(shutil.copytree(flown.folder, tmp_path / "whole"))
+
+
+def write_short_report(folder: Path) -> Path:
+    """Stand for the report, which has tests of its own and takes seconds."""
+    (folder / "report.html").write_text("report", encoding="utf-8")
+    return folder / "report.html"
+
+
+def test_a_run_has_all_groups_and_the_time_of_its_steps(finished):
     groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
-    assert {*open_run(whole).children} == groups
-    assert json.loads((whole / "timing.json").read_text(encoding="utf-8"))["steps"] == 50
+    timing = json.loads((finished / "timing.json").read_text(encoding="utf-8"))
+    assert {*open_run(finished).children} == groups
+    assert timing["steps"] == 50
 
-    def report(folder: Path) -> Path:
-        (folder / "report.html").write_text("report", encoding="utf-8")
-        return folder / "report.html"
 
-    monkeypatch.setattr(workflow, "_write_report", report)
-    with monkeypatch.context() as patch:
-        patch.setattr(workflow, "_run", None)  # nothing is done again
-        notes = noted(patch)
-        again = resume_run(whole)
-    assert notes == [f"The run in {whole} is finished: nothing is flown again."]
+def test_a_finished_run_says_so_and_is_not_flown_again(flown, finished, monkeypatch):
+    monkeypatch.setattr(workflow, "_write_report", write_short_report)
+    monkeypatch.setattr(workflow, "_run", None)
+    notes = noted(monkeypatch)
+    again = resume_run(finished)
+    assert notes == [f"The run in {finished} is finished: nothing is flown again."]
     assert (again.figures, again.report.name, again.origin) == (flown.figures, "report.html", flown.origin)
-    (whole / "run.nc").write_bytes((whole / "run.nc").read_bytes()[:5000])
-    resume_run(whole)
-    check_same(whole, flown.folder, *SAME)
-    (whole / "report.html").unlink()
-    assert resume_run(whole).report.is_file()
+
+
+def test_a_finished_run_is_made_whole_where_something_is_missing(flown, finished, monkeypatch):
+    monkeypatch.setattr(workflow, "_write_report", write_short_report)
+    store = finished / "run.nc"
+    store.write_bytes(store.read_bytes()[:5000])
+    resume_run(finished)
+    check_same(finished, flown.folder, *SAME)
+    (finished / "report.html").unlink()
+    assert resume_run(finished).report.is_file()
 
 
 def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):

@@ -61,55 +61,99 @@ def finished(out: Path) -> int:
         return 0
 
 
-def test_the_library_holds_what_the_formula_says_with_names_and_units(files, tmp_path):
-    outcome = sample_library(grid(files), tmp_path / "lever.nc", workers=1)
+@pytest.fixture(scope="module")
+def lever(files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A library that was sampled from the FMU of a lever."""
+    return sample_library(grid(files), tmp_path_factory.mktemp("lever") / "lever.nc", workers=1)
+
+
+def test_the_library_holds_what_the_formula_says(lever):
     expected = np.array([[[g * p / (1.0 + w) for p in PUSH] for w in WEAR] for g in GAIN])
-    np.testing.assert_allclose(outcome.library.values[..., 0], expected, rtol=1e-15)
-    np.testing.assert_allclose(outcome.library.values[..., 1], 2e3 * expected, rtol=1e-15)
-    assert not blocks_folder(outcome.path).exists()
-    with xr.open_dataset(outcome.path, engine="h5netcdf") as stored:
+    np.testing.assert_allclose(lever.library.values[..., 0], expected, rtol=1e-15)
+    np.testing.assert_allclose(lever.library.values[..., 1], 2e3 * expected, rtol=1e-15)
+    assert not blocks_folder(lever.path).exists()
+
+
+def test_the_file_of_a_library_has_names_of_axes_and_sensors(lever):
+    with xr.open_dataset(lever.path, engine="h5netcdf") as stored:
         assert stored["observation"].dims == ("draw", "wear", "control", "sensor")
-        assert stored["wear"].attrs["units"] == "1"
         assert list(stored["sensor"].values) == ["shown", "double"]
+        assert float(stored["observation"].sel(wear=0.25)[1, 1, 0]) == 3.2
+
+
+def test_the_file_of_a_library_has_units(lever):
+    with xr.open_dataset(lever.path, engine="h5netcdf") as stored:
+        assert stored["wear"].attrs["units"] == "1"
         assert list(stored["sensor_unit"].values) == ["m", "mm"]
         assert stored["control_push"].attrs["units"] == "N"
-        assert float(stored["observation"].sel(wear=0.25)[1, 1, 0]) == 3.2
-    read = load_observation_library(outcome.path)
-    np.testing.assert_array_equal(read.values, outcome.library.values)
-    assert (read.parameter, read.draws.tolist(), read.controls) == (
-        "gain", list(GAIN), ("push = 2, mode = 0", "push = 4, mode = 0"),
-    )  # fmt: skip
 
 
-def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, request):
-    """Interrupted, resumed, and killed. What a shell starts in the background would ignore SIGINT."""
-    former = signal.signal(signal.SIGINT, signal.default_int_handler)
-    request.addfinalizer(lambda: signal.signal(signal.SIGINT, former))
-    slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
-    whole = sample_library(slow, tmp_path / "whole.nc", workers=1)
-    fmu, binding = files
-    out = tmp_path / "part.nc"
-    command = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]
-    command += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(out), "--grid", "wear=0,0.25,0.5"]
-    command += ["--grid", "gain=0.8:1.2:20", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
-    for wanted, end, more in ((5, signal.SIGINT, []), (10, signal.SIGKILL, ["--resume"])):
-        process = subprocess.Popen([*command, *more], cwd=ROOT, stderr=subprocess.PIPE)
-        while finished(out) < 2 * wanted and process.poll() is None:
+def test_the_file_of_a_library_reads_back(lever):
+    library = load_observation_library(lever.path)
+    np.testing.assert_array_equal(library.values, lever.library.values)
+    assert (library.parameter, library.draws.tolist()) == ("gain", list(GAIN))
+    assert library.controls == ("push = 2, mode = 0", "push = 4, mode = 0")
+
+
+class InterruptedSampling:
+    """A library whose sampling was interrupted after five points, resumed, and killed after ten."""
+
+    FINISHED_AT_KILL = 10
+
+    def __init__(self, files: tuple[Path, Path], folder: Path) -> None:
+        fmu, binding = files
+        self.out = folder / "part.nc"
+        self.grid = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
+        self.words = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]
+        self.words += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(self.out)]
+        for axis in ("wear=0,0.25,0.5", "gain=0.8:1.2:20", "push=2,4", f"mode={SLOW}"):
+            self.words += ["--grid", axis]
+        self.code, self.sentence = self.stop_at(5, signal.SIGINT)
+        self.stop_at(self.FINISHED_AT_KILL, signal.SIGKILL, "--resume")
+
+    def stop_at(self, points: int, end: signal.Signals, *options: str) -> tuple[int, str]:
+        """Sample until so many points are finished; return exit code and what was said."""
+        process = subprocess.Popen([*self.words, *options], cwd=ROOT, stderr=subprocess.PIPE)
+        while finished(self.out) < 2 * points and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(end)
-        words = process.communicate()[1].decode()
-        if end == signal.SIGINT:
-            assert process.returncode == 130
-            assert words.startswith("Interrupted; finished blocks are kept")
-            assert "Traceback" not in words
-    assert not out.exists()
+        complaint = process.communicate()[1].decode()
+        return process.returncode, complaint
+
+
+@pytest.fixture(scope="module")
+def interrupted_sampling(
+    files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
+) -> InterruptedSampling:
+    """What a shell starts in the background would ignore SIGINT."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return InterruptedSampling(files, tmp_path_factory.mktemp("interrupted"))
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+def test_an_interrupted_sampling_ends_with_a_sentence(interrupted_sampling):
+    assert interrupted_sampling.code == 130
+    assert interrupted_sampling.sentence.startswith("Interrupted; finished blocks are kept")
+    assert "Traceback" not in interrupted_sampling.sentence
+
+
+def test_finished_blocks_are_resumed_only_on_demand_and_for_the_same_grid(interrupted_sampling, files):
+    out = interrupted_sampling.out
     with pytest.raises(MissionInputError, match=r"part\.nc\.blocks holds the finished blocks"):
-        sample_library(slow, out)
+        sample_library(interrupted_sampling.grid, out)
     with pytest.raises(MissionInputError, match=r"another FMU, binding, grid .*\(draws\)"):
         sample_library(grid(files, SLOW), out, resume=True)
-    outcome = sample_library(slow, out, workers=1, resume=True)
-    assert wanted <= outcome.kept_blocks < outcome.block_count
-    assert out.read_bytes() == whole.path.read_bytes()
+    assert not out.exists()
+
+
+def test_what_an_interrupted_sampling_finished_is_kept(interrupted_sampling, tmp_path):
+    sampling = interrupted_sampling
+    whole = sample_library(sampling.grid, tmp_path / "whole.nc", workers=1)
+    outcome = sample_library(sampling.grid, sampling.out, workers=1, resume=True)
+    assert sampling.FINISHED_AT_KILL <= outcome.kept_blocks < outcome.block_count
+    assert sampling.out.read_bytes() == whole.path.read_bytes()
 
 
 def test_what_is_damaged_is_sampled_again(files, tmp_path, monkeypatch):
@@ -210,37 +254,62 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sampled(tmp_path_factory.mktemp("library"), "viscosity_factor=0.9:1.1:21")
 
 
-def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
-    path = Path(shutil.copy(made, tmp_path / "pump.nc"))
-    library = load_observation_library(path)
+def test_between_its_draws_a_library_is_interpolated(made):
+    library = load_observation_library(made)
     between = library.observations_at("viscosity_factor", np.array([0.955]))[0]
     np.testing.assert_allclose(between, 0.5 * (library.values[5] + library.values[6]), rtol=1e-14)
-    whole = fly(SMALL, tmp_path / "whole", Overrides(library=path))
-    assert not whole.origin.differ
-    assert whole.origin.model == "observation library of it"
-    config = json.loads((tmp_path / "whole" / "config.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def run_with_library(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A run that believes the library."""
+    return fly(SMALL, tmp_path_factory.mktemp("with_library") / "whole", Overrides(library=made))
+
+
+def test_a_run_with_a_library_says_what_is_believed(run_with_library):
+    assert not run_with_library.origin.differ
+    assert run_with_library.origin.model == "observation library of it"
+
+
+def test_a_run_with_a_library_keeps_it(run_with_library):
+    config = json.loads((run_with_library.folder / "config.json").read_text())
     assert config["scenario"]["belief"]["file"] == "asset/observation_library.nc"
     assert config["scenario"]["asset"]["kind"] == "fmu"
     assert set(config["inputs"]) == {"binding", "fmu", "observation_library"}
+
+
+def test_a_run_whose_library_is_gone_is_resumed(run_with_library, made, tmp_path):
+    library = Path(shutil.copy(made, tmp_path / "pump.nc"))
     part = tmp_path / "part"
     with cut_off_after(3):
-        fly(SMALL, part, Overrides(library=path))
-    path.unlink()
+        fly(SMALL, part, Overrides(library=library))
+    library.unlink()
     resume(part)
-    check_same(part, whole.folder, "run.nc", "summary.json", "csv/health.csv")
+    check_same(part, run_with_library.folder, "run.nc", "summary.json", "csv/health.csv")
 
 
-def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
-    script = tmp_path / "gear_pump.py"
+@pytest.fixture(scope="module")
+def run_of_hotter_pump(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A run of a pump with less cooling than that whose library is believed."""
+    folder = tmp_path_factory.mktemp("hotter")
+    script = folder / "gear_pump.py"
     text = asset_scripts()["gear_pump"].read_text(encoding="utf-8")
     script.write_text(text.replace("COOLING = 250.0", "COOLING = 200.0"))
-    fmu = build_script_fmu(script, tmp_path / "other.fmu").path
-    outcome = fly(SMALL, tmp_path / "run", Overrides(library=made, fmu=fmu))
-    assert outcome.origin.differ
-    assert outcome.origin.model == "observation library of another FMU"
-    (misfit,) = (figure.value for figure in outcome.figures if figure.key == "model_misfit_largest")
-    assert misfit > 1.0  # percent: it is hotter with less cooling
-    assert json.loads((outcome.folder / "summary.json").read_text())["asset_and_model_differ"] is True
+    fmu = build_script_fmu(script, folder / "other.fmu").path
+    return fly(SMALL, folder / "run", Overrides(library=made, fmu=fmu))
+
+
+def test_a_library_of_another_fmu_is_flown_with_a_notice(run_of_hotter_pump):
+    summary = json.loads((run_of_hotter_pump.folder / "summary.json").read_text())
+    assert run_of_hotter_pump.origin.differ
+    assert run_of_hotter_pump.origin.model == "observation library of another FMU"
+    assert summary["asset_and_model_differ"] is True
+
+
+def test_the_misfit_of_a_library_of_another_fmu_is_a_figure(run_of_hotter_pump):
+    """In percent of the reading."""
+    figures = {figure.key: figure.value for figure in run_of_hotter_pump.figures}
+    assert figures["model_misfit_largest"] > 1.0
 
 
 @pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("library"))
@@ -343,39 +412,92 @@ def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
     assert math.isnan(steady_temperature(Conditions(2500.0 * math.pi / 30.0, 210e5, 1.0, 0.0, 1.0)))
 
 
-@pytest.mark.parametrize("way", ["asset", "library", "swept", "learnt"])
-def test_what_was_calibrated_beside_the_parameter_follows_its_draws(heat_exchanger, tmp_path, way):
-    """By the formula of the heat exchanger and a regression; in the asset all else is at its mean."""
-    folder = Path(shutil.copytree(heat_exchanger, tmp_path / "system"))
-    with (folder / "binding.toml").open("a") as binding:
-        binding.write('[parameter.specific_heat]\nvariable = "specific_heat"\nunit = "J/(kg.K)"\n')
-    one, two = np.random.default_rng(3).standard_normal((2, 400))
-    samples = np.column_stack([6000.0 + 80.0 * one, 4186.0 + 120.0 * one + 20.0 * two])
-    named = [("conductance", "W/K", 6e3), ("specific_heat", "J/(kg.K)", 4e3)]
-    priors = tuple(ParameterPrior(*row, 600.0, 1e3, 9e3, "model.toml") for row in named)
-    told = ("exchanger 7", "exchanger", "0" * 64, "Gaussian", priors, samples, samples)
-    (tmp_path / "c.nc").write_bytes(result_bytes(Calibration(*told, None, (), (), "test", 1, {})))
-    loaded, given = load_scenario(folder / "fouling.toml"), Overrides(calibration=tmp_path / "c.nc")
-    if way in ("library", "swept"):
-        grid = ["conductance=5600:6400:17"] if way == "swept" else []
-        asked = grid_of_scenario(loaded, tmp_path / "made", grid, overrides=given)
-        given = replace(given, library=sample_library(asked, tmp_path / "l.nc", workers=1).path)
-    elif way == "learnt":
-        text = 'format = 1\n[calibration]\nparameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
-        given = replace(given, learnt=written(tmp_path, text))
-    known, (slope, offset) = prepare_twin(loaded, given), np.polyfit(*samples.T, 1)
-    assert ("the observation library is interpolated" in known.draws.source) is (way == "swept")
-    assert known.draws.mean == pytest.approx(6100.0 if way == "learnt" else samples[:, 0].mean())
-    flown = known.scenario.asset.source(known.scenario).parameters()
-    assert flown == {"conductance": 6100.0, "specific_heat": pytest.approx(samples[:, 1].mean())}
-    for true, of in ((4000.0, "under other parameters"), (samples[:, 1].mean(), "")) * (way == "library"):
-        table = merged(known.scenario.to_dict(), {"asset": {"parameters": {"specific_heat": float(true)}}})
-        source = asset_source(parse_scenario(table, "exchanger"))
-        source.prepare(tmp_path / f"{true:g}", SilentProgress())
-        assert source.origin.model == f"observation library of it {of}".strip()
-        assert source.origin.differ == bool(of)
-    axes = known.draws.values, [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2]
-    draw, fouling, flow = np.meshgrid(*axes, indexing="ij")
-    passed = draw / (1.0 + fouling * draw) / ((slope * draw + offset) * flow)
-    shown = 20.0 + 60.0 * (1.0 - np.exp(-np.stack([0.5 * passed, passed], axis=-1)))
-    np.testing.assert_allclose(known.predicted, shown, rtol=1e-4 if way == "swept" else 1e-12)
+class CalibratedExchanger:
+    """A heat exchanger whose conductance and specific heat were calibrated, and a mission that believes it.
+
+    What is believed is the asset itself, a library at the samples, a library over a sweep of the
+    conductance, or the asset with a conductance that a fleet learnt.
+    """
+
+    def __init__(self, exchanger: Path, folder: Path, way: str) -> None:
+        system = Path(shutil.copytree(exchanger, folder / "system"))
+        with (system / "binding.toml").open("a") as binding:
+            binding.write('[parameter.specific_heat]\nvariable = "specific_heat"\nunit = "J/(kg.K)"\n')
+        self.way = way
+        self.samples = self.draw_samples()
+        self.overrides = Overrides(calibration=self.write_calibration(folder))
+        loaded = load_scenario(system / "fouling.toml")
+        if way in ("library", "swept"):
+            axes = ["conductance=5600:6400:17"] if way == "swept" else []
+            asked = grid_of_scenario(loaded, folder / "made", axes, overrides=self.overrides)
+            library = sample_library(asked, folder / "l.nc", workers=1).path
+            self.overrides = replace(self.overrides, library=library)
+        elif way == "learnt":
+            text = "format = 1\n[calibration]\n"
+            text += 'parameter = "conductance"\nmean = 6100\nstandard_deviation = 30\n'
+            self.overrides = replace(self.overrides, learnt=written(folder, text))
+        self.known = prepare_twin(loaded, self.overrides)
+
+    def draw_samples(self) -> Float:
+        """Return samples of conductance and specific heat, which depend on each other."""
+        one, two = np.random.default_rng(3).standard_normal((2, 400))
+        return np.column_stack([6000.0 + 80.0 * one, 4186.0 + 120.0 * one + 20.0 * two])
+
+    def write_calibration(self, folder: Path) -> Path:
+        rows = [("conductance", "W/K", 6e3), ("specific_heat", "J/(kg.K)", 4e3)]
+        priors = tuple(ParameterPrior(*row, 600.0, 1e3, 9e3, "model.toml") for row in rows)
+        about = ("exchanger 7", "exchanger", "0" * 64, "Gaussian", priors, self.samples, self.samples)
+        file = folder / "c.nc"
+        file.write_bytes(result_bytes(Calibration(*about, None, (), (), "test", 1, {})))
+        return file
+
+
+@pytest.fixture(scope="module", params=["asset", "library", "swept", "learnt"])
+def calibrated_exchanger(
+    request: pytest.FixtureRequest, heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory
+) -> CalibratedExchanger:
+    return CalibratedExchanger(heat_exchanger, tmp_path_factory.mktemp(request.param), request.param)
+
+
+def test_draws_of_the_parameter_say_where_they_come_from(calibrated_exchanger):
+    draws, way = calibrated_exchanger.known.draws, calibrated_exchanger.way
+    mean = 6100.0 if way == "learnt" else calibrated_exchanger.samples[:, 0].mean()
+    is_interpolated = "the observation library is interpolated" in draws.source
+    assert is_interpolated is (way == "swept")
+    assert draws.mean == pytest.approx(mean)
+
+
+def test_in_the_asset_all_but_the_parameter_is_at_its_mean(calibrated_exchanger):
+    scenario = calibrated_exchanger.known.scenario
+    specific_heat = pytest.approx(calibrated_exchanger.samples[:, 1].mean())
+    parameters = scenario.asset.source(scenario).parameters()
+    assert parameters == {"conductance": 6100.0, "specific_heat": specific_heat}
+
+
+def test_what_was_calibrated_beside_the_parameter_follows_its_draws(calibrated_exchanger):
+    """By the formula of the heat exchanger and a regression."""
+    known = calibrated_exchanger.known
+    slope, offset = np.polyfit(*calibrated_exchanger.samples.T, 1)
+    fouling_levels, mass_flows = [0, 1e-4, 2e-4, 3e-4], [0.5, 0.8, 1.2]
+    draw, fouling, flow = np.meshgrid(known.draws.values, fouling_levels, mass_flows, indexing="ij")
+    specific_heat = slope * draw + offset
+    transfer_units = draw / (1.0 + fouling * draw) / (specific_heat * flow)
+    half_and_whole = np.stack([0.5 * transfer_units, transfer_units], axis=-1)
+    expected = 20.0 + 60.0 * (1.0 - np.exp(-half_and_whole))
+    tolerance = 1e-4 if calibrated_exchanger.way == "swept" else 1e-12
+    np.testing.assert_allclose(known.predicted, expected, rtol=tolerance)
+
+
+@pytest.mark.parametrize("calibrated_exchanger", ["library"], indirect=True)
+@pytest.mark.parametrize("is_at_mean", [True, False])
+def test_a_library_says_that_it_was_sampled_under_other_parameters(
+    calibrated_exchanger, tmp_path, is_at_mean
+):
+    true_value = float(calibrated_exchanger.samples[:, 1].mean()) if is_at_mean else 4000.0
+    changes = {"asset": {"parameters": {"specific_heat": true_value}}}
+    table = merged(calibrated_exchanger.known.scenario.to_dict(), changes)
+    source = asset_source(parse_scenario(table, "exchanger"))
+    source.prepare(tmp_path / "source", SilentProgress())
+    expected = "observation library of it" + ("" if is_at_mean else " under other parameters")
+    assert source.origin.model == expected
+    assert source.origin.differ is not is_at_mean

@@ -4,6 +4,7 @@ import pickle
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,21 +64,39 @@ def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_step(
         assert ahead == pytest.approx(binom.sf(2, steps, 0.1), abs=1e-12)
 
 
-def test_an_impossible_observation_names_twin_step_and_sensors(knowledge):
+@pytest.fixture
+def possible(knowledge: Knowledge) -> np.ndarray:
+    """What a healthy wing shows at 3g."""
+    return knowledge.sensor_model.mean[0, 1].copy()
+
+
+@pytest.fixture
+def impossible(possible: np.ndarray) -> np.ndarray:
+    """The same, with a gauge that shows what no state can show."""
+    observation = possible.copy()
+    observation[4] += 1e200
+    return observation
+
+
+def test_an_impossible_observation_names_twin_step_and_sensors(knowledge, possible, impossible):
+    """Also where the error was handed on by the worker of a fleet."""
     twin = knowledge.twin()
-    good = knowledge.sensor_model.mean[0, 1].copy()
-    twin.step(good, 1)
-    bad = good.copy()
-    bad[4] += 1e200
-    with pytest.raises(
-        ImpossibleObservation, match=r"'paper_level_turns', step 1: .* sensor 5: \+8e\+203 sd"
-    ) as caught:
-        twin.step(bad, 1)
-    error = pickle.loads(pickle.dumps(caught.value))  # as a worker of a fleet hands it on
+    twin.step(possible, 1)
+    sentence = r"'paper_level_turns', step 1: .* sensor 5: \+8e\+203 sd"
+    with pytest.raises(ImpossibleObservation, match=sentence) as caught:
+        twin.step(impossible, 1)
+    error = pickle.loads(pickle.dumps(caught.value))
     assert (str(error), error.twin, error.step) == (str(caught.value), "paper_level_turns", 1)
     assert next(iter(error.worst_residuals)) == "sensor 5"
+
+
+def test_a_twin_goes_on_after_an_impossible_observation(knowledge, possible, impossible):
+    twin = knowledge.twin()
+    twin.step(possible, 1)
+    with pytest.raises(ImpossibleObservation):
+        twin.step(impossible, 1)
     assert twin.steps == 1
-    twin.step(good, 1)
+    twin.step(possible, 1)
     assert twin.smoothed().shape == (2, 25)
 
 
@@ -115,62 +134,112 @@ def test_a_twin_has_no_last_step_and_smooths_over_its_lag(knowledge, seen):
     assert knowledge.twin(lag=0).step(seen[0]).control_index == 1  # the first control of the scenario
 
 
-def test_a_twin_is_kept_and_goes_on_to_the_last_bit(knowledge, seen):
-    """Of steps from before its lag nothing can be revised; what is refused or damaged leaves it as it was."""
-    twin, other = knowledge.twin(lag=4), knowledge.twin(lag=4)
+@pytest.fixture
+def twin_of_ten_steps(knowledge: Knowledge, seen: np.ndarray) -> Twin:
+    """A twin with a lag of four steps that has seen ten."""
+    twin = knowledge.twin(lag=4)
     for row in seen[:10]:
         twin.step(row)
-    state = twin.save_state()
-    for step in (4, 10, -1):
-        with pytest.raises(IndexError, match=rf"step {step} .*from 5 on.*seen 10"):
-            twin.revise(step, seen[0])
+    return twin
+
+
+@pytest.mark.parametrize("step", [4, 10, -1])
+def test_of_steps_from_before_its_lag_nothing_can_be_revised(twin_of_ten_steps, seen, step):
+    state = twin_of_ten_steps.save_state()
+    with pytest.raises(IndexError, match=rf"step {step} .*from 5 on.*seen 10"):
+        twin_of_ten_steps.revise(step, seen[0])
+    assert twin_of_ten_steps.save_state() == state
+
+
+def test_an_impossible_revision_leaves_a_twin_as_it_was(twin_of_ten_steps):
+    state = twin_of_ten_steps.save_state()
     with pytest.raises(ImpossibleObservation):
-        twin.revise(7, np.full(24, 1e300))
-    assert twin.save_state() == state
-    other.restore_state(state)
+        twin_of_ten_steps.revise(7, np.full(24, 1e300))
+    assert twin_of_ten_steps.save_state() == state
+
+
+def test_a_twin_is_kept_and_goes_on_to_the_last_bit(knowledge, twin_of_ten_steps, seen):
+    twin, other = twin_of_ten_steps, knowledge.twin(lag=4)
+    other.restore_state(twin.save_state())
     assert other.proposed_control == twin.proposed_control
     for row in seen[10:]:
-        last = told(twin.step(row))
-        assert last == told(other.step(row))
+        assert told(twin.step(row)) == told(other.step(row))
     assert other.save_state() == twin.save_state()
-    # The first step that is kept may be revised; what it has shown already changes nothing.
-    assert told(twin.revise(twin.first_kept, seen[twin.first_kept])) == last
+
+
+def test_a_revision_to_what_was_shown_already_changes_nothing(twin_of_ten_steps, seen):
+    """The first step that is kept may be revised."""
+    twin = twin_of_ten_steps
+    for row in seen[10:]:
+        last = twin.step(row)
+    first = twin.first_kept
+    assert told(twin.revise(first, seen[first])) == told(last)
+
+
+def test_a_damaged_state_is_refused(knowledge, twin_of_ten_steps):
+    state = twin_of_ten_steps.save_state()
     for damaged in (b"", state[:-7], arrays_to_bytes({"a": np.zeros(2)})):
         with pytest.raises(InvalidModelError):
-            other.restore_state(damaged)
+            knowledge.twin(lag=4).restore_state(damaged)
 
 
-def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
-    class Tenfold:
-        """A sensor model of a user's own: no residuals, only a likelihood."""
+class LikelihoodAlone:
+    """A sensor model of a user's own: it has no residuals, only a likelihood."""
 
-        def log_likelihood(self, observation: object, control_index: int, /) -> np.ndarray:
-            return knowledge.sensor_model.log_likelihood(observation, control_index)  # type: ignore[arg-type]
+    def __init__(self, sensor_model: Any) -> None:
+        self.sensor_model = sensor_model
 
-    class Counting(ExactFilter):
-        """An estimator that learns: it carries a figure from step to step beside the belief."""
+    def log_likelihood(self, observation: Any, control_index: int, /) -> np.ndarray:
+        likelihood: np.ndarray = self.sensor_model.log_likelihood(observation, control_index)
+        return likelihood
 
-        def step(
-            self, before: Carried | None, observation: np.ndarray, control_index: int, step: int
-        ) -> Estimate:
-            estimate = super().step(before, observation, control_index, step)
-            count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
-            carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})
-            return replace(estimate, carried=carried, learnt={"count": Learnt(count, 0.0, count, count)})
 
+class Counting(ExactFilter):
+    """An estimator that learns: it carries the number of steps from step to step beside the belief."""
+
+    def step(
+        self, before: Carried | None, observation: np.ndarray, control_index: int, step: int
+    ) -> Estimate:
+        estimate = super().step(before, observation, control_index, step)
+        count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
+        carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})
+        return replace(estimate, carried=carried, learnt={"count": Learnt(count, 0.0, count, count)})
+
+
+@pytest.fixture
+def own_twin(knowledge: Knowledge) -> Twin:
+    """A twin with a policy, sensor model and estimator of a user's own; the policy is always gentle."""
     model = knowledge.model
+    sensors = LikelihoodAlone(knowledge.sensor_model)
     gentle = np.eye(2)[np.zeros(25, dtype=int)]
-    own = Twin("own", model, Tenfold(), lambda _: gentle, estimator=Counting(model, Tenfold()), lag=3)
+    return Twin("own", model, sensors, lambda _: gentle, estimator=Counting(model, sensors), lag=3)
+
+
+def test_own_policy_sensor_model_and_estimator_are_used(own_twin, knowledge, seen):
     plain = knowledge.twin()
     for number, row in enumerate(seen[:8], start=1):
-        mine, theirs = own.step(row, 1), plain.step(row, 1)
-        np.testing.assert_array_equal(mine.filtered, theirs.filtered)
-        assert mine.next_control == 0
-        assert mine.learnt["count"].mean == number
-    assert own.revise(6, seen[6]).learnt["count"].mean == 8
-    assert np.isfinite(own.predict(mine.filtered, "2g", 4).predicted).all()
+        own_step, plain_step = own_twin.step(row, 1), plain.step(row, 1)
+        np.testing.assert_array_equal(own_step.filtered, plain_step.filtered)
+        assert own_step.next_control == 0
+        assert own_step.learnt["count"].mean == number
+
+
+def test_what_an_own_estimator_learns_is_revised(own_twin, seen):
+    for row in seen[:8]:
+        own_twin.step(row, 1)
+    assert own_twin.revise(6, seen[6]).learnt["count"].mean == 8
+
+
+def test_a_twin_of_an_own_sensor_model_predicts_and_refuses_what_is_impossible(own_twin, seen):
+    step = own_twin.step(seen[0], 1)
+    assert np.isfinite(own_twin.predict(step.filtered, "2g", 4).predicted).all()
     with pytest.raises(ImpossibleObservation):
-        own.step(np.full(24, 1e300))
-    for wrong, match in (("4g", "no control is named '4g'"), (2, "between 0 and 1")):
-        with pytest.raises(InvalidModelError, match=match):
-            own.step(seen[0], wrong)  # type: ignore[arg-type]
+        own_twin.step(np.full(24, 1e300))
+
+
+@pytest.mark.parametrize(
+    ("control", "sentence"), [("4g", "no control is named '4g'"), (2, "between 0 and 1")]
+)
+def test_a_control_that_a_twin_does_not_have_is_refused(own_twin, seen, control, sentence):
+    with pytest.raises(InvalidModelError, match=sentence):
+        own_twin.step(seen[0], control)

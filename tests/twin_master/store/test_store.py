@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from tests.twin_master.runs import flight_of, loaded_from, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
@@ -29,58 +30,115 @@ def flown(name: str, library_file: Path) -> MissionResult:
     return MissionResult(knowledge.scenario, knowledge, flight_of(knowledge, source), knowledge.truth(3))
 
 
-def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_path):
-    groups = run_groups(result)
-    first = write_run(tmp_path / "a", groups, {"seed": 3}).read_bytes()
+def test_the_bytes_of_a_store_depend_on_the_tree_alone(result, tmp_path):
+    first = write_run(tmp_path / "a", run_groups(result), {"seed": 3}).read_bytes()
     assert write_run(tmp_path / "b", run_groups(result), {"seed": 3}).read_bytes() == first
     assert write_run(tmp_path / "c", run_groups(result), {"seed": 4}).read_bytes() != first
-    read = open_run(tmp_path / "a")
-    assert ([*read.children], read.attrs) == ([*groups], {"seed": 3})
-    for name, made in groups.items():
-        node, variables = read[name].to_dataset(), {**made.variables, **made.coords}
-        assert ({*node.variables}, node.attrs) == ({*variables}, made.attrs)
-        for key, variable in variables.items():
-            np.testing.assert_array_equal(node[key], variable.values)
-            assert (node[key].dims, node[key].attrs) == (variable.dims, variable.attrs)
-            assert key not in made.variables or (variable.attrs["units"] and variable.attrs["long_name"])
-    np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
-    (tmp_path / "a/run.nc").write_bytes(first[:1000])
+
+
+@pytest.fixture(scope="module")
+def stored(result: MissionResult, tmp_path_factory: pytest.TempPathFactory) -> xr.DataTree:
+    """The store of the mission as it is read."""
+    folder = tmp_path_factory.mktemp("stored")
+    write_run(folder, run_groups(result), {"seed": 3})
+    return open_run(folder)
+
+
+def test_groups_of_a_store_read_back(result, stored):
+    groups = run_groups(result)
+    assert ([*stored.children], stored.attrs) == ([*groups], {"seed": 3})
+    for name, group in groups.items():
+        dataset = stored[name].to_dataset()
+        assert {*dataset.variables} == {*group.variables, *group.coords}
+        assert dataset.attrs == group.attrs
+
+
+def test_variables_of_a_store_read_back(result, stored):
+    np.testing.assert_array_equal(stored["observed"]["strain"], result.flight.observed)
+    for name, group in run_groups(result).items():
+        dataset = stored[name].to_dataset()
+        for key, variable in {**group.variables, **group.coords}.items():
+            np.testing.assert_array_equal(dataset[key], variable.values)
+            assert (dataset[key].dims, dataset[key].attrs) == (variable.dims, variable.attrs)
+
+
+def test_variables_of_a_store_have_units_and_names(result):
+    for group in run_groups(result).values():
+        for variable in group.variables.values():
+            assert variable.attrs["units"]
+            assert variable.attrs["long_name"]
+
+
+def test_a_torn_store_is_refused(result, tmp_path):
+    path = write_run(tmp_path, run_groups(result), {})
+    path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(RunFolderError, match="not a whole run"):
-        open_run(tmp_path / "a")
+        open_run(tmp_path)
 
 
-def test_what_is_stored_agrees_with_itself(result, tmp_path):
-    write_run(tmp_path, run_groups(result), {})
-    tree = open_run(tmp_path)
-    filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
+def test_stored_means_are_those_of_stored_probabilities(result, stored):
+    filtered = stored["filtered"].to_dataset()
     levels = result.knowledge.model.states.coordinates
     np.testing.assert_allclose(filtered["mean"], filtered["probability"].values @ levels)
-    decided = filtered["decision_probability"]
-    np.testing.assert_array_equal(decided.argmax("control")[:-1], result.flight.control_index[1:])
-    # A healthy wing at 3g: the mean over the draws of e is the quantity of interest.
-    np.testing.assert_allclose(filtered["quantity_mean"][0], result.knowledge.sensor_model.mean[0, 1])
-    deviation = result.knowledge.sensor_model.value_per_draw[:, 0, 1].std(axis=0)
+
+
+def test_the_stored_decision_is_the_next_control(result, stored):
+    decision = stored["filtered"]["decision_probability"].argmax("control")
+    np.testing.assert_array_equal(decision[:-1], result.flight.control_index[1:])
+
+
+def test_the_first_stored_quantity_is_that_of_a_healthy_wing(result, stored):
+    """At 3g, its mean over the draws of e; the noise is that with the place between the levels."""
+    filtered = stored["filtered"].to_dataset()
+    sensors = result.knowledge.sensor_model
+    deviation = sensors.value_per_draw[:, 0, 1].std(axis=0)
+    noise = sensors.total_standard_deviation
+    np.testing.assert_allclose(filtered["quantity_mean"][0], sensors.mean[0, 1])
     np.testing.assert_allclose(filtered["quantity_standard_deviation"][0], deviation)
-    noise = result.knowledge.sensor_model.total_standard_deviation  # with the place between the levels
     np.testing.assert_allclose(filtered["noise_standard_deviation"][0], noise[0, 1])
     assert noise.max() > 1.1 * noise.min()
+
+
+def test_steps_without_readings_have_no_error_reward(stored):
+    filtered = stored["filtered"].to_dataset()
+    predicted_error = stored["predicted"]["reward_mean"].sel(reward="error")
     assert filtered["sensors_received"].values[36] == 0
     assert np.isnan(filtered["reward_mean"].sel(reward="error").values[36:38]).all()
-    assert np.isnan(predicted["reward_mean"].sel(reward="error")).all()
-    assert set(tree["truth"]["sensor_status"].values[8:36, 11]) == {2}  # it drifts
+    assert np.isnan(predicted_error).all()
 
 
-def test_tables_are_in_the_units_of_their_headers(result):
+def test_the_stored_truth_says_which_gauge_drifts(stored):
+    drifting = 2
+    assert set(stored["truth"]["sensor_status"].values[8:36, 11]) == {drifting}
+
+
+@pytest.fixture(scope="module")
+def tables(result: MissionResult) -> dict[str, list[dict[str, str]]]:
+    """The rows of each table by their headers."""
     texts = csv_tables(run_groups(result), result.scenario.observation)
-    tables = {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
-    health, observed = tables["health"], tables["observed"]
-    assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
-    shown = float(observed[3]["strain_5_microstrain"])
-    assert shown == pytest.approx(1e6 * result.flight.observed[3, 4], rel=1e-5)
-    assert observed[36]["strain_5_microstrain"] == ""
-    policy, decisions = tables["policy"], tables["decisions"]
-    assert (policy[0]["z1_percent"], policy[0]["control"]) == ("0", "3g")
-    assert (policy[-1]["z1_percent"], policy[-1]["control"]) == ("80", "2g")
+    return {name: [*csv.DictReader(text.splitlines())] for name, text in texts.items()}
+
+
+def test_states_in_tables_are_in_percent(tables):
+    loss = [float(row["z1_true_percent"]) for row in tables["health"][8:13]]
+    assert loss == [0, 0, 2, 4, 6]
+
+
+def test_strains_in_tables_are_in_microstrain_and_empty_where_they_were_lost(result, tables):
+    name = "strain_5_microstrain"
+    strain = float(tables["observed"][3][name])
+    assert strain == pytest.approx(1e6 * result.flight.observed[3, 4], rel=1e-5)
+    assert tables["observed"][36][name] == ""
+
+
+def test_the_table_of_the_policy_has_a_control_for_each_state(tables):
+    first, last = tables["policy"][0], tables["policy"][-1]
+    assert (first["z1_percent"], first["control"]) == ("0", "3g")
+    assert (last["z1_percent"], last["control"]) == ("80", "2g")
+
+
+def test_the_table_of_decisions_has_controls_and_rewards(tables):
+    decisions = tables["decisions"]
     assert decisions[0]["control"] == "3g"
     assert decisions[36]["error_reward"] == ""
 
@@ -109,13 +167,20 @@ def controls(*gentle: int) -> np.ndarray:
         ([12], np.zeros((50, 2)), None, 12),  # no damage calls for it
     ],
 )
-def test_fallback(gentle, truth, delay, early):
-    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
-    assert (found.switch_state, found.switch_level) == ("z1", 0.6)
-    assert found.called_for_step == (30 if truth.any() else None)
-    assert (found.delay, found.early_step) == (delay, early)
-    told = list(fallback_figures(found, SCENARIO)[2])  # one that came before the damage has no delay
-    assert told[3:] == [None if early == 29 else delay, early]
+def test_a_fallback_has_a_delay_or_is_early(gentle, truth, delay, early):
+    """A fallback that came before the damage has no delay among the figures."""
+    fallback = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
+    *_, figures = fallback_figures(fallback, SCENARIO)
+    delay_of_figure = None if early == 29 else delay
+    assert (fallback.delay, fallback.early_step) == (delay, early)
+    assert list(figures)[3:] == [delay_of_figure, early]
+
+
+@pytest.mark.parametrize(("truth", "step"), [(TRUTH, 30), (np.zeros((50, 2)), None)])
+def test_damage_calls_for_a_fallback_at_the_level_of_the_policy(truth, step):
+    fallback = find_fallback(MODEL.states, POLICY, 1, controls(), truth)
+    assert (fallback.switch_state, fallback.switch_level) == ("z1", 0.6)
+    assert fallback.called_for_step == step
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-13, 1e9])
@@ -138,30 +203,58 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
         model.states.index((0.3 * unit, 0.0))
 
 
-@pytest.mark.parametrize("name", ["level_turns", "failing_gauges", "growing_damage"])
-def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name, library_file):
-    each = flown(name, library_file)
+@pytest.fixture(scope="module", params=["level_turns", "failing_gauges", "growing_damage"])
+def monitored(request: pytest.FixtureRequest, library_file: Path) -> MissionResult:
+    """A mission with two references, whose asset also monitored an error bound."""
+    mission = flown(request.param, library_file)
     steps = []
-    for step in each.flight.steps:
-        happened = step.reading.ground_truth._replace(monitors={"strain_error_bound": 2e-6})
-        steps.append(replace(step, reading=replace(step.reading, ground_truth=happened)))
+    for step in mission.flight.steps:
+        truth = step.reading.ground_truth._replace(monitors={"strain_error_bound": 2e-6})
+        steps.append(replace(step, reading=replace(step.reading, ground_truth=truth)))
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),
     )
-    scenario = each.scenario.model_copy(update={"reference": references})
-    complete = replace(each, scenario=scenario, flight=replace(each.flight, steps=steps))
-    figures = [*summarise(complete, np.zeros((50, 3)))]
-    assert tuple(figure.key for figure in figures) == each.scenario.figure_names
-    value, flight = {figure.key: figure.value for figure in figures}, each.flight
-    error = 100.0 * (flight.filtered @ each.knowledge.model.states.coordinates - flight.state)
-    rms = [value[f"filtered_rms_error_{name}"] for name in each.scenario.state_names]
+    scenario = mission.scenario.model_copy(update={"reference": references})
+    return replace(mission, scenario=scenario, flight=replace(mission.flight, steps=steps))
+
+
+SECONDS = np.zeros((50, 3))
+
+
+def test_every_figure_is_one_that_a_reference_can_name(monitored):
+    figures = summarise(monitored, SECONDS)
+    assert tuple(figure.key for figure in figures) == monitored.scenario.figure_names
+
+
+def test_the_rms_error_is_that_of_the_filtered_mean(monitored):
+    value = {figure.key: figure.value for figure in summarise(monitored, SECONDS)}
+    flight = monitored.flight
+    error = 100.0 * (flight.filtered @ monitored.knowledge.model.states.coordinates - flight.state)
+    rms = [value[f"filtered_rms_error_{name}"] for name in monitored.scenario.state_names]
     np.testing.assert_allclose(rms, np.sqrt(np.mean(error**2, axis=0)))
-    found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
-    assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
-    blind = np.full((2, 2, 3), np.nan)  # the asset shows nothing anywhere, or one gauge alone
-    assert "model_misfit_rms" not in [f.key for f in summarise(complete, np.zeros((50, 3)), blind)]
-    blind[:, 1, 2] = 0.3, -0.4
-    found = {f.key: f.value for f in summarise(complete, np.zeros((50, 3)), blind)}
-    assert found["model_misfit_largest"] == pytest.approx(40.0)
-    assert found["model_misfit_rms"] == pytest.approx(100.0 * np.sqrt(0.125))
+
+
+def test_a_reference_stands_beside_its_figure(monitored):
+    references = {
+        figure.key: (figure.reference, figure.reference_source)
+        for figure in summarise(monitored, SECONDS)
+        if figure.reference is not None
+    }
+    assert references == {
+        "fallback_delay": ("1 or 2", "somewhere"),
+        "mean_reward_error": (-0.4, "elsewhere"),
+    }
+
+
+def test_an_asset_that_shows_nothing_has_no_misfit(monitored):
+    misfit = np.full((2, 2, 3), np.nan)
+    assert "model_misfit_rms" not in {figure.key for figure in summarise(monitored, SECONDS, misfit)}
+
+
+def test_the_misfit_is_that_of_the_gauges_that_are_shown(monitored):
+    misfit = np.full((2, 2, 3), np.nan)
+    misfit[:, 1, 2] = 0.3, -0.4
+    value = {figure.key: figure.value for figure in summarise(monitored, SECONDS, misfit)}
+    assert value["model_misfit_largest"] == pytest.approx(40.0)
+    assert value["model_misfit_rms"] == pytest.approx(100.0 * np.sqrt(0.125))
