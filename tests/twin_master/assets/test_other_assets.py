@@ -72,31 +72,60 @@ def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-def test_a_flight_is_the_same_in_process_resumed_and_from_an_ssp_file(folder, tmp_path):
-    """Also of a system of that FMU. It cannot save its state: its inputs are replayed.
-
-    What is flown lies in the run folder.
-    """
-    alone = rows(new_run(load_scenario(folder / "fouling.toml"), tmp_path / "alone").folder)
-    for name in ("fouling", "coupled_fouling"):
-        loaded, place = load_scenario(folder / f"{name}.toml"), tmp_path / name
-        whole = new_run(loaded, place / "whole").folder
-        inside = new_run(loaded, place / "inside", Overrides(in_process=True)).folder
-        assert rows(inside) == rows(whole) == alone
-        with cut_off_after(11):
-            new_run(loaded, place / "part")
-        resume(place / "part")
-        check_same(place / "part", whole, "run.nc", "config.json", "summary.json", "journal.jsonl")
-        ssp = export_scenario(loaded, place / "x.ssp", replace_file=False)
-        flown = new_run(loaded, place / "flown", Overrides(ssp=ssp)).folder
-        assert rows(flown) == alone
-        assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
-        ssp.unlink()
-        assert rows(resume(flown).folder) == alone
-    several = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
-    own = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), several)
+@pytest.fixture(scope="module")
+def rows_alone(folder: Path, no_report: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The tables of a flight of the exchanger as one FMU."""
     loaded = load_scenario(folder / "fouling.toml")
-    asset = loaded.scenario.asset.model_copy(update={"binding": str(own)})
+    return rows(new_run(loaded, tmp_path_factory.mktemp("alone") / "run").folder)
+
+
+class ExchangerFlight:
+    """A flight of the exchanger as one FMU, or as a system of that FMU."""
+
+    def __init__(self, loaded: LoadedScenario, folder: Path) -> None:
+        self.loaded = loaded
+        self.whole = new_run(loaded, folder / "whole").folder
+        self.ssp = export_scenario(loaded, folder / "x.ssp", replace_file=False)
+
+
+@pytest.fixture(scope="module", params=["fouling", "coupled_fouling"])
+def exchanger_flight(
+    request: pytest.FixtureRequest, folder: Path, no_report: None, tmp_path_factory: pytest.TempPathFactory
+) -> ExchangerFlight:
+    loaded = load_scenario(folder / f"{request.param}.toml")
+    return ExchangerFlight(loaded, tmp_path_factory.mktemp(request.param))
+
+
+def test_a_flight_is_the_same_in_process(exchanger_flight, rows_alone, tmp_path):
+    options = Overrides(in_process=True)
+    inside = new_run(exchanger_flight.loaded, tmp_path / "inside", options).folder
+    assert rows(inside) == rows(exchanger_flight.whole) == rows_alone
+
+
+def test_a_flight_is_the_same_resumed(exchanger_flight, tmp_path):
+    """The FMU cannot save its state: its inputs are replayed."""
+    with cut_off_after(11):
+        new_run(exchanger_flight.loaded, tmp_path / "part")
+    resume(tmp_path / "part")
+    names = ("run.nc", "config.json", "summary.json", "journal.jsonl")
+    check_same(tmp_path / "part", exchanger_flight.whole, *names)
+
+
+def test_a_flight_is_the_same_from_an_ssp_file(exchanger_flight, rows_alone, tmp_path):
+    """What is flown lies in the run folder, so that the run is resumed when the file is gone."""
+    ssp = Path(shutil.copy(exchanger_flight.ssp, tmp_path / "x.ssp"))
+    flown = new_run(exchanger_flight.loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
+    assert rows(flown) == rows_alone
+    assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
+    ssp.unlink()
+    assert rows(resume(flown).folder) == rows_alone
+
+
+def test_an_ssp_file_has_the_span_of_the_mission(folder, tmp_path):
+    later_and_finer = ("step_size = 60.0", "step_size = 15.0\ndecimation = 4\nstart_time = 1000.0")
+    binding = written(tmp_path, (folder / "binding.toml").read_text(encoding="utf-8"), later_and_finer)
+    loaded = load_scenario(folder / "fouling.toml")
+    asset = loaded.scenario.asset.model_copy(update={"binding": str(binding)})
     later = replace(loaded, scenario=loaded.scenario.model_copy(update={"asset": asset}))
     ssp = export_scenario(later, tmp_path / "later.ssp", replace_file=False)
     assert read_ssp(ssp, tmp_path).span == (1000.0, 1000.0 + 60.0 * later.scenario.mission.steps)
@@ -154,14 +183,30 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
 
 
+@pytest.fixture(scope="module")
+def papers_wing() -> tuple[Any, Any]:
+    """What a twin of the paper's wing knows, and that wing."""
+    return of_wing("paper_level_turns", 0)
+
+
 @pytest.mark.slow
-def test_the_papers_policy_and_its_reliability():
+def test_the_papers_policy_leaves_a_control_at_60_percent(papers_wing):
+    knowledge, _ = papers_wing
+    loss = knowledge.model.states.coordinates[:, 0]
+    np.testing.assert_array_equal(knowledge.plan.control_index, np.where(loss < 0.59, 1, 0))
+
+
+@pytest.mark.slow
+def test_the_papers_calibration_has_its_moments(papers_wing):
+    draws = papers_wing[0].draws
+    assert draws.mean == pytest.approx(1.0073, abs=0.002)
+    assert draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
+
+
+@pytest.mark.slow
+def test_the_papers_policy_is_reliable(papers_wing):
     """Bars of 300 missions, widened for 80; `benchmarks/studies/level_turns.py` flies as many as wanted."""
-    knowledge, source = of_wing("paper_level_turns", 0)
-    z1 = knowledge.model.states.coordinates[:, 0]
-    np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
-    assert knowledge.draws.mean == pytest.approx(1.0073, abs=0.002)
-    assert knowledge.draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
+    knowledge, source = papers_wing
     study = fly_seeds(knowledge.scenario, source, range(80))
     assert study.prompt_fallbacks.value >= 0.95
     assert study.early_fallbacks.value <= 0.2
@@ -206,32 +251,51 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return new_run(short(), tmp_path_factory.mktemp("bracket") / "run", report=False).folder
 
 
-def test_the_twin_finds_the_damage_of_the_full_model(flown):
-    """The strains flown are those of the full model within their bound; the heel is accused, not the arm."""
-    tree, structure = open_run(flown), load_and_assemble(FILE)
-    unit = structure.load("weight", 1.0)
-    truth, observed = tree["truth"], tree["observed"]
-    for step in (0, 9):
-        losses = dict(zip(structure.regions, truth["state"].values[step].tolist(), strict=True))
-        full = Factorisation(structure.stiffness({"e": 1.02}, losses)).solve(unit)
-        wanted = float(observed["load_factor"][step]) * (structure.gauge_output @ full)
-        bound = float(truth["strain_error_bound"][step])
-        assert np.abs(truth["strain"].values[step] - wanted).max() <= bound < 1e-3 * np.abs(wanted).max()
-    np.testing.assert_allclose(truth["state"].values[-1], [0.4, 0.0], atol=1e-12)
+@pytest.fixture(scope="module")
+def bracket() -> Any:
+    """The full model of the bracket."""
+    return load_and_assemble(FILE)
+
+
+@pytest.mark.parametrize("step", [0, 9])
+def test_the_strains_flown_are_those_of_the_full_model_within_their_bound(flown, bracket, step):
+    tree = open_run(flown)
+    truth = tree["truth"]
+    losses = dict(zip(bracket.regions, truth["state"].values[step].tolist(), strict=True))
+    solution = Factorisation(bracket.stiffness({"e": 1.02}, losses)).solve(bracket.load("weight", 1.0))
+    expected = float(tree["observed"]["load_factor"][step]) * (bracket.gauge_output @ solution)
+    bound = float(truth["strain_error_bound"][step])
+    error = np.abs(truth["strain"].values[step] - expected).max()
+    assert error <= bound < 1e-3 * np.abs(expected).max()
+
+
+def test_the_twin_accuses_the_heel_and_not_the_arm(flown):
+    tree = open_run(flown)
+    np.testing.assert_allclose(tree["truth"]["state"].values[-1], [0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.1)
-    # `structure.vtu` holds mesh, displacement, strain, regions and losses; no file has a wing's name.
+
+
+def test_the_field_of_a_structure_has_its_mesh_and_displacement(flown):
     field = meshio.read(flown / "structure.vtu")
     assert field.cells[0].type == "hexahedron20"
     assert 1e-4 < np.abs(field.point_data["displacement"]).max() < 5e-3
-    loss, region = field.cell_data["stiffness_loss"][0], field.cell_data["region"][0]
+    assert not (flown / "wing.vtu").exists()
+
+
+def test_the_field_of_a_structure_has_regions_and_losses(flown):
+    data = meshio.read(flown / "structure.vtu").cell_data
+    loss, region = data["stiffness_loss"][0], data["region"][0]
     assert set(np.unique(region)) == {0, 1, 2}
     assert np.all(loss[region == 0] == 0.0)
     assert 0.2 < loss[region == 1].max() < 0.6
-    assert not (flown / "wing.vtu").exists()
+
+
+def test_the_report_draws_a_structure_with_losses_and_gauges(flown, bracket):
+    loss = meshio.read(flown / "structure.vtu").cell_data["stiffness_loss"][0]
     (drawn,) = (figure.figure for figure in report_figures(flown) if figure.name == "structure")
     surface, gauges, *_ = drawn.axes[0].collections
     np.testing.assert_allclose(np.unique(surface.get_array()), 100.0 * np.unique(loss))
-    assert len(gauges.get_offsets()) == len(structure.gauges)
+    assert len(gauges.get_offsets()) == len(bracket.gauges)
 
 
 @pytest.mark.long
