@@ -3,7 +3,7 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -224,71 +224,101 @@ LIBRARY, WING = {"strain_library": "UAVconfig.json"}, {"asset/binding.toml", "as
 FILE, TAILORED = {"calibration": "wing 7.nc"}, {"asset/binding.toml", "asset/calibration.nc"}
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "given", "kinds", "differ", "kept"),
-    [
-        ("level_turns", (), {}, "design design", False, {*WING, "asset/design.toml"}),
-        ("level_turns", (), LIBRARY, "strain_library asset", False, {"asset/UAVconfig.json"}),
-        ("level_turns", (FLOWN_PATCH, (BELIEF, f'{BELIEF}patch = "p.json"\n')), {}, "design design", True,
-         {*WING, "asset/design.toml", "asset/patch.json", "asset/model_patch.json"}),
-        ("level_turns", ((BELIEF, BELIEF.replace("uav_wing", "other.toml")),), {}, "design design", False,
-         {*WING, "asset/design.toml"}),
-        ("level_turns", ((BELIEF, '[belief]\nkind = "strain_library"\nfile = "UAVconfig.json"\n'),), {},
-         "design strain_library", True, {*WING, "asset/UAVconfig.json"}),
-        ("level_turns", ((DRAWN, 'source = "file"\nfile = "wing 7.nc"'),), {},
-         "calibration calibration", False, TAILORED),
-        ("level_turns", ((DRAWN, 'source = "file"\nfile = "none.nc"'),), FILE,
-         "calibration calibration", False, TAILORED),
-        ("model_mismatch", (), {"strain_library": "."}, "strain_library design", True,
-         {"asset/UAVconfig.json", "asset/design.toml"}),
-        ("model_mismatch", (("# file", "file"),), {}, "strain_library design", True,
-         {"asset/UAVconfig.json", "asset/design.toml"}),
-        ("model_mismatch", (), LIBRARY | FILE, "strain_library calibration", True,
-         {"asset/UAVconfig.json", "asset/calibration.nc"}),
-    ],
-)  # fmt: skip
-def test_what_flies_what_is_believed_and_what_a_run_keeps(folder, name, changes, given, kinds, differ, kept):
-    """Paths start at the scenario, and what is kept leaves no trace of the machine."""
+SOURCES = [
+    ("level_turns", (), {}, "design design", False, {*WING, "asset/design.toml"}),
+    ("level_turns", (), LIBRARY, "strain_library asset", False, {"asset/UAVconfig.json"}),
+    ("level_turns", (FLOWN_PATCH, (BELIEF, f'{BELIEF}patch = "p.json"\n')), {}, "design design", True,
+     {*WING, "asset/design.toml", "asset/patch.json", "asset/model_patch.json"}),
+    ("level_turns", ((BELIEF, BELIEF.replace("uav_wing", "other.toml")),), {}, "design design", False,
+     {*WING, "asset/design.toml"}),
+    ("level_turns", ((BELIEF, '[belief]\nkind = "strain_library"\nfile = "UAVconfig.json"\n'),), {},
+     "design strain_library", True, {*WING, "asset/UAVconfig.json"}),
+    ("level_turns", ((DRAWN, 'source = "file"\nfile = "wing 7.nc"'),), {},
+     "calibration calibration", False, TAILORED),
+    ("level_turns", ((DRAWN, 'source = "file"\nfile = "none.nc"'),), FILE,
+     "calibration calibration", False, TAILORED),
+    ("model_mismatch", (), {"strain_library": "."}, "strain_library design", True,
+     {"asset/UAVconfig.json", "asset/design.toml"}),
+    ("model_mismatch", (("# file", "file"),), {}, "strain_library design", True,
+     {"asset/UAVconfig.json", "asset/design.toml"}),
+    ("model_mismatch", (), LIBRARY | FILE, "strain_library calibration", True,
+     {"asset/UAVconfig.json", "asset/calibration.nc"}),
+]  # fmt: skip
+"""Scenario, its changes, options, kinds of asset and belief, whether they differ, and files of the run."""
+
+
+def resolved(folder: Path, name: str, changes: Any, options: Mapping[str, str]) -> Any:
+    """Return a scenario with changes under options that name files of a folder."""
     loaded = load_scenario(written(folder, text_of(name, *changes)))
-    scenario = resolve_scenario(loaded, {key: folder / file for key, file in given.items()})
-    assert f"{scenario.asset.kind} {scenario.belief.kind}" == kinds
+    return resolve_scenario(loaded, {key: folder / file for key, file in options.items()})
+
+
+@pytest.mark.parametrize(("name", "changes", "options", "kinds", "differ", "kept"), SOURCES)
+def test_what_flies_what_is_believed_and_what_a_run_keeps(
+    folder, name, changes, options, kinds, differ, kept
+):
+    scenario = resolved(folder, name, changes, options)
     source = asset_source(scenario)
     source.check()
     files = source.files()
+    assert f"{scenario.asset.kind} {scenario.belief.kind}" == kinds
     assert (source.origin.differ, {*files}) == (differ, kept)
-    content = (folder / "wing 7.nc").read_bytes()
-    assert files.get("asset/calibration.nc", content) == content
-    portable = scenario.portable()
+    if "asset/calibration.nc" in files:
+        assert files["asset/calibration.nc"] == (folder / "wing 7.nc").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "changes", "options", "kinds", "differ", "kept"), SOURCES)
+def test_paths_of_a_scenario_start_at_its_file_and_leave_no_trace_of_the_machine(
+    folder, name, changes, options, kinds, differ, kept
+):
+    portable = resolved(folder, name, changes, options).portable()
+    elsewhere = json.dumps(portable.with_paths_from(Path("/there")).to_dict())
     assert str(folder) not in json.dumps(portable.to_dict())
-    assert {
-        *re.findall('"/there/(.*?)"', json.dumps(portable.with_paths_from(Path("/there")).to_dict()))
-    } <= kept
+    assert {*re.findall('"/there/(.*?)"', elsewhere)} <= kept
 
 
-def test_what_options_change_and_what_stays_the_scenarios(folder):
-    loaded, fmu, file = load_scenario("level_turns"), folder / "x.fmu", folder / "wing 7.nc"
-    scenario = resolve_scenario(loaded, Overrides(seed=4, fmu=fmu, in_process=True))
+def test_options_change_seed_and_fmu_and_not_the_binding(folder):
+    fmu = folder / "x.fmu"
+    options = Overrides(seed=4, fmu=fmu, in_process=True)
+    scenario = resolve_scenario(load_scenario("level_turns"), options)
     assert (scenario.mission.seed, scenario.asset.binding) == (4, "uav_wing")
     assert (scenario.asset.file, scenario.asset.isolated) == (str(fmu), False)
+
+
+def test_a_binding_stands_where_the_scenario_does(folder):
     bound = load_scenario(written(folder, text_of("level_turns", ('"uav_wing"\n#', '"mine.toml"\n#'))))
     assert resolve_scenario(bound, Overrides()).asset.binding == str(folder / "mine.toml")
-    tailored = resolve_scenario(loaded, Overrides(calibration=file))
-    assert (tailored.calibration.file, tailored.calibration.draws) == (str(file), 100)
-    assert tailored.asset.parameters == loaded.scenario.asset.parameters  # the truth stays the scenario's
-    named = '[calibration]\nparameter = "young_modulus_factor"\nmean = 1.0\nstandard_deviation = 0.01\n'
-    learnt = written(folder, f"format = 1\n{named}", name="learnt.toml")
-    tailored = resolve_scenario(loaded, Overrides(calibration=file, learnt=learnt))
-    assert (tailored.asset.kind, tailored.calibration.source) == ("calibration", "normal")
-    asset_source(tailored).check()
-    for changes in ((), (OTHER, OTHER)):  # of component and belief
-        several = load_scenario(written(folder, text_of("three_fmus", *changes)))
-        coupled = resolve_scenario(several, Overrides(calibration=file))
-        assert [component.design for component in coupled.asset.component] == [None, "calibration", None]
-        assert coupled.belief.kind == "calibration"
-        asset_source(coupled).check()
+
+
+def test_a_calibration_changes_what_is_drawn_and_not_the_truth(folder):
+    loaded, file = load_scenario("level_turns"), folder / "wing 7.nc"
+    scenario = resolve_scenario(loaded, Overrides(calibration=file))
+    assert (scenario.calibration.file, scenario.calibration.draws) == (str(file), 100)
+    assert scenario.asset.parameters == loaded.scenario.asset.parameters
+
+
+def test_what_a_fleet_learnt_is_drawn_in_the_place_of_a_calibration(folder):
+    text = "format = 1\n[calibration]\n"
+    text += 'parameter = "young_modulus_factor"\nmean = 1.0\nstandard_deviation = 0.01\n'
+    options = Overrides(calibration=folder / "wing 7.nc", learnt=written(folder, text, name="learnt.toml"))
+    scenario = resolve_scenario(load_scenario("level_turns"), options)
+    assert (scenario.asset.kind, scenario.calibration.source) == ("calibration", "normal")
+    asset_source(scenario).check()
+
+
+@pytest.mark.parametrize("changes", [(), (OTHER, OTHER)], ids=["shipped", "other component and belief"])
+def test_a_calibration_is_that_of_the_wing_of_a_system(folder, changes):
+    several = load_scenario(written(folder, text_of("three_fmus", *changes)))
+    scenario = resolve_scenario(several, Overrides(calibration=folder / "wing 7.nc"))
+    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
+    assert scenario.belief.kind == "calibration"
+    asset_source(scenario).check()
+
+
+def test_an_ssp_file_keeps_the_parameters_of_the_scenario(folder):
     pump = load_scenario("pump_wear")
-    of_ssp = resolve_scenario(pump, Overrides(ssp=folder / "pump.ssp")).asset
-    assert (of_ssp.kind, of_ssp.parameters) == ("ssp", pump.scenario.asset.parameters)
+    asset = resolve_scenario(pump, Overrides(ssp=folder / "pump.ssp")).asset
+    assert (asset.kind, asset.parameters) == ("ssp", pump.scenario.asset.parameters)
 
 
 @pytest.mark.parametrize(
@@ -313,38 +343,83 @@ def test_what_does_not_go_together_is_refused(folder, name, changes, given, sent
         asset_source(resolve_scenario(loaded, {key: folder / file for key, file in given.items()})).check()
 
 
-def test_draws_and_records_are_those_of_the_samples(folder, make_calibration):
+def drawn_from(file: Path, parameter: str, draws: int) -> Any:
+    """Return draws of a parameter from a calibration file, with a seed."""
+    table = {"parameter": parameter, "source": "file", "file": str(file), "draws": draws}
+    return draw_parameter(Calibration.model_validate(table), 3)
+
+
+@pytest.fixture(scope="module")
+def wing_7(folder: Path) -> tuple[Path, Any]:
+    """A calibration file, and what it holds."""
     file = folder / "wing 7.nc"
-    result = load_calibration(file)
+    return file, load_calibration(file)
 
-    def section(parameter: str, draws: int = 20) -> Calibration:
-        table = {"parameter": parameter, "source": "file", "file": str(file), "draws": draws}
-        return Calibration.model_validate(table)
 
-    for name in ("young_modulus_factor", "servo_mass"):
-        draws = draw_parameter(section(name), 3)
-        assert set(draws.values.tolist()) <= set(result.draws_of(name).tolist())
-        assert (draws.name, len(draws.values)) == (name, 20)
-        assert (draws.mean, draws.standard_deviation) == (result.mean(name), result.standard_deviation(name))
-        assert "Wing 7 (é)" in draws.source
-    everything = draw_parameter(section("servo_mass", 40), 3).values
-    np.testing.assert_array_equal(np.sort(everything), np.sort(result.draws_of("servo_mass")))
-    text = to_json(run_record(result, "young_modulus_factor"))
-    assert text == to_json(run_record(load_calibration(file), "young_modulus_factor"))
-    record = json.loads(text)
+@pytest.mark.parametrize("name", ["young_modulus_factor", "servo_mass"])
+def test_draws_are_some_of_the_samples(wing_7, name):
+    file, calibration = wing_7
+    draws = drawn_from(file, name, 20)
+    assert set(draws.values.tolist()) <= set(calibration.draws_of(name).tolist())
+    assert (draws.name, len(draws.values)) == (name, 20)
+    assert "Wing 7 (é)" in draws.source
+
+
+@pytest.mark.parametrize("name", ["young_modulus_factor", "servo_mass"])
+def test_draws_have_the_moments_of_all_samples(wing_7, name):
+    file, calibration = wing_7
+    draws = drawn_from(file, name, 20)
+    assert draws.mean == calibration.mean(name)
+    assert draws.standard_deviation == calibration.standard_deviation(name)
+
+
+def test_as_many_draws_as_samples_are_all_samples(wing_7):
+    file, calibration = wing_7
+    draws = drawn_from(file, "servo_mass", 40).values
+    np.testing.assert_array_equal(np.sort(draws), np.sort(calibration.draws_of("servo_mass")))
+
+
+def test_the_record_of_a_calibration_is_that_of_its_file(wing_7):
+    file, calibration = wing_7
+    record = to_json(run_record(calibration, "young_modulus_factor"))
+    assert record == to_json(run_record(load_calibration(file), "young_modulus_factor"))
+
+
+def test_the_record_of_a_calibration_has_moments_and_intervals(wing_7):
+    _, calibration = wing_7
+    record = json.loads(to_json(run_record(calibration, "young_modulus_factor")))
     state = record["state"]["servo_mass"]
+    interval = np.quantile(calibration.samples[:, 1], [0.025, 0.975])
     assert state["unit"] == "kg"
-    assert state["standard_deviation"] == pytest.approx(result.standard_deviation("servo_mass"))
-    assert state["interval_95"] == pytest.approx(np.quantile(result.samples[:, 1], [0.025, 0.975]))
-    correlation = np.corrcoef(result.samples[:, :5], rowvar=False)
-    np.testing.assert_allclose(plain_record(result)["correlation"]["matrix"], correlation, atol=1e-12)
-    grid, density = (np.array(record["posterior"][name]) for name in ("grid", "density"))
-    assert np.trapezoid(density, grid) == pytest.approx(1.0, abs=0.05)
-    assert f"servo_mass {result.mean('servo_mass'):.6g} +- " in description(result)
-    single = run_record(make_calibration(count=1), "young_modulus_factor")  # figures that do not vary
-    to_json(single)
-    assert single["posterior"] == {}
-    assert single["correlation"]["matrix"] == np.eye(5).tolist()
+    assert state["standard_deviation"] == pytest.approx(calibration.standard_deviation("servo_mass"))
+    assert state["interval_95"] == pytest.approx(interval)
+
+
+def test_the_record_of_a_calibration_has_correlations(wing_7):
+    _, calibration = wing_7
+    expected = np.corrcoef(calibration.samples[:, :5], rowvar=False)
+    matrix = plain_record(calibration)["correlation"]["matrix"]
+    np.testing.assert_allclose(matrix, expected, atol=1e-12)
+
+
+def test_the_posterior_of_a_record_is_a_density(wing_7):
+    _, calibration = wing_7
+    posterior = json.loads(to_json(run_record(calibration, "young_modulus_factor")))["posterior"]
+    area = np.trapezoid(np.array(posterior["density"]), np.array(posterior["grid"]))
+    assert area == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_description_of_a_calibration_has_its_means(wing_7):
+    _, calibration = wing_7
+    assert f"servo_mass {calibration.mean('servo_mass'):.6g} +- " in description(calibration)
+
+
+def test_the_record_of_a_single_sample_has_no_density(make_calibration):
+    """Figures that do not vary are no error."""
+    record = run_record(make_calibration(count=1), "young_modulus_factor")
+    to_json(record)
+    assert record["posterior"] == {}
+    assert record["correlation"]["matrix"] == np.eye(5).tolist()
 
 
 @pytest.mark.parametrize(("scenario", "means", "words"), Inputs(__file__).refused("campaign"))
