@@ -43,51 +43,81 @@ def to(lab: Path, asset: str) -> tuple[object, ...]:
     return words(lab, "--out", lab.parent / "out", "--asset", asset)
 
 
-def test_a_campaign_gives_a_file_a_report_and_a_table(lab):
+def test_without_a_report_files_of_something_else_stay(lab):
     out = lab.parent / "out"
-    mine = out / "report.html", out / "figures/posterior.svg"  # of something else, which stays
+    files = (out / "report.html", out / "figures/posterior.svg")
     (out / "figures").mkdir(parents=True)
-    for file in mine:
+    for file in files:
         file.write_text("mine")
     said(*to(lab, "spring 7"), "--no-report")
-    assert [file.read_text() for file in mine] == ["mine", "mine"]
-    shown = said(*to(lab, "spring 7"))
-    assert "factor" in shown
-    assert "1.00 ± 0.19" in shown  # 0.20, cut off at 0.5 and 1.5
-    found = load_calibration(out / "calibration.nc")
-    assert (found.asset, found.model, found.source) == ("spring 7", "spring", "spring test")
-    assert found.mean("factor") == pytest.approx(0.88, abs=0.02)
+    assert [file.read_text() for file in files] == ["mine", "mine"]
+
+
+def test_a_campaign_gives_a_table(lab):
+    """The prior has a standard deviation of 0.20, and is cut off at 0.5 and 1.5."""
+    text = said(*to(lab, "spring 7"), "--no-report")
+    assert "factor" in text
+    assert "1.00 ± 0.19" in text
+
+
+def test_a_campaign_gives_a_file_and_a_report(lab):
+    said(*to(lab, "spring 7"))
+    out = lab.parent / "out"
+    calibration = load_calibration(out / "calibration.nc")
     page = (out / "report.html").read_text()
-    assert "Calibration of spring 7" in page
-    assert page.count("<figure") == 2
-    first = (out / "calibration.nc").read_bytes()
+    assert (calibration.asset, calibration.model, calibration.source) == ("spring 7", "spring", "spring test")
+    assert calibration.mean("factor") == pytest.approx(0.88, abs=0.02)
+    assert ("Calibration of spring 7" in page, page.count("<figure")) == (True, 2)
+
+
+def test_a_calibration_without_a_report_has_no_page_of_other_figures_beside_it(lab):
+    out = lab.parent / "out"
+    said(*to(lab, "spring 7"))
+    file_before = (out / "calibration.nc").read_bytes()
     said(*to(lab, "spring 7"), "--no-report")
-    assert (out / "calibration.nc").read_bytes() == first
-    assert [path.name for path in out.iterdir()] == ["calibration.nc"]  # no page of other figures beside it
-    assert "is the calibration of spring 7, not of spring 8" in refused(*to(lab, "spring 8"), code=None)
+    assert (out / "calibration.nc").read_bytes() == file_before
+    assert [path.name for path in out.iterdir()] == ["calibration.nc"]
+
+
+def test_the_calibration_of_another_asset_is_not_overwritten(lab):
+    said(*to(lab, "spring 7"), "--no-report")
+    sentence = refused(*to(lab, "spring 8"), code=None)
+    assert "is the calibration of spring 7, not of spring 8" in sentence
+
+
+def test_a_calibration_is_printed_as_data(lab):
     record = json.loads(said(*words(lab, "--json")))
     (parameter,) = record["parameters"]
-    assert parameter["name"] == "factor"
-    assert parameter["interval_90"][0] < 0.88 < parameter["interval_90"][1]
-    assert parameter["prior_left"] < 0.15
+    low, high = parameter["interval_90"]
     assert (record["explained"], record["procedure"]) == (True, "quadrature")
+    assert (parameter["name"], low < 0.88 < high) == ("factor", True)
+    assert parameter["prior_left"] < 0.15
 
 
-def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibration):
-    """A wing's by a campaign's and a campaign's by a wing's, of the same asset."""
-    out, wing = lab.parent / "out", make_calibration().asset
-    kept = save_calibration(make_calibration(), out / "calibration.nc")
-    before = kept.read_bytes()
-    told = refused(*to(lab, wing))
-    assert f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and" in told
-    assert "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out" in told
-    assert kept.read_bytes() == before
-    kept.write_bytes(before[:200])  # what nobody can read is replaced
+def test_the_calibration_of_a_wing_is_not_overwritten_by_that_of_a_campaign(lab, make_calibration):
+    file = save_calibration(make_calibration(), lab.parent / "out" / "calibration.nc")
+    wing, content = make_calibration().asset, file.read_bytes()
+    sentence = refused(*to(lab, wing))
+    kind = f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and"
+    assert kind in sentence
+    assert "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out" in sentence
+    assert file.read_bytes() == content
+
+
+def test_the_calibration_of_a_campaign_is_not_overwritten_by_that_of_a_wing(lab):
     said(*to(lab, "spring 7"), "--no-report")
-    before = kept.read_bytes()
-    told = refused("calibrate", "--out", out, "--asset", "spring 7", "--no-report")
-    assert "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one" in told
-    assert kept.read_bytes() == before
+    file = lab.parent / "out" / "calibration.nc"
+    content = file.read_bytes()
+    sentence = refused("calibrate", "--out", file.parent, "--asset", "spring 7", "--no-report")
+    assert "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one" in sentence
+    assert file.read_bytes() == content
+
+
+def test_a_calibration_that_nobody_can_read_is_replaced(lab, make_calibration):
+    file = save_calibration(make_calibration(), lab.parent / "out" / "calibration.nc")
+    file.write_bytes(file.read_bytes()[:200])
+    said(*to(lab, "spring 7"), "--no-report")
+    assert load_calibration(file).asset == "spring 7"
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.table("changed.toml")["spring"])

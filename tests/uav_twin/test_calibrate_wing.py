@@ -41,48 +41,134 @@ def simulate(out: Path, *words: object) -> tuple[Any, ...]:
     return ("calibrate", "simulate", "--out", out, "--sampling-rate", 250, "--seed", 3, *words)
 
 
-def test_a_laboratory_is_simulated_with_its_truth_and_its_records_are_fitted(tmp_path):
-    out = tmp_path / "lab"
-    given = ("--e", 0.99, "--servo-mass", 0.18, "--pitot-mass", 0.11, "--alpha", 0.9, "--beta", 5e-4)
-    said(*simulate(out, *given))
-    truth = json.loads((out / "truth.json").read_text(encoding="utf-8"))
-    assert truth["young_modulus_factor"] == 0.99
-    assert (truth["servo_mass"], truth["pitot_mass"]) == (0.18, 0.11)
-    assert (truth["damping_alpha"], truth["damping_beta"], truth["seed"]) == (0.9, 5e-4, 3)
-    assert read_measurements(out).count == 8
-    assert read_lengths(out).semi_span.measured == pytest.approx(1.828, abs=5e-4)
-    assert read_weighed_mass(out).value == pytest.approx(0.47, abs=4e-3)
-    changes = ("semi_span = 1.828", "semi_span = 1.9"), COARSE
-    design = written(tmp_path, SHIPPED_DESIGN.read_text(encoding="utf-8"), *changes)
-    said(*simulate(tmp_path / "longer", "--design", design))
-    lengths = read_lengths(tmp_path / "longer").semi_span
-    assert (lengths.designed, lengths.measured) == (pytest.approx(1.9), pytest.approx(1.9, abs=5e-4))
-    words = ("--data", tmp_path / "longer", "--design", design, "--out", tmp_path / "model", "--no-report")
-    told = json.loads(said("calibrate", *words, "--json"))
-    assert told["laboratory"].startswith("step1/geometry_data.csv read")
-    assert [item["name"] for item in told["quantities"]][:2] == ["tip_stiffness", "frequency_1"]
-    assert {"weighed_mass", "frequency_1"} <= {reading["name"] for reading in told["readings"]}
-    # The model is that of the measured planform, to 0.1 mm, by the beam's k ~ 1 / L^3 from the shipped one.
-    result = load_calibration(tmp_path / "model/calibration.nc")
-    span, model = result.design.planform.semi_span, reduced_model(result.design)
-    assert span == round(result.mean("semi_span"), 4) != 1.9
-    assert (model.design_hash, result.mean_state().geometry.semi_span) == (result.design_hash, span)
+TRUE_WING = {
+    "young_modulus_factor": 0.99,
+    "servo_mass": 0.18,
+    "pitot_mass": 0.11,
+    "damping_alpha": 0.9,
+    "damping_beta": 5e-4,
+}
+
+
+@pytest.fixture(scope="module")
+def simulated_lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The laboratory of a wing with that truth."""
+    out = tmp_path_factory.mktemp("simulated") / "lab"
+    options = ("--e", "--servo-mass", "--pitot-mass", "--alpha", "--beta")
+    truth = [word for pair in zip(options, TRUE_WING.values(), strict=True) for word in pair]
+    said(*simulate(out, *truth))
+    return out
+
+
+def test_a_simulated_laboratory_has_its_truth(simulated_lab):
+    truth = json.loads((simulated_lab / "truth.json").read_text(encoding="utf-8"))
+    assert {name: truth[name] for name in TRUE_WING} == TRUE_WING
+    assert truth["seed"] == 3
+
+
+def test_a_simulated_laboratory_is_measured_with_errors(simulated_lab):
+    assert read_measurements(simulated_lab).count == 8
+    assert read_lengths(simulated_lab).semi_span.measured == pytest.approx(1.828, abs=5e-4)
+    assert read_weighed_mass(simulated_lab).value == pytest.approx(0.47, abs=4e-3)
+
+
+class LongerWing:
+    """A longer wing on a coarse mesh: its simulated laboratory, and its calibration."""
+
+    def __init__(self, folder: Path) -> None:
+        changes = (("semi_span = 1.828", "semi_span = 1.9"), COARSE)
+        design = written(folder, SHIPPED_DESIGN.read_text(encoding="utf-8"), *changes)
+        lab, out = folder / "longer", folder / "model"
+        said(*simulate(lab, "--design", design))
+        self.semi_span = read_lengths(lab).semi_span
+        words = ("--data", lab, "--design", design, "--out", out, "--no-report", "--json")
+        self.record = json.loads(said("calibrate", *words))
+        self.calibration = load_calibration(out / "calibration.nc")
+        self.model = reduced_model(self.calibration.design)
+
+
+@pytest.fixture(scope="module")
+def longer_wing(tmp_path_factory: pytest.TempPathFactory) -> LongerWing:
+    return LongerWing(tmp_path_factory.mktemp("longer"))
+
+
+def test_a_laboratory_of_another_design_is_simulated(longer_wing):
+    assert longer_wing.semi_span.designed == pytest.approx(1.9)
+    assert longer_wing.semi_span.measured == pytest.approx(1.9, abs=5e-4)
+
+
+def test_a_calibration_of_another_design_is_printed_as_data(longer_wing):
+    record = longer_wing.record
+    readings = {reading["name"] for reading in record["readings"]}
+    quantities = [quantity["name"] for quantity in record["quantities"]]
+    assert record["laboratory"].startswith("step1/geometry_data.csv read")
+    assert quantities[:2] == ["tip_stiffness", "frequency_1"]
+    assert {"weighed_mass", "frequency_1"} <= readings
+
+
+def test_the_model_is_that_of_the_measured_planform(longer_wing):
+    """To 0.1 mm."""
+    calibration = longer_wing.calibration
+    span = calibration.design.planform.semi_span
+    assert span == round(calibration.mean("semi_span"), 4) != 1.9
+    assert longer_wing.model.design_hash == calibration.design_hash
+    assert calibration.mean_state().geometry.semi_span == span
+
+
+def test_the_model_of_a_longer_wing_is_softer(longer_wing):
+    """By the beam's k ~ 1 / L^3 from the shipped one."""
+    span = longer_wing.calibration.design.planform.semi_span
     expected = (1.828 / span) ** 3 * reduced_model().tip_stiffness(1.0)
-    assert model.tip_stiffness(1.0) == pytest.approx(expected, rel=1e-2)
-    modes = reduced_model().modes(
-        young_modulus_factor=0.99, stiffness_loss=(0.0, 0.0), servo_mass=0.18, pitot_mass=0.11
-    )
-    ringdown = ("calibrate", "ringdown", "--data", out)
-    for options, nearest in (((), (2e-3, 5e-2)), (("--fitted",), (1e-3, 5e-3))):
-        said(*ringdown, "--out", tmp_path, *options)
-        with (tmp_path / "ringdown.csv").open(encoding="utf-8", newline="") as stream:
-            found = {row["figure"]: float(row["found"]) for row in csv.DictReader(stream)}
-        assert all(len(str(value)) > 8 for value in found.values())  # the console has five digits
-        for mode, (place, near) in enumerate(zip(modes.followed, nearest, strict=True), start=1):
-            frequency = found[f"mode {mode}, natural frequency"]
-            assert frequency == pytest.approx(modes.frequency[place], rel=near), options
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"ringdown.svg", "ringdown.png"}
-    assert "only one read off a plot does" in refused(*ringdown, "--extremes")
+    assert longer_wing.model.tip_stiffness(1.0) == pytest.approx(expected, rel=1e-2)
+
+
+class RingDownFigures:
+    """The figures that the command finds in the ring-down records of a laboratory, and their folder."""
+
+    def __init__(self, lab: Path, out: Path, *options: str) -> None:
+        self.out = out
+        said("calibrate", "ringdown", "--data", lab, "--out", out, *options)
+        with (out / "ringdown.csv").open(encoding="utf-8", newline="") as stream:
+            self.value = {row["figure"]: float(row["found"]) for row in csv.DictReader(stream)}
+
+
+@pytest.fixture(scope="module")
+def figures_of_peaks(simulated_lab: Path, tmp_path_factory: pytest.TempPathFactory) -> RingDownFigures:
+    return RingDownFigures(simulated_lab, tmp_path_factory.mktemp("peaks"))
+
+
+@pytest.fixture(scope="module")
+def fitted_figures(simulated_lab: Path, tmp_path_factory: pytest.TempPathFactory) -> RingDownFigures:
+    return RingDownFigures(simulated_lab, tmp_path_factory.mktemp("fitted"), "--fitted")
+
+
+def check_frequencies(figures: RingDownFigures, *tolerances: float) -> None:
+    """Check the frequencies of the first modes against those of the truth."""
+    masses = {name: TRUE_WING[name] for name in ("young_modulus_factor", "servo_mass", "pitot_mass")}
+    modes = reduced_model().modes(**masses, stiffness_loss=(0.0, 0.0))
+    for number, (mode, tolerance) in enumerate(zip(modes.followed, tolerances, strict=True), start=1):
+        frequency = figures.value[f"mode {number}, natural frequency"]
+        assert frequency == pytest.approx(modes.frequency[mode], rel=tolerance)
+
+
+def test_peaks_of_ring_down_records_have_the_frequencies_of_the_truth(figures_of_peaks):
+    check_frequencies(figures_of_peaks, 2e-3, 5e-2)
+
+
+def test_fitted_ring_down_records_have_the_frequencies_of_the_truth(fitted_figures):
+    check_frequencies(fitted_figures, 1e-3, 5e-3)
+
+
+def test_figures_of_a_ring_down_have_all_digits_and_are_drawn(figures_of_peaks):
+    """The console has five digits."""
+    drawings = {path.name for path in (figures_of_peaks.out / "figures").iterdir()}
+    assert all(len(str(value)) > 8 for value in figures_of_peaks.value.values())
+    assert drawings == {"ringdown.svg", "ringdown.png"}
+
+
+def test_extremes_are_fitted_only_in_records_that_were_read_off_a_plot(simulated_lab):
+    sentence = refused("calibrate", "ringdown", "--data", simulated_lab, "--extremes")
+    assert "only one read off a plot does" in sentence
 
 
 def test_a_wing_that_is_an_fmu_is_measured_as_the_model_is(wing, tmp_path):
@@ -135,48 +221,89 @@ def test_the_truth_lies_in_the_posterior(soft):
     np.testing.assert_allclose(mass, 2.0 * truth.servo_mass + truth.pitot_mass, atol=6e-3)
 
 
-def test_the_published_figures_give_table_1():
-    lines = said("calibrate").splitlines()
-    assert lines[0] == "Step 1: published lengths (Kapteyn et al. 2021, Table 1)."
-    assert lines[2].startswith("Step 3: published frequencies and damping ratios")
-    rows = {line.split("  ")[0].strip(): line for line in lines if "±" in line}
-    table = {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
-    assert table["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]  # procedure and paper
-    near = {"servo mass, g": 1.0, "pitot mass, g": 2.0, "alpha, 1/s": 0.01, "beta, ms": 0.01}
-    for name, off in near.items():
-        assert float(table[name][4]) == pytest.approx(float(table[name][6]), abs=off)
+@pytest.fixture(scope="module")
+def published_calibration() -> list[str]:
+    """What the command prints of the published figures."""
+    return said("calibrate").splitlines()
+
+
+@pytest.fixture(scope="module")
+def table_1(published_calibration: list[str]) -> dict[str, list[str]]:
+    """The numbers of each row that the command prints beside Table 1; procedure and paper come last."""
+    rows = {line.split("  ")[0].strip(): line for line in published_calibration if "±" in line}
+    return {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
+
+
+def test_a_calibration_says_that_it_is_from_published_figures(published_calibration):
+    lengths, _, frequencies, *_ = published_calibration
+    assert lengths == "Step 1: published lengths (Kapteyn et al. 2021, Table 1)."
+    assert frequencies.startswith("Step 3: published frequencies and damping ratios")
+
+
+def test_the_published_figures_give_table_1(table_1):
+    tolerances = {"servo mass, g": 1.0, "pitot mass, g": 2.0, "alpha, 1/s": 0.01, "beta, ms": 0.01}
+    assert table_1["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]
+    for name, tolerance in tolerances.items():
+        by_procedure, in_paper = float(table_1[name][4]), float(table_1[name][6])
+        assert by_procedure == pytest.approx(in_paper, abs=tolerance)
+
+
+def test_the_published_lengths_are_those_of_table_1(table_1):
     lengths = {"semi-span, mm": "1828.00", "root chord, mm": "433.00", "tip chord, mm": "260.00"}
-    assert {name: table[name][6] for name in lengths} == lengths
+    assert {name: table_1[name][6] for name in lengths} == lengths
 
 
-def test_what_a_calibration_leaves_and_says(soft):
-    for word in ("geometry_data.csv read", "8 pairs", "initialconditiondata_1.DAT to", "Report:"):
-        assert word in soft.said
-    names = {path.relative_to(soft.out).as_posix() for path in soft.out.rglob("*") if path.is_file()}
+@pytest.mark.parametrize(
+    "words", ["geometry_data.csv read", "8 pairs", "initialconditiondata_1.DAT to", "Report:"]
+)
+def test_a_calibration_says_what_it_reads_and_writes(soft, words):
+    assert words in soft.said
+
+
+def test_a_calibration_leaves_file_table_fields_and_figures(soft):
     figures = ["load_test", "modes", "posterior", "prior_and_posterior", "procedure", "readings", "ring_down"]
-    assert names == {
-        "calibration.nc", "report.html", "table_1.csv", "wing.vtu", "modes.vtu",
-        *(f"figures/{name}.{kind}" for name in figures for kind in ("svg", "png")),
-    }  # fmt: skip
-    page = (soft.out / "report.html").read_text(encoding="utf-8")
-    assert "Calibration of soft" in page
-    assert "This calibration beside Table 1 of the paper" in page
-    assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
-    assert not re.search(r"""(?<=[\s"'>(=])/(?:[\w.-]+/)+""", page)  # no folder of this machine
-    result = soft.result
-    assert [reading.experiment for reading in result.readings] == [
-        *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
-    ]  # fmt: skip
-    assert result.mean("semi_span") == pytest.approx(1.828005, abs=1e-6)
-    pairs, bending = read_measurements(soft.words[2]), result.readings[3]  # least squares through the origin
+    names = {path.relative_to(soft.out).as_posix() for path in soft.out.rglob("*") if path.is_file()}
+    drawings = {f"figures/{name}.{kind}" for name in figures for kind in ("svg", "png")}
+    assert names == {"calibration.nc", "report.html", "table_1.csv", "wing.vtu", "modes.vtu"} | drawings
+
+
+@pytest.fixture(scope="module")
+def page_of_soft_wing(soft: SimpleNamespace) -> str:
+    return str((soft.out / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_report_of_a_calibration_stands_beside_table_1(page_of_soft_wing):
+    assert "Calibration of soft" in page_of_soft_wing
+    assert "This calibration beside Table 1 of the paper" in page_of_soft_wing
+
+
+def test_the_report_of_a_calibration_fetches_nothing_and_names_no_folder(page_of_soft_wing):
+    folder = r"""(?<=[\s"'>(=])/(?:[\w.-]+/)+"""
+    assert not re.search(r"https?://", page_of_soft_wing.replace("http://www.w3.org", ""))
+    assert not re.search(folder, page_of_soft_wing)
+
+
+def test_a_calibration_has_the_readings_of_all_experiments(soft):
+    experiments = [reading.experiment for reading in soft.result.readings]
+    assert experiments == [*["planform"] * 3, "load test", "weighing", *["ring-down"] * 4]
+    assert soft.result.mean("semi_span") == pytest.approx(1.828005, abs=1e-6)
+
+
+def test_the_reading_of_a_load_test_is_that_of_least_squares_through_the_origin(soft):
+    pairs, bending = read_measurements(soft.words[2]), soft.result.readings[3]
+    (stiffness,), *_ = np.linalg.lstsq(pairs.displacement[:, None], pairs.load)
     error = np.hypot(pairs.load_standard_deviation, bending.value * pairs.displacement_standard_deviation)
-    (expected,), *_ = np.linalg.lstsq(pairs.displacement[:, None], pairs.load)
-    assert bending.value == pytest.approx(expected, rel=1e-12)
-    assert bending.deviation == pytest.approx(error / np.linalg.norm(pairs.displacement), rel=1e-12)
-    apart = assess_fit(pairs, reduced_model().tip_stiffness(result.mean("young_modulus_factor")))
-    runs = [apart.standardised_residual[pairs.run == run] for run in (0, 1)]
-    wanted = [np.sqrt(np.mean(run**2)) for run in runs]
-    assert [channel.after for channel in result.channels] == pytest.approx(wanted, rel=1e-6)
+    deviation = error / np.linalg.norm(pairs.displacement)
+    assert bending.value == pytest.approx(stiffness, rel=1e-12)
+    assert bending.deviation == pytest.approx(deviation, rel=1e-12)
+
+
+def test_each_run_of_a_load_test_is_a_channel_with_its_residual(soft):
+    pairs = read_measurements(soft.words[2])
+    fit = assess_fit(pairs, reduced_model().tip_stiffness(soft.result.mean("young_modulus_factor")))
+    residuals = [fit.standardised_residual[pairs.run == run] for run in (0, 1)]
+    expected = [np.sqrt(np.mean(residual**2)) for residual in residuals]
+    assert [channel.after for channel in soft.result.channels] == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.long

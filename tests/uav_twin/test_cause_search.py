@@ -63,11 +63,17 @@ def test_a_search_beside_a_live_watch_gives_way_to_it(tmp_path):
 
 def test_the_search_that_a_watch_gets_is_the_command_that_an_alarm_names():
     assert (sys.executable, "-m", "uav_twin", "discrepancy", "run") == COMMAND
-    given = with_discrepancy_search(lambda cause_search=None: cause_search)
-    assert isinstance(given(), DiscrepancySearch)
-    assert given(cause_search="another") == "another"
+
+
+def test_a_watch_gets_the_search_unless_another_one_is_given():
+    watch_with_search = with_discrepancy_search(lambda cause_search=None: cause_search)
+    assert isinstance(watch_with_search(), DiscrepancySearch)
+    assert watch_with_search(cause_search="another") == "another"
+
+
+def test_the_search_is_given_from_python_and_is_no_option_of_the_command():
     assert "cause_search" in inspect.signature(uav_twin.watch).parameters
-    assert "cause_search" not in inspect.signature(watch_command.watch).parameters  # it is no option
+    assert "cause_search" not in inspect.signature(watch_command.watch).parameters
 
 
 def test_to_teach_without_a_search_is_refused_before_a_folder_is_made(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -83,18 +84,30 @@ def test_shipped_files_name_their_schemas_to_editors(name, path):
     assert (path.parent / target).resolve() == FORMATS[name].schema_file
 
 
-def test_the_command_lists_prints_and_writes_schemas(tmp_path):
-    runner = CliRunner()
-    listed = runner.invoke(app, ["schema"]).stdout
-    assert [line.split()[0] for line in listed.splitlines()] == list(FORMATS)
-    assert json.loads(runner.invoke(app, ["schema", "--json"]).stdout).keys() == FORMATS.keys()
-    printed = runner.invoke(app, ["schema", "campaign"]).stdout
-    assert json.loads(printed) == FORMATS["campaign"].schema()
+def schema_command(*words: object) -> Any:
+    """Return the result of the command that prints schemas."""
+    return CliRunner().invoke(app, ["schema", *map(str, words)])
+
+
+def test_the_command_lists_formats():
+    lines = schema_command().stdout.splitlines()
+    assert [line.split()[0] for line in lines] == list(FORMATS)
+    assert json.loads(schema_command("--json").stdout).keys() == FORMATS.keys()
+
+
+def test_the_command_prints_a_schema():
+    assert json.loads(schema_command("campaign").stdout) == FORMATS["campaign"].schema()
+
+
+def test_the_command_writes_a_schema(tmp_path):
     out = tmp_path / "campaign.schema.json"
-    told = runner.invoke(app, ["schema", "campaign", "--out", str(out)]).stdout
-    assert out.read_text(encoding="utf-8") == printed
-    assert "#:schema ./campaign.schema.json" in told
-    assert runner.invoke(app, ["schema", "--out", str(out)]).exit_code == 2
+    message = schema_command("campaign", "--out", out).stdout
+    assert out.read_text(encoding="utf-8") == schema_command("campaign").stdout
+    assert "#:schema ./campaign.schema.json" in message
+
+
+def test_the_list_of_formats_is_not_written(tmp_path):
+    assert schema_command("--out", tmp_path / "campaign.schema.json").exit_code == 2
 
 
 def test_an_unknown_format_is_refused_with_the_nearest_one():

@@ -37,16 +37,24 @@ def commands_by_words() -> dict[str, Any]:
 COMMANDS = commands_by_words()
 
 
+def example_of(words: str) -> str:
+    """Return the example in the help of a command, of which there is one."""
+    (example,) = EXAMPLE.findall(inspect.cleandoc(COMMANDS[words].help))
+    return str(example)
+
+
 @pytest.mark.parametrize("words", sorted(COMMANDS))
-def test_the_help_of_a_command_ends_with_an_example_that_it_understands(words):
-    command = COMMANDS[words]
-    text = inspect.cleandoc(command.help)
-    examples = EXAMPLE.findall(text)
-    assert len(examples) == 1
-    assert text.endswith("`")
-    arguments = shlex.split(examples[0])
-    assert arguments[: len(words.split())] == words.split()
-    context = command.make_context(words, arguments[len(words.split()) :])
+def test_the_help_of_a_command_ends_with_one_example(words):
+    assert example_of(words)
+    assert inspect.cleandoc(COMMANDS[words].help).endswith("`")
+
+
+@pytest.mark.parametrize("words", sorted(COMMANDS))
+def test_a_command_understands_its_example(words):
+    count = len(words.split())
+    arguments = shlex.split(example_of(words))
+    context = COMMANDS[words].make_context(words, arguments[count:])
+    assert arguments[:count] == words.split()
     assert context.args == []
 
 
