@@ -70,21 +70,26 @@ def able(drag):
     return compute_separability(drag.campaign, drag.model, drag.problem.setting, FEW)
 
 
-def test_page_file_and_sentences_state_one_record_of_the_errors(drag, tmp_path, monkeypatch):
+def test_the_proof_has_the_errors_of_its_fit(drag):
     """The errors of a fit are computed once; all that states them reads that record."""
     errors = errors_of_fit(drag.search, drag.fit)
-    assert drag.proof.closed is errors.closed
     before, after, trials = proof_scores(drag.proof)
+    assert drag.proof.closed is errors.closed
     assert trials == errors.closed.trials
-    assert before.rms == errors.rms_before
-    assert after.rms == errors.rms_after
-    # what judges this fit after the verdict computes no share again
+    assert (before.rms, after.rms) == (errors.rms_before, errors.rms_after)
+
+
+def test_page_and_sentences_state_one_record_of_the_errors(drag, monkeypatch):
+    """What judges the fit after the verdict computes no share again."""
+    percent = percent_with_interval(errors_of_fit(drag.search, drag.fit).closed)
     monkeypatch.setattr(proof, "closed_share", lambda *residuals: pytest.fail("computed twice"))
-    clause = SimulationComparison(drag.search).closed_share_clause(drag.fit)
-    percent = percent_with_interval(errors.closed)
-    assert percent in clause
+    assert percent in SimulationComparison(drag.search).closed_share_clause(drag.fit)
     assert percent in error_sentence(drag)
     assert percent in page_of(drag)
+
+
+def test_the_file_of_a_verdict_states_the_record_of_the_errors(drag, tmp_path):
+    errors = errors_of_fit(drag.search, drag.fit)
     write_verdict_folder(tmp_path / "verdict", ReportInput(drag, ORIGIN), report=False)
     stored = read_verdict(tmp_path / "verdict")
     assert stored.proof.closed == errors.closed
@@ -98,45 +103,79 @@ def page_of(investigation, **verdict):
     return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
-    closed, held = drag.proof.closed, drag.proof.held_out_after
-    said = f"It explains {percent_with_interval(closed)} of the mean square error in "
-    text = page_of(drag)  # without intervals, by its parameters
-    force = drag.verdict.force
+@pytest.fixture(scope="module")
+def page(drag):
+    """The page of the verdict without its figures."""
+    return page_of(drag)
+
+
+def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag, page):
+    """Without intervals the size is told by its parameters."""
+    closed, force = percent_with_interval(drag.proof.closed), drag.verdict.force
     opening = (
-        f">Quadratic aerodynamic damping at {force.port}<", f">{number(force.rms)} N<",
-        f">{percent_with_interval(closed)}<", f">{probability_text(drag.verdict.probability)}<",
-        f">{headline(drag.verdict)}<", "Its size: ", said,
-    )  # fmt: skip
-    places = [text.index(words) for words in opening]
+        f">Quadratic aerodynamic damping at {force.port}<",
+        f">{number(force.rms)} N<",
+        f">{closed}<",
+        f">{probability_text(drag.verdict.probability)}<",
+        f">{headline(drag.verdict)}<",
+        "Its size: ",
+        f"It explains {closed} of the mean square error in ",
+    )
+    places = [page.index(words) for words in opening]
     assert places == sorted(places)
-    # one line says what is missing, where, how large and how sure that is; the others are unfolded
-    size = f"{number(force.rms)} N (rms) at {force.port}"
-    card = f"Quadratic aerodynamic damping at {force.port} is missing; {size}"
-    assert f'class="card">{card}; probability {probability_text(drag.verdict.probability)}.<' in text
-    assert text.index('class="card"') < text.index("<details>") < places[0]
-    assert f">{number(held.chi_square_per_sample)}<" in text
-    assert "rms residual of leaf strain (µε)<" in text
+
+
+def test_the_card_of_a_verdict_says_what_is_missing_where_how_large_and_how_sure(drag, page):
+    """The other sentences are unfolded behind it."""
+    force, probability = drag.verdict.force, probability_text(drag.verdict.probability)
+    missing = f"Quadratic aerodynamic damping at {force.port} is missing"
+    card = f"{missing}; {number(force.rms)} N (rms) at {force.port}"
+    first_of_table = page.index(f">Quadratic aerodynamic damping at {force.port}<")
+    assert f'class="card">{card}; probability {probability}.<' in page
+    assert page.index('class="card"') < page.index("<details>") < first_of_table
+
+
+def test_a_verdict_has_the_scores_of_its_held_out_trials(drag, page):
+    held_out = drag.proof.held_out_after
+    assert f">{number(held_out.chi_square_per_sample)}<" in page
+    assert "rms residual of leaf strain (µε)<" in page
     for name, factor in (("displacement", 1e3), ("leaf_strain", 1e6)):
-        assert f">{number(factor * held.rms[name])}<" in text
-    # gates say what they compare
+        assert f">{number(factor * held_out.rms[name])}<" in page
+
+
+def test_gates_say_what_they_compare(drag, page):
     absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
-        assert f"p = {gate.statistic:.2g}</td>" in text
-        assert f"p at least {gate.limit:g}</td>" in text
-    assert f"at most {shape.limit:g} nat</td>" in text
-    # no name, no gap to close, no absolute fit that could be judged, no proof
-    assert "The best hypothesis, which is no name, explains" in page_of(drag, kind=VerdictKind.GROUP)
-    untested = replace(drag.proof, closed=None, closed_reason="Held-out trials show no gap before.")
-    assert "Held-out trials show no gap before." in page_of(replace(drag, proof=untested))
-    larger = replace(closed, value=-0.2, low=-0.3, high=-0.1)
-    assert "makes the error in" in page_of(replace(drag, proof=replace(drag.proof, closed=larger)))
+        assert f"p = {gate.statistic:.2g}</td>" in page
+        assert f"p at least {gate.limit:g}</td>" in page
+    assert f"at most {shape.limit:g} nat</td>" in page
+
+
+def test_a_group_is_no_name(drag):
+    page = page_of(drag, kind=VerdictKind.GROUP)
+    assert "The best hypothesis, which is no name, explains" in page
+
+
+def test_a_proof_without_a_gap_says_so(drag):
+    sentence = "Held-out trials show no gap before."
+    without_gap = replace(drag.proof, closed=None, closed_reason=sentence)
+    assert sentence in page_of(replace(drag, proof=without_gap))
+
+
+def test_an_error_that_grew_is_said_to_be_made(drag):
+    larger = replace(drag.proof.closed, value=-0.2, low=-0.3, high=-0.1)
+    page = page_of(replace(drag, proof=replace(drag.proof, closed=larger)))
+    assert "makes the error in" in page
+
+
+def test_an_unexplained_gap_without_a_proof_has_the_consistency_and_no_share(drag):
+    absolute, shape, consistency, _ = drag.verdict.gates
     unknown = replace(absolute, passed=None, statistic=float("nan"))
     gates = (unknown, shape, replace(consistency, passed=False, statistic=2e-5))
-    unproved = {"kind": VerdictKind.UNEXPLAINED, "effects": (), "gates": gates, "force": None}
-    text = page_of(replace(drag, proof=None), **unproved)
-    assert "of the mean square error" not in text
-    assert "p of the consistency; a fit has at least 0.001" in text
+    unexplained = {"kind": VerdictKind.UNEXPLAINED, "effects": (), "gates": gates, "force": None}
+    page = page_of(replace(drag, proof=None), **unexplained)
+    assert "of the mean square error" not in page
+    assert "p of the consistency; a fit has at least 0.001" in page
 
 
 def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(drag):
@@ -173,17 +212,23 @@ def test_members_of_a_group_stand_apart_and_first(drag):
 
 
 def test_parameters_are_shown_before_and_after(drag):
-    rows = parameter_rows(drag)
-    assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
     fitted = drag.problem.shared.parameters(drag.fit.point.shared)
-    for row, item, value in zip(rows, drag.model.parameters, fitted, strict=True):
-        moments = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
-        assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
-        assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
-        assert moments[2][1] < moments[0][1]
-    nothing = replace(drag, fit=drag.search.no_effect)
-    assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
-    assert {len(row) for row in parameter_rows(nothing)} == {4}
+    for row, parameter, value in zip(parameter_rows(drag), drag.model.parameters, fitted, strict=True):
+        before, _, after = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
+        half_width = norm.ppf(0.95) * parameter.deviation
+        assert before == pytest.approx([parameter.mean, half_width], rel=0.03)
+        assert after[0] == pytest.approx(value, abs=0.06 * after[1])
+        assert after[1] < before[1]
+
+
+def test_parameters_are_shown_by_their_names(drag):
+    assert [row[0] for row in parameter_rows(drag)] == ["stiffness factor", "damping factor"]
+
+
+def test_without_an_effect_parameters_have_no_column_after_it(drag):
+    rows = parameter_rows(replace(drag, fit=drag.search.no_effect))
+    assert [row[:4] for row in rows] == [row[:4] for row in parameter_rows(drag)]
+    assert {len(row) for row in rows} == {4}
 
 
 def test_what_explains_most_of_the_gap_is_told_first(drag):
@@ -215,33 +260,59 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
-def test_what_can_be_decided(drag, able):
+@pytest.fixture(scope="module")
+def needs(drag, able):
+    """What the campaign needs, in one text."""
+    return " ".join(campaign_needs(able, drag.campaign, FEW, TrialKind))
+
+
+def test_detectable_sizes_are_listed_of_effects_that_the_campaign_can_test(able):
     rows = {row[0].replace(" ", "_"): row for row in detectable_sizes_table(able).table.rows}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
+
+
+def test_effects_that_the_campaign_cannot_test_are_printed(drag, able):
     lines = list(check_lines(drag.campaign, model=drag.model, catalogue=FEW, faults=(), separability=able))
     assert "Not testable: washout. The campaign has no flight trial to fit." in lines
+
+
+def test_confused_effects_are_printed(drag, able):
+    lines = check_lines(drag.campaign, model=drag.model, catalogue=FEW, faults=(), separability=able)
     confused = [line for line in lines if isinstance(line, str) and line.startswith("Confused: ")]
     assert len(confused) == sum(bool(confused_effects(able, name)) for name in able.identifiers)
     for line in confused:
         assert all(other in line for other in confused_effects(able, line.split()[1]))
+
+
+def test_effects_are_confused_that_are_nearer_than_the_limit(able):
     for row, name in enumerate(able.identifiers):
-        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSION_DISTANCE
-        near[row] = False
-        assert confused_effects(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
+        is_near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSION_DISTANCE
+        is_near[row] = False
+        near = [able.identifiers[number] for number in np.flatnonzero(is_near)]
+        assert confused_effects(able, name) == near
+
+
+def test_groups_of_confused_effects_are_told(able, needs):
     assert group_lines(able)
-    text = " ".join(campaign_needs(able, drag.campaign, FEW, TrialKind))
-    for group in able.groups:
-        assert group[0].replace("_", " ") in text
-    assert " add " not in " ".join(
-        campaign_needs(able, drag.campaign, FEW, ())
-    )  # trials that its model cannot follow
-    unproved = campaign_needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
-    assert [line for line in unproved if "nothing can be proved" in line] == unproved[-1:]
-    assert "nothing can be proved" not in text
-    quiet = {name: replace(item, noise=None) for name, item in drag.campaign.channels.items()}
-    *_, asked = campaign_needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
-    assert asked.startswith(f"Give a noise record for {', '.join(quiet)} (")
+    assert all(group[0].replace("_", " ") in needs for group in able.groups)
+
+
+def test_trials_that_a_model_cannot_follow_are_not_asked_for(drag, able):
+    assert " add " not in " ".join(campaign_needs(able, drag.campaign, FEW, ()))
+
+
+def test_without_held_out_trials_it_is_said_last_that_nothing_can_be_proved(drag, able, needs):
+    without_proof = replace(drag.campaign, trials=drag.campaign.fitted)
+    lines = campaign_needs(able, without_proof, FEW, ())
+    assert [line for line in lines if "nothing can be proved" in line] == lines[-1:]
+    assert "nothing can be proved" not in needs
+
+
+def test_noise_records_are_asked_for_where_there_are_none(drag, able):
+    quiet = {name: replace(channel, noise=None) for name, channel in drag.campaign.channels.items()}
+    *_, last = campaign_needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
+    assert last.startswith(f"Give a noise record for {', '.join(quiet)} (")
 
 
 def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):
@@ -266,19 +337,41 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
 # ---------------------------------------------------------------- numbers, formulas and sentences
 
 
-def test_numbers_formulas_and_lists_as_they_are_written():
-    minus = "\N{MINUS SIGN}"
-    for value, text in (
-        (1582.6, "1,580"), (-11424.0, f"{minus}11,400"), (0.98, "0.98"), (2e6, "2e+06"), (999.6, "1,000"),
-    ):  # fmt: skip
-        assert number(value) == text
-    # numbers that nobody should read as certain
-    for value, text in ((1.0 - 1e-6, "> 0.999"), (1e-200, "< 1e-99"), (float("nan"), "not known")):
-        assert probability_text(value) == text
-    assert formula("zeta_eq = 4 c A w^2 / (3 pi k) -> zeta") == "ζ_eq = 4 c A w² / (3 π k) → ζ"
-    assert formula("x^n, beta2, multiplier mu") == "x^n, beta2, multiplier μ"
-    assert listing(["a"]) == "a"
-    assert listing(["a", "b", "c"]) == "a, b and c"
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1582.6, "1,580"),
+        (-11424.0, "\N{MINUS SIGN}11,400"),
+        (0.98, "0.98"),
+        (2e6, "2e+06"),
+        (999.6, "1,000"),
+    ],
+)
+def test_numbers_have_three_digits(value, text):
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1.0 - 1e-6, "> 0.999"), (1e-200, "< 1e-99"), (float("nan"), "not known")]
+)
+def test_a_probability_is_not_read_as_certain(value, text):
+    assert probability_text(value) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("zeta_eq = 4 c A w^2 / (3 pi k) -> zeta", "ζ_eq = 4 c A w² / (3 π k) → ζ"),
+        ("x^n, beta2, multiplier mu", "x^n, beta2, multiplier μ"),
+    ],
+)
+def test_formulas_have_greek_letters_and_powers(text, printed):
+    assert formula(text) == printed
+
+
+@pytest.mark.parametrize(("words", "text"), [(["a"], "a"), (["a", "b", "c"], "a, b and c")])
+def test_lists_end_with_and(words, text):
+    assert listing(words) == text
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
@@ -299,38 +392,54 @@ def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
     assert cards["long"] == "one of 2 hypotheses"
 
 
-def test_a_headline_has_one_probability(drag):
+def test_a_headline_has_one_probability():
     named = Verdict(VerdictKind.NAMED, "The model lacks drag (probability 0.998).", 0.998, 12.0)
-    assert headline(named).count("probability") == 1
     group = Verdict(VerdictKind.GROUP, "One of a, b is missing.", 0.97, 12.0)
-    assert headline(group) == "One of a, b is missing (together they have the probability 0.970)."
     broken = Verdict(VerdictKind.DATA_ERROR, "Channel x is clipped.", float("nan"), float("nan"))
+    assert headline(named).count("probability") == 1
+    assert headline(group) == "One of a, b is missing (together they have the probability 0.970)."
     assert headline(broken) == "Channel x is clipped."
-    # a name that holds its identifier is said once
+
+
+def test_a_name_that_holds_its_identifier_is_said_once(drag):
     (effect,) = drag.verdict.effects
     flow = replace(effect, identifier="outflow", name="outflow by a power of the level")
     sentence = f"The nearest is outflow; {flow.name} closes 74 %."
-    said = headline(replace(drag.verdict, sentence=sentence, effects=(flow,), hypotheses=()))
-    assert said.startswith(f"The nearest is {flow.name}; {flow.name} closes 74 %")
+    verdict = replace(drag.verdict, sentence=sentence, effects=(flow,), hypotheses=())
+    assert headline(verdict).startswith(f"The nearest is {flow.name}; {flow.name} closes 74 %")
 
 
-def test_gauges_lie_where_the_design_has_them():
-    bench = Bench()
-    residuals = bench.fit(np.random.default_rng(3))
-    design = load_design()
+@pytest.fixture(scope="module")
+def strains():
+    """Residuals of four channels that are the first gauges of a wing."""
+    residuals = Bench().fit(np.random.default_rng(3))
     channels = {
-        name: replace(channel, output=f"strain[{number}]")
-        for number, (name, channel) in enumerate(residuals.channels.items(), start=1)
+        name: replace(channel, output=f"strain[{gauge}]")
+        for gauge, (name, channel) in enumerate(residuals.channels.items(), start=1)
     }
-    places = gauge_places(list(channels.values()), design)
-    assert list(places.values()) == list(design.gauges.positions[:4])  # gauges count from one
-    own = {"g1": replace(channels["g1"], station=0.5, chord=0.2)}
-    assert gauge_places(list(own.values()), design) == {"g1": (0.5, 0.2)}
-    figure = planform_figure(replace(residuals, channels=channels), None, design)
-    labels = [text.get_text() for text in figure.axes[0].texts]
-    assert labels == ["g1", "g2", "g3", "g4"]
-    nowhere = {name: replace(channel, output="x") for name, channel in channels.items()}
-    assert planform_figure(replace(residuals, channels=nowhere), None, design) is None
+    return replace(residuals, channels=channels)
+
+
+def test_gauges_lie_where_the_design_has_them(strains):
+    """Gauges count from one."""
+    design = load_design()
+    places = gauge_places(list(strains.channels.values()), design)
+    assert list(places.values()) == list(design.gauges.positions[:4])
+
+
+def test_a_gauge_lies_where_its_channel_says(strains):
+    channel = replace(strains.channels["g1"], station=0.5, chord=0.2)
+    assert gauge_places([channel], load_design()) == {"g1": (0.5, 0.2)}
+
+
+def test_gauges_are_named_on_the_planform(strains):
+    figure = planform_figure(strains, None, load_design())
+    assert [text.get_text() for text in figure.axes[0].texts] == ["g1", "g2", "g3", "g4"]
+
+
+def test_without_gauges_there_is_no_planform(strains):
+    nowhere = {name: replace(channel, output="x") for name, channel in strains.channels.items()}
+    assert planform_figure(replace(strains, channels=nowhere), None, load_design()) is None
 
 
 @pytest.mark.parametrize(
@@ -368,79 +477,139 @@ def test_a_port_turns_as_what_is_measured_or_prescribed_of_it():
 # ---------------------------------------------------------------- the folder
 
 
-def test_an_old_verdict_is_not_lost(drag, tmp_path):
-    """Where writing fails, another process replaces it, or a killed one had moved it aside.
-
-    How a kill between the moves leaves it is in test_workflow of twin_master.
-    """
+@pytest.fixture
+def old_verdict(tmp_path):
+    """Folder of a verdict with a note of the user's."""
     folder = tmp_path / "v"
     folder.mkdir()
     (folder / "verdict.json").write_text("first", encoding="utf-8")
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    return folder
 
+
+def check_old_verdict(folder):
+    """Check that the verdict is whole, and nothing beside it."""
+    assert (folder / "verdict.json").read_text(encoding="utf-8") == "first"
+    assert (folder / "notes.txt").read_text(encoding="utf-8") == "mine"
+    assert [path.name for path in folder.parent.iterdir()] == ["v"]
+
+
+def test_an_old_verdict_is_not_lost_where_writing_fails(drag, old_verdict):
     def refuse(patch, target):
         raise OSError(28, "No space left on device")
 
+    failing = ReportInput(drag, ORIGIN, pack=refuse)
     with pytest.raises(FileNotWrittenError, match="No space"):
-        write_verdict_folder(folder, ReportInput(drag, ORIGIN, pack=refuse), replace_it=True, report=False)
-    lock = lock_folder(folder)
+        write_verdict_folder(old_verdict, failing, replace_it=True, report=False)
+    check_old_verdict(old_verdict)
+
+
+def test_an_old_verdict_is_not_lost_where_another_process_replaces_it(drag, old_verdict):
+    lock = lock_folder(old_verdict)
     with pytest.raises(FileNotWrittenError, match="another process is replacing"):
-        write_verdict_folder(folder, ReportInput(drag, ORIGIN), replace_it=True, report=False)
+        write_verdict_folder(old_verdict, ReportInput(drag, ORIGIN), replace_it=True, report=False)
     os.close(lock)
-    aside = tmp_path / ".v.old-x" / "v"
-    for put_back in (
-        lambda: check_verdict_folder(folder, replace_it=True),
-        lambda: read_verdict(folder),  # which is a word
-    ):
-        aside.parent.mkdir()
-        folder.rename(aside)
-        with suppress(VerdictFileError):
-            put_back()
-        assert (folder / "verdict.json").read_text(encoding="utf-8") == "first"
-        assert (folder / "notes.txt").read_text(encoding="utf-8") == "mine"
-        assert [path.name for path in tmp_path.iterdir()] == ["v"]
-    # replaced on demand only, and nothing else ever
-    other = tmp_path / "thesis"
-    other.mkdir()
+
+
+def check_for_replacement(folder):
+    check_verdict_folder(folder, replace_it=True)
+
+
+@pytest.mark.parametrize("look", [check_for_replacement, read_verdict])
+def test_an_old_verdict_that_a_killed_process_had_moved_aside_is_put_back(old_verdict, look):
+    """How a kill between the moves leaves it is in test_workflow of twin_master.
+
+    The verdict of this test is a word, which is refused once it is back.
+    """
+    aside = old_verdict.parent / ".v.old-x" / "v"
+    aside.parent.mkdir()
+    old_verdict.rename(aside)
+    with suppress(VerdictFileError):
+        look(old_verdict)
+    check_old_verdict(old_verdict)
+
+
+def test_an_old_verdict_is_replaced_on_demand_only(drag, old_verdict):
     with pytest.raises(FileNotWrittenError, match="--replace"):
-        write_verdict_folder(folder, ReportInput(drag, ORIGIN), report=False)
-    write_verdict_folder(folder, ReportInput(drag, ORIGIN), replace_it=True, report=False)
-    assert not (folder / "notes.txt").exists()
-    assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
-    (other / "chapter.tex").write_text("x", encoding="utf-8")
-    for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
-        with pytest.raises(FileNotWrittenError, match=words):
-            check_verdict_folder(place, replace_it=True)
+        write_verdict_folder(old_verdict, ReportInput(drag, ORIGIN), report=False)
+    other = old_verdict.with_name("other")
+    other.mkdir()
+    write_verdict_folder(old_verdict, ReportInput(drag, ORIGIN), replace_it=True, report=False)
+    assert not (old_verdict / "notes.txt").exists()
+    assert stat.S_IMODE(old_verdict.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
 
 
-def test_the_folder_of_a_named_effect(drag, able, tmp_path):
-    written = tmp_path / "verdict"
-    write_verdict_folder(written, ReportInput(drag, ORIGIN, able))
+@pytest.mark.parametrize(("name", "sentence"), [(".", "not touched"), ("chapter.tex", "no folder")])
+def test_what_is_no_verdict_is_never_replaced(tmp_path, name, sentence):
+    (tmp_path / "chapter.tex").write_text("x", encoding="utf-8")
+    with pytest.raises(FileNotWrittenError, match=sentence):
+        check_verdict_folder(tmp_path / name, replace_it=True)
+
+
+@pytest.fixture(scope="module")
+def folder_of_drag(drag, able, tmp_path_factory):
+    """The folder of the verdict, with its report."""
+    folder = tmp_path_factory.mktemp("drag") / "verdict"
+    write_verdict_folder(folder, ReportInput(drag, ORIGIN, able))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page_of_drag(folder_of_drag):
+    return next(folder_of_drag.glob("*.html")).read_text(encoding="utf-8")
+
+
+def test_the_page_of_a_named_effect_has_its_name_and_equation(drag, page_of_drag):
+    """The equation is that of the catalogue."""
     assert drag.verdict.kind is VerdictKind.NAMED
-    page = next(written.glob("*.html")).read_text(encoding="utf-8")
-    assert "quadratic aerodynamic damping" in page
-    assert "F = c |v| v" in page  # the equation of the catalogue
-    assert page.count("<script>") == page.count("<script") == 1
-    assert not re.search(r'(?:src|href)="(?!#|data:)', page)  # self-contained
-    assert str(written.parent) not in page
-    for title in ("Verdict", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"):
-        assert f">{title}<" in page
-    identifiers = re.findall(r'\bid="([^"]+)"', page)
+    assert "quadratic aerodynamic damping" in page_of_drag
+    assert "F = c |v| v" in page_of_drag
+
+
+def test_the_page_of_a_verdict_contains_all_that_it_shows(folder_of_drag, page_of_drag):
+    assert page_of_drag.count("<script>") == page_of_drag.count("<script") == 1
+    assert not re.search(r'(?:src|href)="(?!#|data:)', page_of_drag)
+    assert str(folder_of_drag.parent) not in page_of_drag
+
+
+@pytest.mark.parametrize(
+    "title", ["Verdict", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"]
+)
+def test_the_page_of_a_verdict_has_its_sections(page_of_drag, title):
+    assert f">{title}<" in page_of_drag
+
+
+def test_identifiers_of_a_page_are_unique(page_of_drag):
+    identifiers = re.findall(r'\bid="([^"]+)"', page_of_drag)
     assert len(set(identifiers)) == len(identifiers)
-    assert read_verdict_file(written / "verdict.json").verdict.sentence == drag.verdict.sentence
-    patch = read_patch(written / "patch.json")
+
+
+def test_the_files_of_a_verdict_read_back(drag, folder_of_drag):
+    stored = read_verdict_file(folder_of_drag / "verdict.json")
+    residuals = read_residuals(folder_of_drag / "residuals.nc")
+    assert stored.verdict.sentence == drag.verdict.sentence
+    assert len(residuals.trials) == len(drag.campaign.trials)
+
+
+def test_the_patch_of_a_verdict_has_its_effect_with_intervals(drag, folder_of_drag):
+    patch = read_patch(folder_of_drag / "patch.json")
+    interval = patch.effects[0].intervals[0]
     assert patch.patch == drag.verdict.effects[0].patch
     assert patch.verdict is VerdictKind.NAMED
-    row = patch.effects[0].intervals[0]
-    assert row.low < row.value < row.high
-    assert len(read_residuals(written / "residuals.nc").trials) == len(drag.campaign.trials)
-    pictures = {path.name for path in (written / "figures").iterdir()}
-    assert {"history.svg", "history.png", "missing_force.svg", "backbone.svg", "separability.png"} <= pictures
-    assert not list(written.parent.glob(".*"))  # nothing half-written is left
-    # the report repeats bit for bit
+    assert interval.low < interval.value < interval.high
+
+
+def test_the_folder_of_a_verdict_has_figures_and_nothing_half_written(folder_of_drag):
+    figures = {path.name for path in (folder_of_drag / "figures").iterdir()}
+    assert {"history.svg", "history.png", "missing_force.svg", "backbone.svg", "separability.png"} <= figures
+    assert not list(folder_of_drag.parent.glob(".*"))
+
+
+def test_the_report_of_a_verdict_repeats_to_the_bit(drag, able, folder_of_drag, page_of_drag):
+    patch = read_patch(folder_of_drag / "patch.json")
     content = ReportInput(drag, ORIGIN, able, intervals=[effect.intervals for effect in patch.effects])
     figures = report_figures(content)
+    drawings = {name: to_svg(figure.figure) for name, figure in figures.items()}
     held_out = listing(trial.name for trial in drag.campaign.held_out)
     assert f"Held out: {held_out};" in figures["residual_table"].caption
-    again = render_report(content, {name: to_svg(item.figure) for name, item in figures.items()}, figures)
-    assert again == page
+    assert render_report(content, drawings, figures) == page_of_drag
