@@ -75,66 +75,126 @@ def campaign():
     return example_campaign(CANTILEVER, "complete", 7, PLAN)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sound_data_have_no_fault(seed):
-    for patch in (
+@pytest.fixture(
+    scope="module",
+    params=[
         ModelPatch(),
         ModelPatch((SensorGain("g0", 0.15), patches.SensorDrift("g1", 2e-5, 5000.0))),
         ModelPatch((SensorGain("*", -0.2, "strain"), patches.HighPass("x", 2.0))),
-    ):
-        campaign = example_campaign(CANTILEVER, "complete", seed, PLAN, patch)
-        assert campaign.channels["g0"].noise.degrees_of_freedom == 399
+    ],
+    ids=["no effect", "gain and drift", "gains and filter"],
+)
+def sound_campaigns(request):
+    """Three sound campaigns of an object with an effect, which is no fault of the data."""
+    return [example_campaign(CANTILEVER, "complete", seed, PLAN, request.param) for seed in range(3)]
+
+
+def test_sound_data_have_no_fault(sound_campaigns):
+    for campaign in sound_campaigns:
         assert check_data(campaign) == ()
         assert check_against_model(campaign, CANTILEVER) == ()
+
+
+def test_sound_data_have_a_long_noise_record_and_hardly_an_outlier(sound_campaigns):
+    for campaign in sound_campaigns:
         marked = mark_outliers(campaign)
+        assert campaign.channels["g0"].noise.degrees_of_freedom == 399
         assert all(trial.used.mean() > 0.999 for trial in marked.trials)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_examples_are_sound_and_repeat_whatever_effect_they_hide(tmp_path, seed):
-    """And say what is held out."""
-    chain = LumpedModel.load("three_mass_chain")
+CHAIN = LumpedModel.load("three_mass_chain")
+
+
+@pytest.fixture(scope="module")
+def chain_plan():
+    """A plan of measurements of a chain of three masses."""
+    return plan_from_scales(CHAIN, ("x3", "x1", "base_strain", "joint_strain"), "end")
+
+
+def test_an_output_that_the_model_does_not_have_is_refused():
     with pytest.raises(ModelError, match="has no output 'x9'"):
-        plan_from_scales(chain, ("x9",), "end")
-    plan = plan_from_scales(chain, ("x3", "x1", "base_strain", "joint_strain"), "end")
-    one, two = (write_example(chain, tmp_path / name, "laboratory", seed, plan) for name in "ab")
-    assert one.data_hash == two.data_hash
-    assert one.data_hash != write_example(chain, tmp_path / "c", "laboratory", 4, plan).data_hash
-    assert [trial.name for trial in one.held_out] == ["loading again", "release 3"]
-    scales = chain.scales(one)
+        plan_from_scales(CHAIN, ("x9",), "end")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_examples_repeat_with_their_seed(tmp_path, chain_plan, seed):
+    hashes = [
+        write_example(CHAIN, tmp_path / name, "laboratory", seed_of_file, chain_plan).data_hash
+        for name, seed_of_file in (("a", seed), ("b", seed), ("c", 4))
+    ]
+    first, second, other = hashes
+    assert first == second
+    assert first != other
+
+
+def test_examples_say_what_is_held_out(chain_plan):
+    example = example_campaign(CHAIN, "laboratory", 1, chain_plan)
+    assert [trial.name for trial in example.held_out] == ["loading again", "release 3"]
+
+
+def hidden_effects(campaign):
+    """Return patches of effects of a usual size, of which the first has none."""
+    scales = CHAIN.scales(campaign)
     force = 0.05 * scales.ports["joint"].stiffness * scales.ports["joint"].displacement
-    for items in (
-        (),
-        (patches.PointMass(0.3 * scales.modal_mass, 0.6),),
-        (patches.RootCompliance(0.3 / scales.tip_stiffness / 0.36),),
-        (patches.PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),),
-        (SensorGain("base_strain", -0.15), patches.HighPass("x3", 0.5)),
-    ):
-        campaign = example_campaign(chain, "laboratory", seed, plan, ModelPatch(items))
-        assert [fault for fault in check_data(campaign) if fault.fatal or not items] == []
-        assert check_against_model(campaign, chain) == ()
-        assert sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials) <= 2
+    return [
+        ModelPatch(()),
+        ModelPatch((patches.PointMass(0.3 * scales.modal_mass, 0.6),)),
+        ModelPatch((patches.RootCompliance(0.3 / scales.tip_stiffness / 0.36),)),
+        ModelPatch((patches.PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),)),
+        ModelPatch((SensorGain("base_strain", -0.15), patches.HighPass("x3", 0.5))),
+    ]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_examples_are_sound_whatever_effect_they_hide(chain_plan, seed):
+    """An effect may be doubted, and is no fatal fault."""
+    example = example_campaign(CHAIN, "laboratory", seed, chain_plan)
+    for effect, patch in enumerate(hidden_effects(example)):
+        campaign = example_campaign(CHAIN, "laboratory", seed, chain_plan, patch)
+        left_out = sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials)
+        assert [fault for fault in check_data(campaign) if fault.fatal or effect == 0] == []
+        assert check_against_model(campaign, CHAIN) == ()
+        assert left_out <= 2
 
 
 # ---------------------------------------------------------------- units, signs, exchanged channels
 
 
-@pytest.mark.parametrize(("name", "factor", "guess"), Inputs(__file__).table("faults.toml")["scaled"])
-def test_unit_slips(campaign, name, factor, guess):
-    """The noise record slips with the channel, or stays in the right unit."""
+SLIPS = Inputs(__file__).table("faults.toml")["scaled"]
+
+
+def faults_with_noise(campaign, name, noise):
+    """Return the faults of a campaign in which a channel has a noise record."""
+    channels = {**campaign.channels, name: replace(campaign.channels[name], noise=noise)}
+    return check_against_model(replace(campaign, channels=channels), CANTILEVER)
+
+
+def check_slip_of(faults, name, guess):
+    """Check that a channel alone has a slip of its unit, with the guess of what it is."""
+    assert (FaultKind.UNIT_SLIP, name) in kinds_of(faults)
+    assert {fault.channel for fault in faults} == {name}
+    assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
+
+
+@pytest.mark.parametrize(("name", "factor", "guess"), SLIPS)
+def test_unit_slips_are_found_where_the_noise_record_slips_with_the_channel(campaign, name, factor, guess):
     slipped = scaled(campaign, name, factor)
-    channel = slipped.channels[name]
-    noise = replace(channel.noise, standard_deviation=channel.noise.standard_deviation * abs(factor))
-    # where the unit is too small what is left is below the noise, and says nothing
-    for record in (noise, channel.noise) if abs(factor) > 1.0 else (noise,):
-        channels = {**slipped.channels, name: replace(channel, noise=record)}
-        faults = check_against_model(replace(slipped, channels=channels), CANTILEVER)
-        assert (FaultKind.UNIT_SLIP, name) in kinds_of(faults)
-        assert {fault.channel for fault in faults} == {name}
-        assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
-    if abs(factor) > 1.0:  # at one load factor, too
-        flown = every(slipped, lambda trial: trial.rows(slice(2, 3)), TrialKind.FLIGHT)
-        assert (FaultKind.UNIT_SLIP, name) in kinds_of(check_against_model(flown, CANTILEVER))
+    noise = slipped.channels[name].noise
+    noise = replace(noise, standard_deviation=noise.standard_deviation * abs(factor))
+    check_slip_of(faults_with_noise(slipped, name, noise), name, guess)
+
+
+@pytest.mark.parametrize(("name", "factor", "guess"), [row for row in SLIPS if abs(row[1]) > 1.0])
+def test_unit_slips_are_found_where_the_noise_record_stays_in_the_right_unit(campaign, name, factor, guess):
+    """Where the unit is too small what remains is below the noise, and says nothing."""
+    slipped = scaled(campaign, name, factor)
+    check_slip_of(faults_with_noise(slipped, name, slipped.channels[name].noise), name, guess)
+
+
+@pytest.mark.parametrize(("name", "factor", "guess"), [row for row in SLIPS if abs(row[1]) > 1.0])
+def test_unit_slips_are_found_at_one_load_factor(campaign, name, factor, guess):
+    flown = every(scaled(campaign, name, factor), lambda trial: trial.rows(slice(2, 3)), TrialKind.FLIGHT)
+    assert (FaultKind.UNIT_SLIP, name) in kinds_of(check_against_model(flown, CANTILEVER))
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])
@@ -147,32 +207,47 @@ def test_other_factors_are_no_unit_slips(campaign, factor):
         assert not kinds_of(check_against_model(released, CANTILEVER))
 
 
-def test_slips_of_inputs(campaign):
-    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
+def force_divided_by(size):
+    """Return what makes the force of a trial so many times smaller."""
+    return lambda trial: replace(trial, force=trial.force / size)
 
-    def over(size):
-        return lambda trial: replace(trial, force=trial.force / size)
 
-    (fault,) = check_against_model(every(campaign, over(1e3), name="loading"), CANTILEVER)
+def test_a_slip_of_the_force_of_one_trial_is_a_slip_of_its_input(campaign):
+    (fault,) = check_against_model(every(campaign, force_divided_by(1e3), name="loading"), CANTILEVER)
     assert (fault.kind, fault.trial) == (FaultKind.INPUT_SLIP, "loading")
     assert "about 1000 times" in fault.sentence
-    (fault,) = check_against_model(every(campaign, over(1e3), TrialKind.STATIC), CANTILEVER)
+
+
+def test_a_slip_of_all_forces_asks_for_their_units(campaign):
+    (fault,) = check_against_model(every(campaign, force_divided_by(1e3), TrialKind.STATIC), CANTILEVER)
     assert fault.kind is FaultKind.INPUT_SLIP
     assert "check the units of forces" in fault.sentence
+
+
+@pytest.mark.parametrize(
+    ("size", "kind", "unit"),
+    [(9.80665, FaultKind.INPUT_SLIP, "kgf"), (4.448, FaultKind.UNIT_DOUBT, "lbf")],
+)
+def test_forces_in_another_unit_are_found_in_each_static_trial(campaign, size, kind, unit):
+    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
     static = [trial.name for trial in campaign.trials if trial.kind is TrialKind.STATIC]
-    for size, kind, unit in (
-        (9.80665, FaultKind.INPUT_SLIP, "kgf"), (4.448, FaultKind.UNIT_DOUBT, "lbf"),
-    ):  # fmt: skip
-        faults = check_against_model(every(campaign, over(size), kind=TrialKind.STATIC), CANTILEVER)
-        assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
-        assert f"({unit} given as N?)" in faults[0].sentence
-        assert faults[0].fatal is (unit == "kgf")
-    stated = {**campaign.channels, "x": replace(campaign.channels["x"], unit="mm")}
-    inches = replace(scaled(campaign, "x", 1.0 / 25.4), channels=stated)
+    slipped = every(campaign, force_divided_by(size), kind=TrialKind.STATIC)
+    faults = check_against_model(slipped, CANTILEVER)
+    assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
+    assert f"({unit} given as N?)" in faults[0].sentence
+    assert faults[0].fatal is (kind is FaultKind.INPUT_SLIP)
+
+
+def test_inches_that_are_given_as_millimetres_are_a_fault(campaign):
+    in_millimetres = {**campaign.channels, "x": replace(campaign.channels["x"], unit="mm")}
+    inches = replace(scaled(campaign, "x", 1.0 / 25.4), channels=in_millimetres)
     (fault,) = check_against_model(inches, CANTILEVER)
-    assert "'x' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
+    sentence = "'x' shows about 0.0393701 times what the model says (inch given as mm?)"
+    assert sentence in fault.sentence
     assert fault.fatal
 
+
+def test_releases_in_millimetres_are_a_slip_of_each_release(campaign):
     def in_millimetres(trial):
         return replace(trial, release=replace(trial.release, displacement=1e3 * trial.release.displacement))
 
@@ -253,29 +328,40 @@ def test_swapped_channels(campaign, kind, pair):
     assert all(name in fault.sentence for name in pair)
 
 
-def test_outputs_and_lengths(campaign):
-    for output, quantity, kind in (
-        ("strain[9]", Quantity.STRAIN, FaultKind.MISSING_OUTPUT),
-        ("tip_displacement", Quantity.STRAIN, FaultKind.WRONG_QUANTITY),
-    ):
-        channel = replace(campaign.channels["g0"], output=output, quantity=quantity)
-        other = replace(campaign, channels={**campaign.channels, "g0": channel})
-        assert kinds_of(check_against_model(other, CANTILEVER)) == {(kind, "g0")}
+@pytest.mark.parametrize(
+    ("output", "kind"),
+    [("strain[9]", FaultKind.MISSING_OUTPUT), ("tip_displacement", FaultKind.WRONG_QUANTITY)],
+)
+def test_an_output_that_is_not_there_or_is_no_strain_is_a_fault(campaign, output, kind):
+    channel = replace(campaign.channels["g0"], output=output, quantity=Quantity.STRAIN)
+    other = replace(campaign, channels={**campaign.channels, "g0": channel})
+    assert kinds_of(check_against_model(other, CANTILEVER)) == {(kind, "g0")}
+
+
+def faults_of_release(campaign, count, step=1, unit=1.0):
+    """Return the faults of a release of which every so-many-th sample of some is read, in a unit of time."""
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
+    samples = release.rows(slice(0, count, step))
+    trials = (replace(samples, time=unit * samples.time),)
+    return check_against_model(replace(campaign, trials=trials), CANTILEVER)
 
-    def cut(count, step=1, unit=1.0):
-        part = release.rows(slice(0, count, step))
-        return check_against_model(
-            replace(campaign, trials=(replace(part, time=unit * part.time),)), CANTILEVER
-        )
 
-    assert (FaultKind.TOO_SHORT, "") in kinds_of(cut(100))
-    assert kinds_of(cut(401)) == set()
-    assert (FaultKind.UNDERSAMPLED, "") in kinds_of(cut(401, 16))
-    assert not any("milliseconds" in fault.sentence for fault in cut(401, 16))
-    (said,) = (item.sentence for item in cut(401, unit=1e3) if item.kind is FaultKind.UNDERSAMPLED)
-    assert "looks like milliseconds" in said
-    assert "sample faster" not in said
+def test_a_short_record_is_a_fault(campaign):
+    assert (FaultKind.TOO_SHORT, "") in kinds_of(faults_of_release(campaign, 100))
+    assert kinds_of(faults_of_release(campaign, 401)) == set()
+
+
+def test_a_record_of_few_samples_is_a_fault(campaign):
+    faults = faults_of_release(campaign, 401, step=16)
+    assert (FaultKind.UNDERSAMPLED, "") in kinds_of(faults)
+    assert not any("milliseconds" in fault.sentence for fault in faults)
+
+
+def test_times_in_milliseconds_are_recognised(campaign):
+    faults = faults_of_release(campaign, 401, unit=1e3)
+    (sentence,) = (fault.sentence for fault in faults if fault.kind is FaultKind.UNDERSAMPLED)
+    assert "looks like milliseconds" in sentence
+    assert "sample faster" not in sentence
 
 
 @pytest.mark.parametrize(
@@ -294,29 +380,44 @@ def test_a_rate_of_an_angle_is_measured_and_no_integral(output, quantity, kinds)
     assert kinds_of(check_against_model(Campaign("", channels, (trial,), None, {}, ""), wheel)) == kinds
 
 
-def test_clipped_and_dead_channels(campaign):
-    def limited(low, high, column):
-        def change(_, values):
-            values[:, column] = np.clip(values[:, column], low, high)
-            return values
+def limited(low, high, column):
+    """Return what clips the readings of a channel."""
 
-        return change
+    def change(_, values):
+        values[:, column] = np.clip(values[:, column], low, high)
+        return values
 
-    faults = check_data(shown(campaign, limited(-3e-4, 1.0, 1), name="release 1"))
-    assert [(fault.kind, fault.channel, fault.trial) for fault in faults] == [
-        (FaultKind.CLIPPED, "g0", "release 1")
-    ]
-    assert "smallest value -0.0003" in faults[0].sentence
+    return change
+
+
+def test_a_clipped_channel_is_a_fault_of_its_trial(campaign):
+    (fault,) = check_data(shown(campaign, limited(-3e-4, 1.0, 1), name="release 1"))
+    assert (fault.kind, fault.channel, fault.trial) == (FaultKind.CLIPPED, "g0", "release 1")
+    assert "smallest value -0.0003" in fault.sentence
+
+
+def test_a_channel_that_is_clipped_in_static_trials_is_a_fault(campaign):
     saturated = check_data(shown(campaign, limited(-1.0, 0.01, 0), kind=TrialKind.STATIC))
     assert (FaultKind.CLIPPED, "x") in kinds_of(saturated)
-    for values, load, run in (
+
+
+@pytest.mark.parametrize(
+    ("values", "load", "run"),
+    [
         ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 3),
-        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 3, 3), 0),  # repeats
-        ((1, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 0),  # few digits
-    ):
-        assert clipped_run(np.array(values), 3.0, np.array(load)) == run
+        ((0, 1, 2, 3, 3, 3), (0, 1, 2, 3, 3, 3), 0),
+        ((1, 1, 2, 3, 3, 3), (0, 1, 2, 3, 4, 5), 0),
+    ],
+    ids=["clipped", "repeats", "few digits"],
+)
+def test_a_clipped_run_is_longer_than_repeats_and_few_digits_explain(values, load, run):
+    assert clipped_run(np.array(values), 3.0, np.array(load)) == run
+
+
+def test_a_dead_channel_is_a_fault_beside_the_model_alone(campaign):
+    """A load may do nothing at the place of a channel."""
     unplugged = shown(campaign, limited(1e-6, 1e-6, 2), name="loading")
-    assert check_data(unplugged) == ()  # a load may do nothing there
+    assert check_data(unplugged) == ()
     assert kinds_of(check_against_model(unplugged, CANTILEVER)) == {(FaultKind.DEAD, "g1")}
 
 
@@ -330,59 +431,108 @@ def test_slow_records_of_few_digits_are_not_clipped():
         assert clipped_run(values, values.max()) == 0
 
 
-def test_noise_records_against_their_label_and_repeats(campaign):
-    for record, kind, words in (
+@pytest.mark.parametrize(
+    ("record", "kind", "words"),
+    [
         (None, FaultKind.NO_NOISE_RECORD, "g0"),
         (NoiseRecord(1e-5, 200.0), FaultKind.NOISE_LABEL, "says 1e-05"),
-    ):
-        channels = {**campaign.channels, "g0": replace(campaign.channels["g0"], noise=record)}
-        (fault,) = check_data(replace(campaign, channels=channels))
-        assert (fault.kind, fault.channel, fault.fatal) == (kind, "g0", False)
-        assert words in fault.sentence
+    ],
+)
+def test_a_noise_record_that_is_missing_or_wrong_is_a_limit(campaign, record, kind, words):
+    channels = {**campaign.channels, "g0": replace(campaign.channels["g0"], noise=record)}
+    (fault,) = check_data(replace(campaign, channels=channels))
+    assert (fault.kind, fault.channel, fault.fatal) == (kind, "g0", False)
+    assert words in fault.sentence
 
+
+def faults_of_channel(trials, record):
+    """Return the faults of trials of one displacement with a noise record."""
+    channel = Channel("x", Quantity.DISPLACEMENT, "x", record)
+    return check_data(Campaign("", {"x": channel}, tuple(trials), None, {}, ""))
+
+
+@pytest.mark.parametrize("stated", [1.0, 0.2, 5.0])
+def test_a_noise_record_is_compared_with_the_scatter_of_repeats(stated):
+    """The repeats have a standard deviation of one."""
     rng, rows = np.random.default_rng(1), np.arange(6.0)
-    trials = tuple(
-        Trial.plain(str(number), TrialKind.STATIC, ("x",), np.zeros(6), force=rows,
-                    values=(rows + rng.normal(size=6))[:, None])
-        for number in range(5)
-    )  # fmt: skip
-    for stated in (1.0, 0.2, 5.0):
-        channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(stated, 100.0))
-        faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
-        assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * (stated != 1.0)
-        assert all("repeated trials scatter" in fault.sentence for fault in faults)
-    # slow noise is smooth, and so is its record
-    time, (slow, rest) = 0.01 * np.arange(600), lfilter([1.0], [1.0, -0.9], rng.normal(size=(2, 600)))
+    trials = []
+    for number in range(5):
+        values = (rows + rng.normal(size=6))[:, None]
+        trial = Trial.plain(str(number), TrialKind.STATIC, ("x",), np.zeros(6), force=rows, values=values)
+        trials.append(trial)
+    faults = faults_of_channel(trials, NoiseRecord(stated, 100.0))
+    assert [fault.kind for fault in faults] == ([] if stated == 1.0 else [FaultKind.NOISE_LABEL])
+    assert all("repeated trials scatter" in fault.sentence for fault in faults)
+
+
+@pytest.mark.parametrize(
+    ("has_samples", "factor", "is_faulty"), [(True, 1.0, False), (True, 3.0, True), (False, 1.0, True)]
+)
+def test_slow_noise_is_compared_with_the_samples_of_its_record(has_samples, factor, is_faulty):
+    """Slow noise is smooth, and so is its record; a standard deviation alone does not say so."""
+    time = 0.01 * np.arange(600)
+    noise = np.random.default_rng(2).normal(size=(2, 600))
+    slow, slow_at_rest = lfilter([1.0], [1.0, -0.9], noise)
     values = (30.0 * np.cos(12.0 * time) * np.exp(-time) + slow)[:, None]
-    trials = (Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values),)
-    for samples, faulty in ((rest, False), (3.0 * rest, True), (None, True)):
-        record = NoiseRecord(float(np.std(rest if samples is None else samples)), 599.0, samples, 0.01)
-        channel = Channel("x", Quantity.DISPLACEMENT, "x", record)
-        faults = check_data(Campaign("", {"x": channel}, trials, None, {}, ""))
-        assert [fault.kind for fault in faults] == [FaultKind.NOISE_LABEL] * faulty
+    trial = Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values)
+    samples = factor * slow_at_rest
+    record = NoiseRecord(float(np.std(samples)), 599.0, samples if has_samples else None, 0.01)
+    faults = faults_of_channel([trial], record)
+    assert [fault.kind for fault in faults] == ([FaultKind.NOISE_LABEL] if is_faulty else [])
 
 
-def test_outliers_are_found_and_left_out_unless_they_are_too_many(campaign):
-    rng = np.random.default_rng(5)
-    places = {}
+class SpoiltReadings:
+    """The campaign with outliers in one of a hundred readings of a gauge in all ring-downs."""
 
-    def spoil(trial, values):
-        rows = rng.choice(np.arange(3, len(values) - 3), len(values) // 100, replace=False)
-        places[trial.name] = rows
-        values[rows, 1] += rng.choice([-1.0, 1.0], len(rows)) * rng.uniform(10.0, 60.0, len(rows)) * 2e-6
+    def __init__(self, campaign):
+        self.campaign = campaign
+        self.rng = np.random.default_rng(5)
+        self.rows_by_trial = {}
+        self.spoilt = shown(campaign, self.spoil, kind=TrialKind.RINGDOWN)
+        self.marked = mark_outliers(self.spoilt)
+
+    def spoil(self, trial, values):
+        inner = np.arange(3, len(values) - 3)
+        rows = self.rng.choice(inner, len(values) // 100, replace=False)
+        signs = self.rng.choice([-1.0, 1.0], len(rows))
+        values[rows, 1] += signs * self.rng.uniform(10.0, 60.0, len(rows)) * 2e-6
+        self.rows_by_trial[trial.name] = rows
         return values
 
-    spoilt = shown(campaign, spoil, kind=TrialKind.RINGDOWN)
-    assert check_data(spoilt) == ()
-    marked = mark_outliers(spoilt)
-    hit = sum((~trial.used[places[trial.name], 1]).sum() for trial in marked.trials if trial.name in places)
-    left_out = sum((~trial.used).sum() for trial in marked.trials)
-    assert hit >= 0.9 * sum(len(rows) for rows in places.values())
-    assert left_out - hit <= 1
-    said = f"of {len(campaign.trials[3].time)} readings of 'g0' in the trial 'release 1' are outliers"
-    assert said in " ".join(marked.remarks)
+    def hits(self):
+        """Return how many of the outliers are left out."""
+        return sum(
+            (~trial.used[self.rows_by_trial[trial.name], 1]).sum()
+            for trial in self.marked.trials
+            if trial.name in self.rows_by_trial
+        )
+
+
+@pytest.fixture(scope="module")
+def spoilt_readings(campaign):
+    return SpoiltReadings(campaign)
+
+
+def test_few_outliers_are_found_and_left_out(spoilt_readings):
+    left_out = sum((~trial.used).sum() for trial in spoilt_readings.marked.trials)
+    count = sum(len(rows) for rows in spoilt_readings.rows_by_trial.values())
+    assert spoilt_readings.hits() >= 0.9 * count
+    assert left_out - spoilt_readings.hits() <= 1
+
+
+def test_few_outliers_are_no_fault_and_remarked_on(spoilt_readings):
+    count = len(spoilt_readings.campaign.trials[3].time)
+    remark = f"of {count} readings of 'g0' in the trial 'release 1' are outliers"
+    assert check_data(spoilt_readings.spoilt) == ()
+    assert remark in " ".join(spoilt_readings.marked.remarks)
+
+
+def test_outliers_are_looked_for_once(spoilt_readings):
+    marked = spoilt_readings.marked
     assert mark_outliers(marked).trials[3].used.sum() >= marked.trials[3].used.sum() - 1
 
+
+def test_many_outliers_are_a_fault_and_not_left_out(campaign):
     def spoil_many(_, values):
         values[10::17, 1] += 1e-4
         return values
