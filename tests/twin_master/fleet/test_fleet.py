@@ -139,13 +139,21 @@ def single_run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return open_run(new_run("growing_damage", folder, options, report=False).folder)
 
 
-@pytest.mark.parametrize(
+PATHS = pytest.mark.parametrize(
     "path", ["observed/strain", "observed/control_index", "filtered/mean", "truth/state"]
 )
+
+
+@PATHS
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(present_group, single_run, path):
     row = present_group["seed"].values.tolist().index(int(single_run.attrs["seed"]))
     of_fleet, of_run = present_group[path], single_run[path]
     assert np.array_equal(of_fleet.values[row], of_run.values.astype(of_fleet.dtype))
+
+
+@PATHS
+def test_a_variable_of_a_fleet_has_axes_units_and_labels_of_that_of_a_run(present_group, single_run, path):
+    of_fleet, of_run = present_group[path], single_run[path]
     assert of_fleet.dims == ("twin", *of_run.dims)
     assert of_fleet.attrs["units"] == of_run.attrs["units"]
     for name, coordinate in of_run.coords.items():

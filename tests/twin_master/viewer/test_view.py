@@ -98,53 +98,102 @@ def test_every_number_is_that_of_the_run(run):
     )
 
 
-def test_steps_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
-    begun, lines
-):
-    """A line that was changed ends the view with its number."""
+def test_steps_are_seen_as_soon_as_their_lines_are_whole(begun, lines):
     flight = Flight(begun)
     assert not flight.update()
-    for content, steps in (([*lines[:20], lines[20][:40]], 19), ([lines[20][40:]], 20)):
-        add(begun, *content)
-        assert [flight.update(), flight.steps, flight.update()] == [True, steps, False]
+    add(begun, *lines[:20], lines[20][:40])
+    assert [flight.update(), flight.steps, flight.update()] == [True, 19, False]
+    add(begun, lines[20][40:])
+    assert [flight.update(), flight.steps, flight.update()] == [True, 20, False]
+
+
+@pytest.fixture
+def taken_back(begun: Path, lines: list[bytes]) -> tuple[Flight, int]:
+    """The view of twenty steps of which a resumed run took back ten, and the number that it had before."""
+    add(begun, *lines[:21])
+    flight = viewed(begun)
     number = flight.number
-    (begun / JOURNAL_NAME).write_bytes(b"".join(lines[:11]))  # as a resumed run does
+    (begun / JOURNAL_NAME).write_bytes(b"".join(lines[:11]))
     flight.update()
-    assert (flight.steps, flight.number) == (10, number + 1)
-    # A viewer that holds the twenty steps is told all ten again.
-    answer = told(FlightPage(flight), 0, 20, flight=number, shown=19, count=20)
+    return flight, number
+
+
+def test_steps_are_forgotten_where_they_are_taken_back(taken_back):
+    flight, number_before = taken_back
+    assert (flight.steps, flight.number) == (10, number_before + 1)
+
+
+def test_a_viewer_that_holds_steps_that_were_taken_back_is_told_all_again(taken_back):
+    flight, number_before = taken_back
+    answer = told(FlightPage(flight), 0, 20, flight=number_before, shown=19, count=20)
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
+
+
+def test_a_line_that_was_changed_ends_the_view_with_its_number(taken_back, begun, lines):
+    flight, _ = taken_back
     add(begun, lines[11].replace(b'"step": 10', b'"step": 11'), *lines[12:])
     with pytest.raises(RunFolderError, match=r"line 12 of the journal .* was changed or is damaged"):
         flight.update()
 
 
-def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
-    steps = [json.loads(line[65:]) for line in lines[1:]]
-    missed = steps[6] | {"observed": [None] * 24}
-    late = steps[9] | {"observation_step": 6, "observed": steps[6]["observed"]}
-    add(begun, lines[0], *map(encode_line, [*steps[:6], missed, *steps[7:10]]))
-    flight = viewed(begun)
-    number = flight.number
-    add(begun, encode_line(late | {"filtered": steps[20]["filtered"]}))
-    assert flight.update()
-    assert (flight.steps, flight.number) == (10, number + 1)
-    expected = [step["observed"] for step in steps[:10]]
-    np.testing.assert_array_equal(
-        flight.observations_in(flight.records_of_steps(0, 10)), np.array(expected, dtype=float)
-    )
-    last = [step["filtered"] for step in flight.records_of_steps(8, 10)]
-    assert last == [steps[8]["filtered"], steps[20]["filtered"]]
-    add(begun, *map(encode_line, [{"model": {}}, *steps[10:20]]))
-    assert viewed(begun).steps == 20
-    flight.update()
-    add(begun, encode_line(steps[30]))
-    with pytest.raises(RunFolderError, match="tells step 30 where 20 was expected"):
-        flight.update()
-    journal = begun / JOURNAL_NAME
-    journal.rename(begun / "before")
-    journal.write_bytes(b"".join(lines[:4]))  # another flight
-    assert FlightPage(flight).answer(asked()) is None  # until it is seen
+class LateObservation:
+    """A view of ten steps of which the observation of step 6 came late, with the last one."""
+
+    def __init__(self, folder: Path, lines: list[bytes]) -> None:
+        self.folder = folder
+        self.records = [json.loads(line[65:]) for line in lines[1:]]
+        missed = self.records[6] | {"observed": [None] * 24}
+        late = self.records[9] | {"observation_step": 6, "observed": self.records[6]["observed"]}
+        revised = late | {"filtered": self.records[20]["filtered"]}
+        self.add_header(lines[0], [*self.records[:6], missed, *self.records[7:10]])
+        self.flight = viewed(folder)
+        self.number_before = self.flight.number
+        self.add(revised)
+        self.has_changed = self.flight.update()
+
+    def add_header(self, header: bytes, records: list[dict[str, Any]]) -> None:
+        add(self.folder, header, *map(encode_line, records))
+
+    def add(self, *records: dict[str, Any]) -> None:
+        add(self.folder, *map(encode_line, records))
+
+
+@pytest.fixture
+def late_observation(begun: Path, lines: list[bytes]) -> LateObservation:
+    return LateObservation(begun, lines)
+
+
+def test_an_observation_that_came_late_is_told_anew(late_observation):
+    flight = late_observation.flight
+    assert late_observation.has_changed
+    assert (flight.steps, flight.number) == (10, late_observation.number_before + 1)
+
+
+def test_an_observation_that_came_late_stands_in_its_step(late_observation):
+    flight, records = late_observation.flight, late_observation.records
+    observations = flight.observations_in(flight.records_of_steps(0, 10))
+    expected = np.array([record["observed"] for record in records[:10]], dtype=float)
+    last_beliefs = [record["filtered"] for record in flight.records_of_steps(8, 10)]
+    np.testing.assert_array_equal(observations, expected)
+    assert last_beliefs == [records[8]["filtered"], records[20]["filtered"]]
+
+
+def test_records_that_are_no_steps_are_passed_over(late_observation):
+    late_observation.add({"model": {}}, *late_observation.records[10:20])
+    assert viewed(late_observation.folder).steps == 20
+
+
+def test_a_step_that_is_missing_ends_the_view(late_observation):
+    late_observation.add(late_observation.records[30])
+    with pytest.raises(RunFolderError, match="tells step 30 where 10 was expected"):
+        late_observation.flight.update()
+
+
+def test_another_flight_in_the_same_folder_is_shown_once_it_is_seen(late_observation, lines):
+    flight, journal = late_observation.flight, late_observation.folder / JOURNAL_NAME
+    journal.rename(late_observation.folder / "before")
+    journal.write_bytes(b"".join(lines[:4]))
+    assert FlightPage(flight).answer(asked()) is None
     assert flight.update()
     assert flight.steps == 3
 
@@ -163,31 +212,60 @@ def told(teller: FlightPage, *words: int, **changed: int) -> dict[str, Any]:
     return answer
 
 
-def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
-    flight = viewed(run)
-    teller = FlightPage(flight)
-    everything = told(teller)
+@pytest.fixture(scope="module")
+def flight(run: Path) -> Flight:
+    return viewed(run)
+
+
+def test_a_new_viewer_is_told_everything(flight):
+    everything = told(FlightPage(flight))
     assert (everything["step"], everything["first"], everything["count"]) == (STEPS - 1, 0, STEPS)
+
+
+def test_a_viewer_is_told_what_it_misses_and_nothing_else(flight):
+    page = FlightPage(flight)
+    everything = told(page)
     number = everything["flight"]
-    missed = told(teller, 0, 30, flight=number, shown=29, count=30)
+    missed = told(page, 0, 30, flight=number, shown=29, count=30)
+    expected = everything["past"]["state"][30:]
     assert missed["first"] == 30
-    np.testing.assert_allclose(missed["past"]["state"], everything["past"]["state"][30:], rtol=1e-12)
-    assert teller.answer(asked(0, STEPS, flight=number, shown=STEPS - 1, count=STEPS)) is None
-    back = told(teller, 0, STEPS, 7, flight=number, shown=8, count=STEPS)
+    np.testing.assert_allclose(missed["past"]["state"], expected, rtol=1e-12)
+    assert page.answer(asked(0, STEPS, flight=number, shown=STEPS - 1, count=STEPS)) is None
+
+
+def test_a_viewer_that_looks_back_is_told_what_is_ahead_of_its_step(flight):
+    page = FlightPage(flight)
+    number = told(page)["flight"]
+    back = told(page, 0, STEPS, 7, flight=number, shown=8, count=STEPS)
     assert (back["step"], back["past"]) == (7, None)
     assert len(back["ahead"]["state"]) == 10
-    # In printed units, with their bands.
-    answer = told(teller, step=28)
-    past, believed = answer["past"], of_steps(flight, 0, 29)
-    mean = flight.knowledge.model.states.mean(believed.probability)
-    wide = np.hypot(believed.expected.standard_deviation, believed.expected.noise)
+
+
+def test_a_viewer_is_told_means_and_readings_in_printed_units(flight):
+    past = told(FlightPage(flight), step=28)["past"]
+    beliefs = of_steps(flight, 0, 29)
+    mean = flight.knowledge.model.states.mean(beliefs.probability)
+    observations = flight.observations_in(flight.records_of_steps(0, 29))
     np.testing.assert_allclose(past["state"], 100.0 * mean)
-    np.testing.assert_allclose(past["observed"], 1e6 * flight.observations_in(flight.records_of_steps(0, 29)))
+    np.testing.assert_allclose(past["observed"], 1e6 * observations)
+
+
+def test_a_viewer_is_told_bands_in_printed_units(flight):
+    past = told(FlightPage(flight), step=28)["past"]
+    expected = of_steps(flight, 0, 29).expected
+    deviation = np.hypot(expected.standard_deviation, expected.noise)
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
-    np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * wide)
+    np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * deviation)
     assert np.min(past["state_lower"]) >= 0.0
     assert np.max(past["state_upper"]) <= 80.0
-    assert answer["ahead"]["reward"][0][2] is None  # no error reward of a step to come
+
+
+def test_a_step_to_come_has_no_error_reward(flight):
+    answer = told(FlightPage(flight), step=28)
+    assert answer["ahead"]["reward"][0][2] is None
+
+
+def test_a_request_for_half_a_step_is_refused():
     with pytest.raises(ValueError, match=r"for Request"):
         Request.model_validate_json(json.dumps(asked().__dict__ | {"step": 1.5}))
 
@@ -209,84 +287,123 @@ def opened(folder: Path) -> Iterator[str]:
         process.stdout.close()
 
 
+def check_served_to_this_machine_alone(address: str) -> None:
+    port = int(address.rstrip("/").rpartition(":")[2])
+    for host, status in ((f"127.0.0.1:{port}", 200), (f"localhost:{port}", 200), ("evil.example", 404)):
+        assert served(port, host=host)[0] == status
+    own = socket.gethostbyname(socket.gethostname())
+    if not own.startswith("127."):
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection((own, port), timeout=5.0)
+
+
+def check_nothing_wider_than_the_window(tab: Any) -> None:
+    edges = tab.value("Object.values(views).map((view) => view.el.getBoundingClientRect().right)")
+    assert tab.value("document.documentElement.scrollWidth <= innerWidth")
+    assert max(edges) <= tab.value("innerWidth")
+
+
+def check_sentence_of_step_29(tab: Any) -> None:
+    sentence = tab.value("element('said').textContent")
+    state = r"step 29: z₁ \d+ ± \d+ %, z₂ \d+ ± \d+ %\."
+    assert re.fullmatch(rf"{state} Flown 3g; next [23]g with probability [01]\.\d{{3}}\.", sentence)
+
+
+def go_back_by_keyboard(tab: Any) -> None:
+    """Go back by one and by ten steps, to the start, and on to step 10."""
+    keys = (("ArrowLeft", 28), ("PageUp", 18), ("Home", 0), ("ArrowLeft", 0), ("PageDown", 10))
+    for key, step in keys:
+        tab.press(key)
+        tab.wait(f"state.shown === {step} && state.wanted === {step} && window.painted.at(-1)[0] === {step}")
+
+
+def check_drawing_of_step_10(tab: Any) -> None:
+    assert tab.value("drawn.past.length") == 11
+    assert tab.value("drawn.ahead") == list(range(11, 21))
+    gauges = [tab.value(f"document.querySelectorAll('#wing {kind}').length") for kind in ("circle", ".lost")]
+    assert gauges == [24, 0]
+
+
+def add_verdict_on_motion(folder: Path) -> None:
+    """Add a verdict with the picture of a missing force behind the last step."""
+    (folder / "teaching" / "figures").mkdir(parents=True)
+    (folder / "teaching" / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
+    verdict = json.dumps({"verdict": {"sentence": "A spring is <missing>."}})
+    (folder / "teaching" / "verdict.json").write_text(verdict)
+    add(folder, encode_line({"verdict": {"folder": "teaching", "notice": {}}}))
+
+
+def check_missing_force(tab: Any, tab_at_step_10: Any) -> None:
+    """Check that the latest step shows it, and that nothing was known of it at step 10."""
+    tab.wait("!element('force').hidden && element('picture').naturalWidth > 0")
+    assert tab.value("element('verdict').textContent") == "A spring is <missing>."
+    assert tab.value("document.documentElement.scrollWidth <= innerWidth")
+    assert tab_at_step_10.value("element('force').hidden")
+
+
+def check_all_steps_after_an_absence(folder: Path, lines: list[bytes], tabs: list[Any]) -> None:
+    """Check that a viewer that was away gets what it missed; one that looks back stays there.
+
+    It knows of the further steps.
+    """
+    looking_back, following, away = tabs
+    away.value("socket.onclose = null; socket.close()")
+    last = json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")
+    add(folder, *lines[31:-1], encode_line(last))
+    following.wait("window.painted.at(-1)[0] === 49")
+    looking_back.wait("state.count === 50")
+    assert looking_back.value("state.shown") == 10
+    away.value("connect()")
+    away.wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
+    flown = viewed(folder)
+    expected = 100.0 * flown.knowledge.model.states.mean(of_steps(flown, 0, STEPS).probability)
+    for tab in (following, away):
+        np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
+    assert looking_back.value("element('told').hidden && element('learning').hidden")
+
+
+def check_notices_and_learning_of_the_last_step(tab: Any) -> None:
+    tab.press("End")
+    tab.wait("window.painted.at(-1)[0] === 49")
+    notices = tab.value("[...element('notices').children].map((item) => item.textContent)")
+    learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
+    assert tab.value("element('latest').getAttribute('aria-pressed')") == "true"
+    assert notices == ["Step 49: gauge 4 is off.", "step 49: Look at <b>gauge 3</b>."]
+    assert tab.value("element('learnt').textContent") == learnt
+
+
+def check_nothing_went_wrong(tab: Any, address: str) -> None:
+    """Check that everything came from the server of the page."""
+    tab.value("1")
+    assert tab.errors == []
+    assert all(url.startswith((address, "data:", "about:")) for url in tab.requests)
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 def test_the_page_in_a_browser(begun, lines, tmp_path):
+    """Three tabs: one goes back to step 10, one follows, and one is away for a while."""
     add(begun, *lines[:31])
     with open_browser() as browser, opened(begun) as address:
-        port = int(address.rstrip("/").rpartition(":")[2])
-        for host, status in ((f"127.0.0.1:{port}", 200), (f"localhost:{port}", 200), ("evil.example", 404)):
-            assert served(port, host=host)[0] == status
-        own = socket.gethostbyname(socket.gethostname())
-        if not own.startswith("127."):  # only this machine is served
-            with pytest.raises(OSError, match="refused"):
-                socket.create_connection((own, port), timeout=5.0)
+        check_served_to_this_machine_alone(address)
         tabs = [browser.tab() for _ in range(3)]
+        looking_back, following, _ = tabs
         for tab, width in zip(tabs, (1300, 400, 400), strict=True):
             tab.go(address, width)
         for tab in tabs:
             tab.wait("window.painted.at(-1)[0] === 29")
-            assert tab.value("document.documentElement.scrollWidth <= innerWidth")
-            edges = tab.value("Object.values(views).map((view) => view.el.getBoundingClientRect().right)")
-            assert max(edges) <= tab.value("innerWidth")
-        first = tabs[0]
-        said = first.value("element('said').textContent")
-        assert re.fullmatch(
-            r"step 29: z₁ \d+ ± \d+ %, z₂ \d+ ± \d+ %\. Flown 3g; next [23]g with probability [01]\.\d{3}\.",
-            said,
-        )
-        # Keyboard: back by one and by ten, to the start; the others stay where they are.
-        for key, step in (("ArrowLeft", 28), ("PageUp", 18), ("Home", 0), ("ArrowLeft", 0), ("PageDown", 10)):
-            first.press(key)
-            first.wait(
-                f"state.shown === {step} && state.wanted === {step} && window.painted.at(-1)[0] === {step}"
-            )
-        assert first.value("drawn.past.length") == 11
-        assert first.value("drawn.ahead") == list(range(11, 21))
-        assert first.value("document.querySelectorAll('#wing circle').length") == 24
-        assert first.value("document.querySelectorAll('#wing .lost').length") == 0
-        assert tabs[1].value("state.shown") == 29
-        before = first.picture(tmp_path / "step_10.png")
-        # A verdict on motion came behind step 29.
-        (begun / "teaching" / "figures").mkdir(parents=True)
-        drawing = to_svg(new_figure(2.0))
-        (begun / "teaching" / "figures" / "missing_force.svg").write_bytes(drawing)
-        said = json.dumps({"verdict": {"sentence": "A spring is <missing>."}})
-        (begun / "teaching" / "verdict.json").write_text(said)
-        add(begun, encode_line({"verdict": {"folder": "teaching", "notice": {}}}))
-        tabs[1].wait("!element('force').hidden && element('picture').naturalWidth > 0")
-        assert tabs[1].value("element('verdict').textContent") == "A spring is <missing>."
-        assert tabs[1].value("document.documentElement.scrollWidth <= innerWidth")
-        assert first.value("element('force').hidden")  # nothing was known at step 10
-        # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
-        tabs[2].value("socket.onclose = null; socket.close()")
-        add(
-            begun,
-            *lines[31:-1],
-            encode_line(json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")),
-        )
-        tabs[1].wait("window.painted.at(-1)[0] === 49")
-        first.wait("state.count === 50")
-        assert first.value("state.shown") == 10
-        tabs[2].value("connect()")
-        tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
-        flown = viewed(begun)
-        expected = 100.0 * flown.knowledge.model.states.mean(of_steps(flown, 0, STEPS).probability)
-        for tab in tabs[1:]:
-            np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
-        assert first.value("element('told').hidden && element('learning').hidden")
-        first.press("End")
-        first.wait("window.painted.at(-1)[0] === 49")
-        assert first.value("element('latest').getAttribute('aria-pressed')") == "true"
-        assert first.picture(tmp_path / "step_49.png") != before
-        said = first.value("[...element('notices').children].map((item) => item.textContent)")
-        assert said == ["Step 49: gauge 4 is off.", "step 49: Look at <b>gauge 3</b>."]
-        learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
-        assert first.value("element('learnt').textContent") == learnt
-        # Everything came from this server, and nothing went wrong.
+            check_nothing_wider_than_the_window(tab)
+        check_sentence_of_step_29(looking_back)
+        go_back_by_keyboard(looking_back)
+        check_drawing_of_step_10(looking_back)
+        assert following.value("state.shown") == 29
+        picture_of_step_10 = looking_back.picture(tmp_path / "step_10.png")
+        add_verdict_on_motion(begun)
+        check_missing_force(following, looking_back)
+        check_all_steps_after_an_absence(begun, lines, tabs)
+        check_notices_and_learning_of_the_last_step(looking_back)
+        assert looking_back.picture(tmp_path / "step_49.png") != picture_of_step_10
         for tab in tabs:
-            tab.value("1")
-            assert tab.errors == []
-            assert all(url.startswith((address, "data:", "about:")) for url in tab.requests)
+            check_nothing_went_wrong(tab, address)
 
 
 def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_path):
