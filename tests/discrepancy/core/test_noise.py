@@ -34,23 +34,43 @@ def channel(samples, interval=INTERVAL):
     return Channel("g", Quantity.STRAIN, "g", record)
 
 
-@pytest.mark.parametrize("coefficients", [(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
-def test_autoregression_is_recovered(coefficients):
+@pytest.fixture(scope="module", params=[(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
+def autoregression(request):
+    """Coefficients and a series of that autoregression with innovations of one."""
+    return request.param, coloured(np.random.default_rng(1), request.param, 8000)
+
+
+def test_autoregression_is_recovered(autoregression):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
-    series = coloured(np.random.default_rng(1), coefficients, 8000)
-    found, innovation = fit_autoregression(series)
-    padded = np.zeros(max(len(found), len(coefficients)))
-    padded[: len(found)] = found
-    padded[: len(coefficients)] -= coefficients
-    assert np.abs(padded).max() < 5.0 / np.sqrt(8000)
+    coefficients, series = autoregression
+    estimate, innovation = fit_autoregression(series)
+    error = np.zeros(max(len(estimate), len(coefficients)))
+    error[: len(estimate)] = estimate
+    error[: len(coefficients)] -= coefficients
+    assert np.abs(error).max() < 5.0 / np.sqrt(8000)
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
+
+
+def test_the_innovation_is_that_of_the_record_in_silence(autoregression):
+    _, series = autoregression
+    estimate, innovation = fit_autoregression(series)
+    residual = np.convolve(series, np.r_[1.0, -estimate])
+    expected = residual @ residual / (8000 - len(estimate) - 1.0)
+    assert innovation == pytest.approx(expected, rel=1e-9)
+
+
+def test_noise_has_the_deviation_of_its_innovation_and_that_of_its_samples(autoregression):
+    _, series = autoregression
     noise = noise_model(channel(series[:3000]), 1.0)
-    assert noise.standard_deviation == pytest.approx(1.0, rel=0.05)  # of the innovation
+    assert noise.standard_deviation == pytest.approx(1.0, rel=0.05)
     assert noise.static_deviation == pytest.approx(series.std(), rel=0.1)
+
+
+def test_noise_is_whitened_at_the_interval_of_its_record_alone(autoregression):
+    _, series = autoregression
+    noise = noise_model(channel(series[:3000]), 1.0)
     assert (noise.can_whiten(INTERVAL), noise.can_whiten(2.0 * INTERVAL)) == (True, False)
     np.testing.assert_array_equal(noise.whiten(series, 2.0 * INTERVAL), series)
-    left = np.convolve(series, np.r_[1.0, -found])  # of the record in silence
-    assert innovation == pytest.approx(left @ left / (8000 - len(found) - 1.0), rel=1e-9)
 
 
 @pytest.mark.parametrize(("coefficients", "count", "records"), [((), 64, 1500), ((0.9,), 500, 300)])
@@ -108,15 +128,17 @@ def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
             assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * error), (test.__name__, level)
 
 
-def test_serial_tests_see_what_they_are_for():
-    generator = np.random.default_rng(4)
-    correlated = coloured(generator, (0.4,), 400)
+def test_correlated_noise_is_not_white():
+    correlated = coloured(np.random.default_rng(4), (0.4,), 400)
     assert ljung_box(correlated)[1] < 1e-6
     assert cumulative_periodogram(correlated)[1] < 1e-4
+
+
+def test_a_line_in_noise_is_found_with_its_share_of_the_power():
     line = 0.6 * np.cos(2.0 * np.pi * 50 / 400 * np.arange(400))
-    share, p, place = fisher_g(generator.standard_normal(400) + line)
-    assert p < 1e-6
-    assert place == 50
+    share, p_value, frequency = fisher_g(np.random.default_rng(4).standard_normal(400) + line)
+    assert p_value < 1e-6
+    assert frequency == 50
     assert share == pytest.approx(0.18 / 1.18, rel=0.5)
 
 
@@ -126,22 +148,35 @@ def test_holm_by_hand():
     assert holm_rejections([], 0.01) == ()
 
 
-def test_ljung_box_allows_for_samples_that_do_not_count():
-    """A third is left out, in blocks and singly: levels hold, and its value there does not matter."""
-    generator = np.random.default_rng(12)
+@pytest.fixture(scope="module")
+def samples_that_count():
+    """Which of 150 samples count: a third is left out, in blocks and singly."""
     used = np.ones(150, dtype=bool)
     used[40:70] = False
-    used[generator.choice(150, 20, replace=False)] = False
-    rows = generator.standard_normal((4000, 150))
-    p = np.array([ljung_box(row, used=used)[1] for row in rows])
+    used[np.random.default_rng(12).choice(150, 20, replace=False)] = False
+    return used
+
+
+def test_ljung_box_allows_for_samples_that_do_not_count(samples_that_count):
+    rows = np.random.default_rng(13).standard_normal((4000, 150))
+    p_values = np.array([ljung_box(row, used=samples_that_count)[1] for row in rows])
     for level in (0.2, 0.05, 0.01, 0.0025):
-        assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * np.sqrt(level / 4000) + 0.2 * level)
-    rows[:, ~used] = 100.0
-    assert ljung_box(rows[0], used=used)[1] == p[0]
-    assert ljung_box(rows[0], used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
-    every = np.ones(150, dtype=bool)
-    again = generator.standard_normal(150)
-    assert ljung_box(again, used=every)[0] == pytest.approx(ljung_box(again)[0], rel=1e-12)
+        tolerance = 4.0 * np.sqrt(level / 4000) + 0.2 * level
+        assert np.mean(p_values <= level) == pytest.approx(level, abs=tolerance)
+
+
+def test_values_of_samples_that_do_not_count_do_not_matter(samples_that_count):
+    row = np.random.default_rng(13).standard_normal(150)
+    p_value = ljung_box(row, used=samples_that_count)[1]
+    row[~samples_that_count] = 100.0
+    assert ljung_box(row, used=samples_that_count)[1] == p_value
+    assert ljung_box(row, used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
+
+
+def test_ljung_box_of_samples_that_all_count_is_that_without_a_mask():
+    row = np.random.default_rng(13).standard_normal(150)
+    with_mask = ljung_box(row, used=np.ones(150, dtype=bool))[0]
+    assert with_mask == pytest.approx(ljung_box(row)[0], rel=1e-12)
 
 
 def test_weights_of_the_pooled_variance_have_the_most_power():

@@ -41,25 +41,49 @@ def two_clocks(
     return table(folder, heads, first, readings(first), second, readings(second))
 
 
-def test_each_reading_stays_at_its_own_time_and_the_others_are_empty(tmp_path):
-    found = understood(two_clocks(tmp_path))
-    campaign = found.campaign("lab")
-    (trial,) = campaign.trials
+@pytest.fixture
+def imported_clocks(tmp_path):
+    """The import of a table with two clocks, and its campaign."""
+    laboratory = understood(two_clocks(tmp_path))
+    return laboratory, laboratory.campaign("lab")
+
+
+def test_a_trial_of_two_clocks_has_the_stamps_of_both(imported_clocks):
+    (trial,) = imported_clocks[1].trials
     stamps = sorted({round(float(time), 3) for time in FAST + SLOW})
     np.testing.assert_allclose(trial.time, stamps, atol=1e-12)
-    for channel, times in enumerate((FAST, SLOW)):
-        used = trial.used[:, channel]
-        np.testing.assert_allclose(trial.time[used], [float(time) for time in times], atol=1e-12)
-        assert [f"{value:.6f}" for value in trial.values[used, channel]] == readings(times)
-    assert found.clock_sentences == [
-        "lab.csv: 'acc1' by 'time1' and 'acc2' by 'time2': one clock has the 48 stamps of all, and a channel "
+
+
+@pytest.mark.parametrize(("channel", "times"), [(0, FAST), (1, SLOW)])
+def test_each_reading_stays_at_its_own_time(imported_clocks, channel, times):
+    (trial,) = imported_clocks[1].trials
+    used = trial.used[:, channel]
+    np.testing.assert_allclose(trial.time[used], [float(time) for time in times], atol=1e-12)
+    assert [f"{value:.6f}" for value in trial.values[used, channel]] == readings(times)
+
+
+def test_an_import_says_that_two_clocks_became_one(imported_clocks):
+    laboratory, campaign = imported_clocks
+    sentence = (
+        "'acc1' by 'time1' and 'acc2' by 'time2': one clock has the 48 stamps of all, and a channel "
         "has no reading where its own clock has no stamp."
-    ]
-    assert found.clock_sentences[0].removeprefix("lab.csv: ") in campaign.remarks[0]
-    folder = write_campaign(campaign, tmp_path / "lab", units=found.units(), left_out_as_empty=True)
+    )
+    assert laboratory.clock_sentences == [f"lab.csv: {sentence}"]
+    assert sentence in campaign.remarks[0]
+
+
+def test_a_stamp_of_another_clock_is_written_as_an_empty_cell(imported_clocks, tmp_path):
+    laboratory, campaign = imported_clocks
+    folder = write_campaign(campaign, tmp_path / "lab", units=laboratory.units(), left_out_as_empty=True)
     assert (folder / "01_lab.csv").read_text("utf-8").splitlines()[4] == "0.025,,0.174108"
-    assert "left_out" not in (folder / "campaign.toml").read_text("utf-8")
+
+
+def test_a_stamp_of_another_clock_is_read_as_left_out(imported_clocks, tmp_path):
+    laboratory, campaign = imported_clocks
+    folder = write_campaign(campaign, tmp_path / "lab", units=laboratory.units(), left_out_as_empty=True)
+    (trial,) = campaign.trials
     (again,) = read_campaign(folder).trials
+    assert "left_out" not in (folder / "campaign.toml").read_text("utf-8")
     np.testing.assert_array_equal(again.used, trial.used)
     np.testing.assert_allclose(again.values[again.used], trial.values[trial.used], rtol=1e-14)
 
@@ -146,31 +170,51 @@ def test_samples_at_rest_of_one_rate_stand_beside_each_other(tmp_path):
         LaboratoryImport([other, swing], given).campaign("lab")
 
 
-def test_what_cannot_be_put_on_one_clock_is_one_sentence(tmp_path):
-    def refusal(sheet, kind="driven", error=CampaignFileError, **answers):
-        with pytest.raises(error) as caught:
-            understood(sheet, kind, **answers).campaign("lab")
-        assert "\n" not in str(caught.value)
-        return str(caught.value)
+def refusal(sheet, kind="driven", error=CampaignFileError, **answers):
+    """Return the sentence with which the import of a sheet is refused."""
+    with pytest.raises(error) as caught:
+        understood(sheet, kind, **answers).campaign("lab")
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
-    rest = {"column": {"acc1": "force"}, "unit": {"acc1": "N"}}
-    assert "and a row of a static trial is one state at rest" in refusal(
-        two_clocks(tmp_path), "static", **rest
-    )
+
+def test_a_static_trial_has_no_two_clocks(tmp_path):
+    force = {"column": {"acc1": "force"}, "unit": {"acc1": "N"}}
+    sentence = refusal(two_clocks(tmp_path), "static", **force)
+    assert "and a row of a static trial is one state at rest" in sentence
+
+
+def test_clocks_whose_names_and_places_contradict_each_other_are_refused(tmp_path):
     crossed = ("time1 [s]", "acc2 [m/s2]", "time2 [s]", "acc1 [m/s2]")
-    assert "names and places contradict each other" in refusal(two_clocks(tmp_path, heads=crossed))
+    sentence = refusal(two_clocks(tmp_path, heads=crossed))
+    assert "names and places contradict each other" in sentence
+
+
+def test_clocks_that_neither_names_nor_places_tell_apart_are_refused(tmp_path):
     heads = ("time a [s]", "time b [s]", "acc1 [m/s2]", "acc2 [m/s2]")
     beside = table(tmp_path, heads, FAST, FAST, readings(FAST), readings(FAST))
     assert "neither names nor places say it" in refusal(beside)
+
+
+def test_a_clock_that_goes_back_is_refused(tmp_path):
     back = [*SLOW[:4], "0.01", *SLOW[5:]]
     sentence = refusal(two_clocks(tmp_path, second=back), error=CampaignDataError)
     assert "the time of the column 'time2' does not increase after sample 4" in sentence
-    late = [f"{9 + k / 100:.2f}" for k in range(12)]
-    apart = two_clocks(tmp_path, second=late)
-    pushed = {"column": {"acc2": "input:pull"}, "unit": {"acc2": "N"}}
-    assert "no time at which both 'acc2' (linear) and 'acc1' are known" in refusal(apart, **pushed)
-    lines = (tmp_path / "lab.csv").read_text("utf-8").splitlines()
-    lines[5] = lines[5].replace(f",{late[4]},", ",,")
-    (tmp_path / "lab.csv").write_text("\n".join(lines) + "\n", "utf-8")
-    sentence = refusal(read_sheet(tmp_path / "lab.csv"))
-    assert "lab.csv, line 6: 'acc2' has a reading and 'time2' no time" in sentence
+
+
+LATE = [f"{9 + row / 100:.2f}" for row in range(12)]
+
+
+def test_an_input_at_no_time_of_the_readings_is_refused(tmp_path):
+    pull = {"column": {"acc2": "input:pull"}, "unit": {"acc2": "N"}}
+    sentence = refusal(two_clocks(tmp_path, second=LATE), **pull)
+    assert "no time at which both 'acc2' (linear) and 'acc1' are known" in sentence
+
+
+def test_a_reading_without_a_time_is_refused_by_its_line(tmp_path):
+    two_clocks(tmp_path, second=LATE)
+    file = tmp_path / "lab.csv"
+    lines = file.read_text("utf-8").splitlines()
+    lines[5] = lines[5].replace(f",{LATE[4]},", ",,")
+    file.write_text("\n".join(lines) + "\n", "utf-8")
+    assert "lab.csv, line 6: 'acc2' has a reading and 'time2' no time" in refusal(read_sheet(file))
