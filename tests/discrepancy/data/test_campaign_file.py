@@ -43,160 +43,289 @@ def test_missing_folders_and_bytes(tmp_path):
     assert read_campaign(folder).trials[2].values.tolist() == [[9e-4]]
 
 
+def release_with_stamps(folder, stamps):
+    """Return the campaign whose release has these times, and that release."""
+    rows = "".join(f"{stamp},{row % 7}\n" for row, stamp in enumerate(stamps))
+    table = ("release.csv", "", f"time,w [mm]\n{rows}")
+    campaign = read_campaign(campaign_folder(folder / "a", PLAIN, table))
+    return campaign, campaign.trials[1]
+
+
+def test_stamps_that_are_printed_with_few_decimals_are_even(tmp_path):
+    _, release = release_with_stamps(tmp_path, [f"{row / 1613.0:.4f}" for row in range(300)])
+    assert release.interval == pytest.approx(1.0 / 1613.0, rel=5e-5)
+    assert np.ptp(np.diff(release.time)) < 1e-12
+
+
 @pytest.mark.parametrize(
-    ("stamps", "said"),
+    ("stamps", "sentence"),
     [
-        ([f"{k / 1613.0:.4f}" for k in range(300)], ""),  # printed with few decimals
-        (["0.0195" if k == 10 else f"{k * 0.002:.3f}" for k in range(60)],
+        (["0.0195" if row == 10 else f"{row * 0.002:.3f}" for row in range(60)],
          "steps of 0.0015 to 0.0025 s, usually 0.002 s"),
-        ([f"{k * 0.002:.3f}" for k in range(60) if k not in (19, 20)],
+        ([f"{row * 0.002:.3f}" for row in range(60) if row not in (19, 20)],
          "widest gap, 0.006 s, begins at 0.036 s"),
     ],
+    ids=["jitter", "gap"],
 )  # fmt: skip
-def test_uneven_stamps_are_taken_as_they_come(tmp_path, stamps, said):
-    rows = "".join(f"{stamp},{k % 7}\n" for k, stamp in enumerate(stamps))
-    campaign = read_campaign(
-        campaign_folder(tmp_path / "a", PLAIN, ("release.csv", "", f"time,w [mm]\n{rows}"))
-    )
-    time = campaign.trials[1].time
-    if not said:
-        assert campaign.trials[1].interval == pytest.approx(1.0 / 1613.0, rel=5e-5)
-        assert np.ptp(np.diff(time)) < 1e-12
-        return
-    np.testing.assert_array_equal(time, [float(stamp) for stamp in stamps])
-    assert not is_even(time)
-    assert any(said in remark for remark in campaign.remarks)
+def test_uneven_stamps_are_taken_as_they_come(tmp_path, stamps, sentence):
+    campaign, release = release_with_stamps(tmp_path, stamps)
+    np.testing.assert_array_equal(release.time, [float(stamp) for stamp in stamps])
+    assert not is_even(release.time)
+    assert any(sentence in remark for remark in campaign.remarks)
 
 
-def test_everything_comes_out_in_si(tmp_path):
-    """And is read the same again from what is written; the hash follows every file."""
-    folder = campaign_folder(tmp_path / "a", PLAIN)
-    campaign = read_campaign(folder)
-    gauge, tip = campaign.channels["g17"], campaign.channels["tip"]
-    assert (gauge.quantity, gauge.output, gauge.station, gauge.chord, gauge.gain_deviation) == (
-        Quantity.STRAIN, "strain[17]", 0.35, 0.3, 0.005,
-    )  # fmt: skip
-    assert (gauge.offset_deviation, tip.offset_deviation) == (2e-6, math.inf)
-    assert (gauge.noise.source, gauge.noise.degrees_of_freedom) == ("pre-trigger", 39)
-    assert gauge.noise.standard_deviation == pytest.approx(1.5e-6 * math.sqrt(40 / 39))
-    assert gauge.noise.interval == pytest.approx(0.01)
-    assert (tip.noise.standard_deviation, tip.noise.degrees_of_freedom) == (5e-5, 200.0)
-    up, release, turn = campaign.trials
-    for found, wanted in (
-        (up.values, [[5e-7, 1e-4], [1.2025e-4, 7.3e-3], [1.2025e-4, 1.46e-2]]),
-        (up.used, [[True, True], [True, True], [False, True]]),
-        (up.time, [30.0] * 3),
-        (up.health, [[0.2, 0.0, 0.1]] * 3),
-        (up.health_deviation, [[0.05] * 3] * 3),
-        (up.temperature, [0.0] * 3),
-        (release.temperature[:1], [3.5]),
-        (turn.load_factor, [1.0, 2.5]),
-        (turn.temperature, [0.0, -1.5]),
-        (turn.health, [[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]),
-    ):
-        assert found.tolist() == wanted
-    assert "1 of 3 readings of 'g17' in the trial 'tip load up' is empty" in campaign.remarks[0]
+@pytest.fixture(scope="module")
+def plain_folder(tmp_path_factory):
+    return campaign_folder(tmp_path_factory.mktemp("plain") / "a", PLAIN)
+
+
+@pytest.fixture(scope="module")
+def plain(plain_folder):
+    """The campaign of that folder."""
+    return read_campaign(plain_folder)
+
+
+@pytest.fixture(scope="module")
+def up(plain):
+    """Its static trial."""
+    return plain.trials[0]
+
+
+@pytest.fixture(scope="module")
+def release(plain):
+    return plain.trials[1]
+
+
+@pytest.fixture(scope="module")
+def turn(plain):
+    """Its flight."""
+    return plain.trials[2]
+
+
+def test_a_channel_has_its_quantity_output_and_place(plain):
+    gauge = plain.channels["g17"]
+    assert (gauge.quantity, gauge.output) == (Quantity.STRAIN, "strain[17]")
+    assert (gauge.station, gauge.chord) == (0.35, 0.3)
+
+
+def test_a_channel_has_deviations_of_zero_and_gain_in_si(plain):
+    gauge = plain.channels["g17"]
+    assert (gauge.offset_deviation, gauge.gain_deviation) == (2e-6, 0.005)
+    assert plain.channels["tip"].offset_deviation == math.inf
+
+
+def test_noise_is_that_of_samples_before_the_trigger(plain):
+    noise = plain.channels["g17"].noise
+    assert (noise.source, noise.degrees_of_freedom) == ("pre-trigger", 39)
+    assert noise.standard_deviation == pytest.approx(1.5e-6 * math.sqrt(40 / 39))
+    assert noise.interval == pytest.approx(0.01)
+
+
+def test_noise_is_that_which_is_stated(plain):
+    noise = plain.channels["tip"].noise
+    assert (noise.standard_deviation, noise.degrees_of_freedom) == (5e-5, 200.0)
+
+
+def test_readings_are_in_si_and_an_empty_one_is_not_used(plain, up):
+    assert up.values.tolist() == [[5e-7, 1e-4], [1.2025e-4, 7.3e-3], [1.2025e-4, 1.46e-2]]
+    assert up.used.tolist() == [[True, True], [True, True], [False, True]]
+    assert "1 of 3 readings of 'g17' in the trial 'tip load up' is empty" in plain.remarks[0]
+
+
+def test_a_static_trial_has_its_place_and_time(up):
     assert up.load_place == (1.0, 0.35)
+    assert up.time.tolist() == [30.0] * 3
+
+
+def test_health_has_its_regions_and_deviation(up, turn):
     assert up.regions == turn.regions == ("z1", "z2", "flange")
+    assert (up.health.tolist(), up.health_deviation.tolist()) == ([[0.2, 0.0, 0.1]] * 3, [[0.05] * 3] * 3)
+    assert turn.health.tolist() == [[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]
+
+
+def test_temperatures_are_differences_from_the_reference(up, release, turn):
+    assert up.temperature.tolist() == [0.0] * 3
+    assert release.temperature[:1].tolist() == [3.5]
+    assert turn.temperature.tolist() == [0.0, -1.5]
+
+
+def test_a_release_has_its_displacement_and_interval(release):
     assert (release.channels, release.release) == (("tip",), Release(0.05))
     assert release.interval == pytest.approx(0.002, rel=1e-12)
+
+
+def test_a_flight_has_its_load_factor_and_start(turn):
+    assert turn.load_factor.tolist() == [1.0, 2.5]
     assert (turn.held_out, turn.start) == (True, 100.0)
-    assert campaign.parameters == {"young_modulus_factor": (1.0073, 0.0103)}
-    assert len(campaign.data_hash) == 64
-    assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
-    (event,) = campaign.events  # in all trials that are samples in time
+
+
+def test_a_campaign_has_parameters_and_trials_to_fit(plain):
+    assert plain.parameters == {"young_modulus_factor": (1.0073, 0.0103)}
+    assert [trial.name for trial in plain.fitted] == ["tip load up", "release"]
+
+
+def test_an_event_is_of_all_trials_that_are_samples_in_time(plain):
+    (event,) = plain.events
     assert (event.trials, event.trial) == (("release",), None)
-    again = read_campaign(write_campaign(campaign, tmp_path / "b"))
-    assert same(campaign, again, 1e-9)
-    assert len(again.remarks) == 1  # what the reader remarked is not said twice
-    assert read_campaign(folder / TOML).data_hash == campaign.data_hash
-    campaign_folder(folder, PLAIN, ("noise.csv", "0.00,2.0", "0.00,2.1"))
-    assert read_campaign(folder).data_hash != campaign.data_hash
 
 
-def test_what_tables_hold_besides(tmp_path):
-    """Columns of no channel are one remark; rows under one force, at a time or at two, are two readings.
+def test_a_campaign_is_read_the_same_from_what_is_written(plain, tmp_path):
+    """What the reader remarked is not said twice."""
+    again = read_campaign(write_campaign(plain, tmp_path / "b"))
+    assert same(plain, again, 1e-9)
+    assert len(again.remarks) == 1
 
-    Samples at rest go before a stated deviation.
-    """
-    for table in ("force,g17\n2.0,1.03\n2.0,1.04\n", "time,force,g17\n0,2.0,1.03\n9,2.0,1.03\n"):
-        folder = campaign_folder(tmp_path / "a", PLAIN, ("tip_up.csv", "", table))
-        assert len(read_campaign(folder).trials[0].force) == 2
+
+def test_the_hash_of_a_campaign_follows_every_file(plain, plain_folder, tmp_path):
+    changed = campaign_folder(tmp_path / "a", PLAIN, ("noise.csv", "0.00,2.0", "0.00,2.1"))
+    assert len(plain.data_hash) == 64
+    assert read_campaign(plain_folder / TOML).data_hash == plain.data_hash
+    assert read_campaign(changed).data_hash != plain.data_hash
+
+
+@pytest.mark.parametrize(
+    "table", ["force,g17\n2.0,1.03\n2.0,1.04\n", "time,force,g17\n0,2.0,1.03\n9,2.0,1.03\n"]
+)
+def test_rows_under_one_force_are_two_readings(tmp_path, table):
+    """At one time or at two."""
+    folder = campaign_folder(tmp_path / "a", PLAIN, ("tip_up.csv", "", table))
+    assert len(read_campaign(folder).trials[0].force) == 2
+
+
+def test_samples_at_rest_go_before_a_stated_deviation(tmp_path):
     stated = (TOML, "offset_deviation = 2.0", "noise = { standard_deviation = 9.0 }")
     campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, stated))
     assert campaign.channels["g17"].noise.source == "pre-trigger"
-    plain = (TOML, 'displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
-    release = read_campaign(campaign_folder(tmp_path / "b", PLAIN, plain)).trials[1].release
+
+
+def test_a_release_may_be_stated_without_a_unit(tmp_path):
+    without_unit = (TOML, 'displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
+    release = read_campaign(campaign_folder(tmp_path / "b", PLAIN, without_unit)).trials[1].release
     assert (release.displacement, release.unit) == (50.0, "1")
-    release = (CAMPAIGNS.folder / PLAIN / "release.csv").read_text("utf-8")
-    more = ("release.csv", "", release.replace("\n", ",1\n").replace("[mm],1", "[mm],g71"))
+
+
+def test_columns_of_no_channel_are_one_remark(tmp_path):
+    text = (CAMPAIGNS.folder / PLAIN / "release.csv").read_text("utf-8")
+    with_column = ("release.csv", "", text.replace("\n", ",1\n").replace("[mm],1", "[mm],g71"))
     tip_up = ("tip_up.csv", "", "force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n")
-    campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, more, tip_up))
+    campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, with_column, tip_up))
+    (remark,) = (remark for remark in campaign.remarks if "'g71'" in remark)
     assert campaign.trials[0].channels == ("tip",)
-    (said,) = (remark for remark in campaign.remarks if "'g71'" in remark)
-    assert said.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
+    assert remark.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
-def test_inputs_come_out_in_si(tmp_path):
-    """And come back as they were; a begin is written where it was said."""
-    campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED))
-    first, second = campaign.trials
-    heater, table, fan = first.inputs
+@pytest.fixture(scope="module")
+def heated(tmp_path_factory):
+    """A campaign with three inputs: a heater, a table and a fan."""
+    return read_campaign(campaign_folder(tmp_path_factory.mktemp("heated") / "a", HEATED))
+
+
+def test_inputs_have_their_quantity_and_hold(heated):
+    heater, table, fan = heated.trials[0].inputs
     assert (heater.quantity, heater.hold, heater.offset_deviation) == (Quantity.HEAT, Hold.ZERO_ORDER, 10.0)
-    assert heater.values[:2].tolist() == [1000.0, 2000.0]
     assert (table.hold, fan.hold) == (Hold.SMOOTH, None)
-    assert table.values[3] == 3e-3
-    assert first.force.tolist() == fan.values.tolist()
-    assert fan.values[3] == 6e-3
-    np.testing.assert_allclose(first.values[2], [22.0, np.pi])
+
+
+def test_inputs_come_out_in_si(heated):
+    heater, table, fan = heated.trials[0].inputs
+    assert heater.values[:2].tolist() == [1000.0, 2000.0]
+    assert (table.values[3], fan.values[3]) == (3e-3, 6e-3)
+    assert heated.trials[0].force.tolist() == fan.values.tolist()
+
+
+def test_temperatures_and_angles_come_out_in_si(heated):
+    np.testing.assert_allclose(heated.trials[0].values[2], [22.0, np.pi])
+
+
+def test_trials_begin_as_they_say_or_settled(heated):
+    first, second = heated.trials
+    remarks = " ".join(heated.remarks)
+    settled = "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed"
     assert (first.begins, second.begins, second.inputs) == (Start.UNKNOWN, Start.SETTLED, ())
-    said = " ".join(campaign.remarks)
-    assert "The trial 'first' is begun in a state that is fitted." in said
-    assert "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed" in said
-    settled = (TOML, '"second.csv"', '"second.csv", begins = "settled"')
-    held = (TOML, 'column = "x"', 'column = "x", hold = "linear", reference = true')
-    kelvin = (TOML, '"degC"', '"K"')
-    cell = 'name = "force", quantity = "force", unit = "kN"'  # a channel may be called so
-    loads = [(f"{name}.csv", "turned", "force") for name in ("first", "second")]
-    loads.append((TOML, 'name = "turned", quantity = "angle", unit = "deg"', cell))
-    for changes, count in (((), 1), ((settled,), 2), ((held,), 1), ((kelvin,), 1), (loads, 1)):
-        campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
-        assert campaign.trials[1].begin_assumed is (count == 1)
-        for si in (True, False):
-            again = write_campaign(campaign, tmp_path / "again", si=si)
-            found = read_campaign(again)
-            assert same(found, campaign, 1e-9)
-            assert found.channels["plate"].unit == ("K" if kelvin in changes else "degC")
-            assert (again / TOML).read_text("utf-8").count("\nbegins = ") == count
+    assert "The trial 'first' is begun in a state that is fitted." in remarks
+    assert settled in remarks
+
+
+SETTLED = (TOML, '"second.csv"', '"second.csv", begins = "settled"')
+HELD = (TOML, 'column = "x"', 'column = "x", hold = "linear", reference = true')
+KELVIN = (TOML, '"degC"', '"K"')
+FORCE_CHANNEL = (
+    ("first.csv", "turned", "force"),
+    ("second.csv", "turned", "force"),
+    (TOML, 'name = "turned", quantity = "angle", unit = "deg"',
+     'name = "force", quantity = "force", unit = "kN"'),
+)  # fmt: skip
+"""A channel may be called force."""
+
+
+@pytest.mark.parametrize("si", [True, False])
+@pytest.mark.parametrize(
+    ("changes", "beginnings"),
+    [((), 1), ((SETTLED,), 2), ((HELD,), 1), ((KELVIN,), 1), (FORCE_CHANNEL, 1)],
+    ids=["plain", "settled", "held", "kelvin", "force"],
+)
+def test_inputs_come_back_as_they_were(tmp_path, changes, beginnings, si):
+    """A begin is written where it was said."""
+    campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
+    folder = write_campaign(campaign, tmp_path / "again", si=si)
+    again = read_campaign(folder)
+    assert campaign.trials[1].begin_assumed is (beginnings == 1)
+    assert same(again, campaign, 1e-9)
+    assert (folder / TOML).read_text("utf-8").count("\nbegins = ") == beginnings
+
+
+@pytest.mark.parametrize(("changes", "unit"), [((), "degC"), ((KELVIN,), "K")])
+def test_the_unit_of_a_temperature_comes_back(tmp_path, changes, unit):
+    campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *changes))
+    for si in (True, False):
+        again = read_campaign(write_campaign(campaign, tmp_path / "again", si=si))
+        assert again.channels["plate"].unit == unit
+
+
+def test_a_channel_may_be_a_force(tmp_path):
+    campaign = read_campaign(campaign_folder(tmp_path / "a", HEATED, *FORCE_CHANNEL))
     assert campaign.trials[0].values[2, 1] == 180e3
+
+
+@pytest.mark.parametrize(("first_force", "is_assumed"), [(0, False), (3, True)])
+def test_a_forced_trial_that_begins_under_a_force_is_taken_to_begin_at_rest(
+    tmp_path, first_force, is_assumed
+):
     forced = (TOML, 'name = "second", kind = "driven"', 'name = "second", kind = "forced"')
-    for first in (0, 3):
-        rows = "".join(f"{k},{first if k == 0 else 1},{20 + k},{k}\n" for k in range(10))
-        pushed = ("second.csv", "", f"time,force,plate,turned\n{rows}")
-        remarks = " ".join(read_campaign(campaign_folder(tmp_path / "a", HEATED, forced, pushed)).remarks)
-        assert ("'second' is taken to begin at rest under what acts" in remarks) is (first != 0)
+    rows = "".join(f"{row},{first_force if row == 0 else 1},{20 + row},{row}\n" for row in range(10))
+    pushed = ("second.csv", "", f"time,force,plate,turned\n{rows}")
+    remarks = " ".join(read_campaign(campaign_folder(tmp_path / "a", HEATED, forced, pushed)).remarks)
+    assert ("'second' is taken to begin at rest under what acts" in remarks) is is_assumed
 
 
-def test_the_documented_campaign_is_read(tmp_path):
-    """That of docs/reference/campaign.md, which shows how its tables begin; a record is longer."""
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "campaign.md").read_text(encoding="utf-8")
+@pytest.fixture(scope="module")
+def documented(tmp_path_factory):
+    """The campaign of docs/reference/campaign.md, which shows how its tables begin; a record is longer."""
+    folder = tmp_path_factory.mktemp("documented")
+    page = Path(__file__).parents[3] / "docs" / "reference" / "campaign.md"
+    text = page.read_text(encoding="utf-8")
     toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
     tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
-    record = "\n".join(f"{0.002 * k:.3f},{(-1) ** k}" for k in range(3, 50))
+    (folder / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
+    record = "\n".join(f"{0.002 * row:.3f},{(-1) ** row}" for row in range(3, 50))
     for table in tables.group(1).split("\n\n"):
         name, columns, *_ = table.removeprefix("# ").splitlines()
         more = f"\n{record}" if columns == "time,g17" else ""
-        (tmp_path / name).write_text(f"{table.rstrip()}{more}\n", encoding="utf-8")
-    campaign = read_campaign(tmp_path)
-    up, release, turns = campaign.trials
-    assert [trial.kind.value for trial in campaign.trials] == ["static", "ringdown", "flight"]
-    assert up.values[1].tolist() == [54.1e-6, 2.98e-3]
-    assert up.temperature.tolist() == [1.5] * 3
+        (folder / name).write_text(f"{table.rstrip()}{more}\n", encoding="utf-8")
+    return read_campaign(folder)
+
+
+def test_the_documented_campaign_is_read(documented):
+    assert [trial.kind.value for trial in documented.trials] == ["static", "ringdown", "flight"]
+    assert documented.channels["g17"].noise.source == "pre-trigger"
+    assert documented.remarks == ()
+
+
+def test_the_documented_trials_are_read_in_si(documented):
+    up, release, turns = documented.trials
+    assert (up.values[1].tolist(), up.temperature.tolist()) == ([54.1e-6, 2.98e-3], [1.5] * 3)
     assert release.release.displacement == 0.015
     assert turns.health[2].tolist() == [0.2, 0.0]
-    assert campaign.channels["g17"].noise.source == "pre-trigger"
-    assert campaign.remarks == ()
 
 
 # ---------------------------------------------------------------- round trip
@@ -329,41 +458,68 @@ def repeats(rows, used=None):
     ]
 
 
-def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
-    """With a free zero per trial, rows and trials are taken out: a two-way layout without interaction.
+@pytest.fixture(scope="module")
+def repeated():
+    """Readings of three repeated trials about their rows; and their trials with one of another run.
 
-    Another run is no repeat; a noise of twice the record's counts half.
+    The noise of these trials is twice the record's, so that a reading counts half.
     """
     readings = np.random.default_rng(4).normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
     rows = repeats(np.vstack((readings, [100.0, 200.0, 300.0, 400.0])))
     *trials, other = (replace(row, noise_factor=2.0) for row in rows)
-    other = replace(other, run="B")
-    rest = 0.5 * (readings - readings.mean(axis=0))
-    for zero, freedom, left in ((0.0, 8.0, rest), (math.inf, 6.0, rest - rest.mean(axis=1, keepdims=True))):
-        channels = {"w": replace(W, offset_deviation=zero)}
-        campaign = Campaign("r", channels, (*trials, other), None, {}, "")
-        campaign = read_campaign(write_campaign(campaign, tmp_path / str(freedom)))
-        record = campaign.channels["w"].noise
-        assert (record.source, record.degrees_of_freedom) == ("repeats", freedom)
-        assert record.standard_deviation == pytest.approx(np.sqrt(np.sum(left**2) / freedom))
-        assert f"taken from repeated trials ({freedom:g} degrees" in campaign.remarks[0]
-    # Without repeats nothing is known; the checks say so.
-    alone = replace(campaign, channels={"w": W}, trials=(trials[0], other), remarks=())
-    alone = read_campaign(write_campaign(alone, tmp_path / "alone"))
+    residual = 0.5 * (readings - readings.mean(axis=0))
+    return residual, (*trials, replace(other, run="B"))
+
+
+def reread(folder, trials, zero=0.0):
+    """Return a campaign of trials of one channel as it is read from what is written."""
+    channels = {"w": replace(W, offset_deviation=zero)}
+    return read_campaign(write_campaign(Campaign("r", channels, trials, None, {}, ""), folder / "r"))
+
+
+@pytest.mark.parametrize(("zero", "freedom"), [(0.0, 8.0), (math.inf, 6.0)], ids=["known zero", "free zero"])
+def test_noise_from_repeats_is_the_pooled_deviation(tmp_path, repeated, zero, freedom):
+    """With a free zero per trial, rows and trials are taken out: a two-way layout without interaction."""
+    residual, trials = repeated
+    if zero:
+        residual = residual - residual.mean(axis=1, keepdims=True)
+    campaign = reread(tmp_path, trials, zero)
+    record = campaign.channels["w"].noise
+    assert (record.source, record.degrees_of_freedom) == ("repeats", freedom)
+    assert record.standard_deviation == pytest.approx(np.sqrt(np.sum(residual**2) / freedom))
+    assert f"taken from repeated trials ({freedom:g} degrees" in campaign.remarks[0]
+
+
+def test_without_repeats_no_noise_is_known(tmp_path, repeated):
+    """Another run is no repeat. The checks say so."""
+    _, (first, *_, other) = repeated
+    channels = {"w": W}
+    written = write_campaign(Campaign("r", channels, (first, other), None, {}, ""), tmp_path / "alone")
+    alone = read_campaign(written)
     assert (alone.channels["w"].noise, alone.remarks) == (None, ())
 
 
-def test_what_is_no_repeat():
-    """A trial under something else, and a reading that is left out."""
-    trial = asked(TrialKind.STATIC, np.zeros(3), channels=("w",), force=np.arange(3.0))
-    assert [group for group, *_ in repeated_readings([trial, trial], "w")] == [[trial, trial]]
-    for what in ("force", "load_factor", "temperature", "health", "noise_factor"):
-        changed = replace(trial, **{what: getattr(trial, what) + 1.0})
-        assert not [*repeated_readings([trial, changed], "w")], what
-    cracked = [
-        replace(trial, regions=("z1", "z2", "web"), health=np.full((3, 3), loss)) for loss in (0.0, 0.1)
-    ]
-    assert [group for group, *_ in repeated_readings([trial, *cracked], "w")] == [[trial, cracked[0]]]
+@pytest.fixture
+def loading():
+    """A static trial of three readings."""
+    return asked(TrialKind.STATIC, np.zeros(3), channels=("w",), force=np.arange(3.0))
+
+
+@pytest.mark.parametrize("name", ["force", "load_factor", "temperature", "health", "noise_factor"])
+def test_a_trial_under_something_else_is_no_repeat(loading, name):
+    changed = replace(loading, **{name: getattr(loading, name) + 1.0})
+    assert [group for group, *_ in repeated_readings([loading, loading], "w")] == [[loading, loading]]
+    assert not [*repeated_readings([loading, changed], "w")]
+
+
+def test_a_trial_with_another_loss_of_a_further_region_is_no_repeat(loading):
+    regions = ("z1", "z2", "web")
+    sound, cracked = (replace(loading, regions=regions, health=np.full((3, 3), loss)) for loss in (0.0, 0.1))
+    groups = [group for group, *_ in repeated_readings([loading, sound, cracked], "w")]
+    assert groups == [[loading, sound]]
+
+
+def test_a_reading_that_is_left_out_is_no_repeat():
     rows, used = np.random.default_rng(1).standard_normal((3, 6)), np.ones((3, 6), dtype=bool)
     used[1, 2] = False
     left_out = repeat_record(W, repeats(np.where(used, rows, 1e9), used))
@@ -386,31 +542,43 @@ def test_what_is_wrong_is_named_in_one_sentence(tmp_path, base, file, old, new, 
     assert str(caught.value).endswith(".") or "not valid TOML" in sentence
 
 
+PIECES = [b"nan", b"1e999", b"-", b",", b'"', b"\n", b"[", b"1_0", b"0x1", b"1e", b"=", b"\r"]
+
+
+def damage(content, data):
+    """Exchange up to three pieces of a file by others."""
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        piece = data.draw(st.binary(max_size=4) | st.sampled_from(PIECES))
+        content[place : place + data.draw(st.integers(0, 6))] = piece
+
+
+def trials_or_refusal(folder):
+    """Return the trials of a folder and no sentence, or no trials and the sentence that refuses it."""
+    try:
+        return read_campaign(folder).trials, ""
+    except DiscrepancyError as error:
+        return (), str(error)
+
+
+def check_trial(trial):
+    """Check that a trial has a finite reading of each channel at each time, and a finite force."""
+    assert trial.values.shape == trial.used.shape == (len(trial.time), len(trial.channels))
+    assert np.isfinite(trial.values).all()
+    assert np.isfinite(trial.force).all()
+
+
 @given(st.sampled_from(sorted(path.name for path in (CAMPAIGNS.folder / PLAIN).iterdir())), st.data())
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path_factory, file, data):
     folder = campaign_folder(tmp_path_factory.mktemp("hostile") / "a", PLAIN)
     content = bytearray((folder / file).read_bytes())
-    for _ in range(data.draw(st.integers(1, 3))):
-        place = data.draw(st.integers(0, len(content) - 1))
-        piece = data.draw(
-            st.binary(max_size=4)
-            | st.sampled_from(
-                [b"nan", b"1e999", b"-", b",", b'"', b"\n", b"[", b"1_0", b"0x1", b"1e", b"=", b"\r"]
-            )
-        )
-        content[place : place + data.draw(st.integers(0, 6))] = piece
+    damage(content, data)
     (folder / file).write_bytes(bytes(content))
-    trials, said = (), "."
-    try:
-        trials = read_campaign(folder).trials
-    except DiscrepancyError as error:
-        said = str(error)
-    assert said.endswith(".")
+    trials, sentence = trials_or_refusal(folder)
+    assert trials or sentence.endswith(".")
     for trial in trials:
-        assert trial.values.shape == trial.used.shape == (len(trial.time), len(trial.channels))
-        assert np.isfinite(trial.values).all()
-        assert np.isfinite(trial.force).all()
+        check_trial(trial)
 
 
 def test_a_cycle_of_a_coarse_gauge_that_reads_alike_up_and_down_is_read(tmp_path):
