@@ -48,21 +48,32 @@ def same(first, second):
     return repr(first) == repr(second)
 
 
-def test_a_verdict_comes_back_equal(tmp_path):
+def test_the_stored_verdict_has_its_kind_and_its_numbers():
     assert (VERDICT.kind, VERDICT.log_bayes_factor) == (VerdictKind.NAMED, inf)
     assert FRICTION.parameters[0].value == 0.0123456789012345678
-    assert FRICTION.patch == ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),))
-    law = PowerStiffness("tip", -3.0, 3.0, -1, 0.05)
-    assert MASS.patch == ModelPatch((PointMass(0.1 + 0.2, 1.7), law))
     assert np.isnan([FRICTION.shape[0].high, STIFFNESS.deviation, VERDICT.gates[0].statistic]).all()
+
+
+def test_the_stored_effects_have_their_patches():
+    law = PowerStiffness("tip", -3.0, 3.0, -1, 0.05)
+    assert FRICTION.patch == ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),))
+    assert MASS.patch == ModelPatch((PointMass(0.1 + 0.2, 1.7), law))
+
+
+def test_a_verdict_is_written_as_it_was(tmp_path):
     again = write_verdict(tmp_path / "again.json", VERDICT, None, ORIGIN)
     assert again.read_bytes() == GOLDEN.read_bytes()
+
+
+@pytest.mark.parametrize("has_trials_before", [True, False])
+def test_a_verdict_comes_back_equal(tmp_path, has_trials_before):
     proof = prove_effects(FITTED, FITTED)
-    for number, content in enumerate((proof, replace(proof, held_out_before=None))):
-        back = files.read_verdict_file(write_verdict(tmp_path / f"{number}.json", VERDICT, content, ORIGIN))
-        assert same(back.verdict, VERDICT)
-        assert same(back.proof, content)
-        assert back.origin == ORIGIN
+    if not has_trials_before:
+        proof = replace(proof, held_out_before=None)
+    back = files.read_verdict_file(write_verdict(tmp_path / "v.json", VERDICT, proof, ORIGIN))
+    assert same(back.verdict, VERDICT)
+    assert same(back.proof, proof)
+    assert back.origin == ORIGIN
 
 
 def stored_patch(*effects, draws=()):
@@ -70,18 +81,38 @@ def stored_patch(*effects, draws=()):
     return StoredPatch(VerdictKind.NAMED, "Two.", found, {}, (STIFFNESS,), ORIGIN)
 
 
-def test_a_patch_comes_back_identical_with_its_intervals(tmp_path):
+@pytest.fixture(scope="module")
+def patch_with_draws():
+    """A patch of two effects, the first of which has 4000 draws of its coefficient."""
     (law,) = FRICTION.patch
-    drawn = np.random.default_rng(1).normal(1.0 / 3.0, 0.02, 4000)
-    draws = [ModelPatch((replace(law, coefficient=float(c)),)) for c in drawn]
-    stored = stored_patch(FRICTION, MASS, draws=(draws, ()))
-    back = read_patch(write_patch(tmp_path / "patch.json", stored))
-    assert same(back, stored)
-    assert back.patch == FRICTION.patch + MASS.patch
-    friction, mass = (effect.intervals for effect in back.effects)
-    told = [(i.primitive, i.parameter, i.unit) for i in (friction[0], *mass[:3])]
-    force = "coefficient", "N or N m"
-    assert told == [(0, *force), (0, "mass", "kg"), (0, "station", "m"), (1, *force)]
+    coefficients = np.random.default_rng(1).normal(1.0 / 3.0, 0.02, 4000)
+    draws = [ModelPatch((replace(law, coefficient=float(value)),)) for value in coefficients]
+    return stored_patch(FRICTION, MASS, draws=(draws, ()))
+
+
+@pytest.fixture
+def patch_read_back(patch_with_draws, tmp_path):
+    return read_patch(write_patch(tmp_path / "patch.json", patch_with_draws))
+
+
+def test_a_patch_comes_back_identical(patch_with_draws, patch_read_back):
+    assert same(patch_read_back, patch_with_draws)
+    assert patch_read_back.patch == FRICTION.patch + MASS.patch
+
+
+def test_intervals_of_a_patch_have_parameters_and_units(patch_read_back):
+    friction, mass = (effect.intervals for effect in patch_read_back.effects)
+    rows = [(row.primitive, row.parameter, row.unit) for row in (friction[0], *mass[:3])]
+    assert rows == [
+        (0, "coefficient", "N or N m"),
+        (0, "mass", "kg"),
+        (0, "station", "m"),
+        (1, "coefficient", "N or N m"),
+    ]
+
+
+def test_intervals_of_a_patch_are_those_of_its_draws(patch_read_back):
+    friction, mass = (effect.intervals for effect in patch_read_back.effects)
     ends = 1.0 / 3.0 + 1.645 * 0.02 * np.array([-1.0, 1.0])
     assert [friction[0].low, friction[0].high] == pytest.approx(ends, abs=2e-3)
     assert np.isnan(mass[0].low)
@@ -189,27 +220,58 @@ def test_residuals_come_back_to_the_last_bit(tmp_path):
     assert alike(fitted, back)
 
 
-def test_residual_file_carries_units_and_refuses_damage(tmp_path):
-    path = write_residuals(tmp_path / "residuals.nc", FITTED)
+@pytest.fixture
+def residual_file(tmp_path):
+    return write_residuals(tmp_path / "residuals.nc", FITTED)
+
+
+def tree_of(path):
+    """Return the content of a file of residuals, which is closed again."""
     with xr.open_datatree(path, engine="h5netcdf") as opened:
-        tree = opened.load()
-    group = tree["trial_001"].to_dataset()
+        return opened.load()
+
+
+def test_the_file_of_residuals_has_units(residual_file):
+    group = tree_of(residual_file)["trial_001"].to_dataset()
     assert group["time"].attrs["units"] == "s"
     assert set(group["unit"].values) == {"1"}
+
+
+def test_the_file_of_residuals_has_axes_and_names(residual_file):
+    group = tree_of(residual_file)["trial_001"].to_dataset()
     assert group["residual"].dims == ("row", "channel")
     assert group.attrs["name"] == "release 1"
+
+
+def write_time_that_is_not_finite(path):
+    tree = tree_of(path)
     tree["trial_001/time"].values[1] = nan
-    whole = path.read_bytes()
-    for write, words in (
-        (lambda: tree.to_netcdf(path, engine="h5netcdf"), "time is not finite"),
-        (lambda: path.write_bytes(whole[: len(whole) // 2]), "damaged"),
-        (lambda: path.write_bytes(b""), "damaged"),
-        (lambda: xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf"), "'other'"),
-        (path.unlink, "There is no file"),
-    ):
-        write()
-        with refused(VerdictFileError, words):
-            read_residuals(path)
+    tree.to_netcdf(path, engine="h5netcdf")
+
+
+def cut_in_half(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def write_another_schema(path):
+    xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf")
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (write_time_that_is_not_finite, "time is not finite"),
+        (cut_in_half, "damaged"),
+        (lambda path: path.write_bytes(b""), "damaged"),
+        (write_another_schema, "'other'"),
+        (Path.unlink, "There is no file"),
+    ],
+)
+def test_a_damaged_file_of_residuals_is_refused(residual_file, damage, sentence):
+    damage(residual_file)
+    with refused(VerdictFileError, sentence):
+        read_residuals(residual_file)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])

@@ -81,32 +81,65 @@ def hum(trial, _):
 MODE = SHAPES[0]
 
 
-def test_an_amplitude_dependence_is_told_where_releases_differ():
-    found, first, patterns = located(2, in_releases(MODE, quadratic), amplitudes=(200.0, 100.0, 50.0))
-    assert found.disagrees
+@pytest.fixture(scope="module")
+def amplitude_dependence():
+    """What is located of an error of mode 1 that grows with its amplitude, in three releases."""
+    return located(2, in_releases(MODE, quadratic), amplitudes=(200.0, 100.0, 50.0))
+
+
+def test_an_amplitude_dependence_is_told_where_releases_differ(amplitude_dependence):
+    location, first, _ = amplitude_dependence
+    assert location.disagrees
     assert (first.subject, first.dependence, first.trials) == ("mode 1", "amplitude", "ring-down")
     assert first.share > 0.8
+
+
+def test_an_amplitude_dependence_is_told_in_a_sentence(amplitude_dependence):
+    _, first, _ = amplitude_dependence
     assert first.sentence.startswith("Mode 1, by amplitude, in ring-down trials; explains ")
+
+
+def test_the_pattern_of_a_mode_is_dynamics_or_load(amplitude_dependence):
+    _, _, patterns = amplitude_dependence
     pattern = next(item for item in patterns if item.trials == "ring-down")
     assert pattern.subject == "dynamics or load"
     assert pattern.share > 0.8
-    _, first, _ = located(2, in_releases(MODE, quadratic))  # releases of one amplitude
+
+
+def test_releases_of_one_amplitude_do_not_tell_amplitude_from_time():
+    _, first, _ = located(2, in_releases(MODE, quadratic))
     assert first.subject == "mode 1"
     assert "do not tell the two apart" in first.sentence
 
 
-def test_a_bad_gauge_is_a_sensor():
+@pytest.fixture(scope="module")
+def bad_gauge():
+    """What is located of a gauge that drifts in static trials."""
     drift = np.zeros((16, 4))
     drift[:, 1] = np.linspace(0.0, 25.0, 16)
-    found, _, patterns = located(3, lambda bench: {2: drift})
-    assert found.disagrees
+    location, _, patterns = located(3, lambda bench: {2: drift})
+    return location, patterns
+
+
+def test_a_bad_gauge_is_a_sensor(bad_gauge):
+    location, patterns = bad_gauge
+    assert location.disagrees
     assert patterns[0].subject == "sensor"
     assert "g2" in patterns[0].sentence
-    told = next(item for item in found.disagreements if item.trials == "static")
-    assert told.subject in ("channel g2", "sensor")
-    # The fit puts part of the drift into the stiffness that all gauges share: others may follow faintly.
-    assert min(found.cells, key=lambda cell: cell.p_value).channel == "g2"
-    assert np.mean([cell.channel == "g2" for cell in found.cells if cell.significant]) > 0.6
+
+
+def test_a_bad_gauge_is_the_subject_of_static_trials(bad_gauge):
+    location, _ = bad_gauge
+    static = next(item for item in location.disagreements if item.trials == "static")
+    assert static.subject in ("channel g2", "sensor")
+
+
+def test_most_significant_cells_are_those_of_a_bad_gauge(bad_gauge):
+    """The fit puts part of the drift into the stiffness that all gauges share: others may follow faintly."""
+    location, _ = bad_gauge
+    significant = [cell.channel == "g2" for cell in location.cells if cell.significant]
+    assert min(location.cells, key=lambda cell: cell.p_value).channel == "g2"
+    assert np.mean(significant) > 0.6
 
 
 def test_few_static_readings_do_not_drown_in_many_samples():
@@ -125,44 +158,72 @@ def test_modes_are_those_of_records_at_one_rate():
     assert predicted_frequencies((fast, slow)) == predicted_frequencies((fast,))
 
 
-def test_lines_and_temperature_are_told():
-    """Hum is common to all channels, a mode that the model lacks decays, static trials warm."""
-    found, told, patterns = located(4, in_releases(np.full(4, 2.0), hum))
-    line = next(test for test in found.tests if test.name == "Fisher g")
+@pytest.fixture(scope="module")
+def located_hum():
+    """What is located of a hum that is common to all channels."""
+    return located(4, in_releases(np.full(4, 2.0), hum))
+
+
+def test_a_line_is_found_by_its_test(located_hum):
+    location, _, _ = located_hum
+    line = next(test for test in location.tests if test.name == "Fisher g")
     assert line.rejected
     assert line.where.endswith("17 Hz")
-    assert patterns[0].subject == "common"
-    assert told.dependence == "a line at 17 Hz"
-    assert told.share > 0.9
 
-    def lacking(trial, n):
+
+def test_a_hum_is_a_line_that_is_common_to_all_channels(located_hum):
+    _, first, patterns = located_hum
+    assert patterns[0].subject == "common"
+    assert first.dependence == "a line at 17 Hz"
+    assert first.share > 0.9
+
+
+def test_a_mode_that_the_model_lacks_is_a_decaying_line():
+    def lacking_mode(trial, n):
         return np.cos(2 * np.pi * 9.0 * trial.time + n) * np.exp(-2.0 * trial.time)
 
-    _, told, _ = located(4, in_releases(40.0 * np.array([0.2, 0.5, -0.3, 0.1]), lacking))
-    assert told.dependence in ("a decaying line at 9 Hz", "a decaying line at 9.08 Hz")
-    assert told.share > 0.8
-    assert told.sentence.startswith("All channels, a decaying line at 9")
-
-    found, told, _ = located(5, lambda bench: {2: np.outer(bench.trials[-1].temperature, np.full(4, 3.0))})
-    assert (told.trials, told.dependence) == ("static", "temperature")
-    assert any(c.statistic == "temperature" and c.significant for c in found.cells)
+    shape = 40.0 * np.array([0.2, 0.5, -0.3, 0.1])
+    _, first, _ = located(4, in_releases(shape, lacking_mode))
+    assert first.dependence in ("a decaying line at 9 Hz", "a decaying line at 9.08 Hz")
+    assert first.share > 0.8
+    assert first.sentence.startswith("All channels, a decaying line at 9")
 
 
-def test_outliers_are_remarked_as_errors_of_the_data():
-    bench = Bench()
+def test_what_follows_the_temperature_of_static_trials_is_told():
+    def warming(bench):
+        return {2: np.outer(bench.trials[-1].temperature, np.full(4, 3.0))}
+
+    location, first, _ = located(5, warming)
+    assert (first.trials, first.dependence) == ("static", "temperature")
+    assert any(cell.statistic == "temperature" and cell.significant for cell in location.cells)
+
+
+@pytest.fixture(scope="module")
+def spiky():
+    """Residuals with three spikes in a trial."""
     spikes = np.zeros((300, 4))
     spikes[[20, 150, 280], [0, 2, 2]] = 30.0
-    told = bench.fit(np.random.default_rng(4), extra={1: spikes})
-    assert any("g1 (1), g3 (2)" in remark for remark in outlier_remarks(told))
-    assert not outlier_remarks(bench.fit(np.random.default_rng(4)))
-    # beside a gap a sample has no neighbours, and where the model is off many are far out
-    item = told.trials[1]
-    used = item.used.copy()
+    return Bench().fit(np.random.default_rng(4), extra={1: spikes})
+
+
+def test_outliers_are_remarked_as_errors_of_the_data(spiky):
+    assert any("g1 (1), g3 (2)" in remark for remark in outlier_remarks(spiky))
+    assert not outlier_remarks(Bench().fit(np.random.default_rng(4)))
+
+
+def test_a_sample_without_neighbours_is_no_outlier(spiky):
+    """As it is beside a gap."""
+    residuals = spiky.trials[1]
+    used = residuals.used.copy()
     used[[19, 21, 149, 151, 279, 281]] = False
-    gaps = replace(item, trial=replace(item.trial, used=used))
-    assert not outlier_remarks(replace(told, trials=(gaps,)))
-    off = replace(item, residual=item.residual + 20.0 * item.noise_deviation)
-    assert not outlier_remarks(replace(told, trials=(off,)))
+    gaps = replace(residuals, trial=replace(residuals.trial, used=used))
+    assert not outlier_remarks(replace(spiky, trials=(gaps,)))
+
+
+def test_where_the_model_is_off_many_samples_are_far_out_and_none_is_an_outlier(spiky):
+    residuals = spiky.trials[1]
+    off = replace(residuals, residual=residuals.residual + 20.0 * residuals.noise_deviation)
+    assert not outlier_remarks(replace(spiky, trials=(off,)))
 
 
 def test_where_the_model_is_far_off_no_cell_is_judged():
@@ -177,58 +238,86 @@ def test_where_the_model_is_far_off_no_cell_is_judged():
     assert any("no cell of the map can be judged" in remark for remark in found.remarks)
 
 
-def test_what_noise_records_say():
-    """Without one nothing absolute is said; residuals below it, and a line in it, are no gap."""
-    fitted = Bench().fit(np.random.default_rng(1))
-    found = locate(with_noise(fitted, None))
-    assert np.isnan(found.tests[0].p_value)
-    assert "No noise record for g1" in found.remarks[0]
-    assert not found.disagrees
-    assert not any(cell.statistic == "variance" for cell in found.cells)
-    quiet = tuple(replace(item, noise_deviation=3.0 * item.noise_deviation) for item in fitted.trials)
-    found = locate(replace(fitted, trials=quiet))
-    assert any("smaller than their noise record allows" in remark for remark in found.remarks)
-    assert not found.disagrees
+def test_without_a_noise_record_nothing_absolute_is_said():
+    location = locate(with_noise(Bench().fit(np.random.default_rng(1)), None))
+    assert np.isnan(location.tests[0].p_value)
+    assert "No noise record for g1" in location.remarks[0]
+    assert not any(cell.statistic == "variance" for cell in location.cells)
 
+
+def test_without_a_noise_record_there_is_no_gap():
+    location = locate(with_noise(Bench().fit(np.random.default_rng(1)), None))
+    assert not location.disagrees
+
+
+def test_residuals_below_the_noise_record_are_remarked_on_and_no_gap():
+    fitted = Bench().fit(np.random.default_rng(1))
+    quiet = tuple(replace(item, noise_deviation=3.0 * item.noise_deviation) for item in fitted.trials)
+    location = locate(replace(fitted, trials=quiet))
+    assert any("smaller than their noise record allows" in remark for remark in location.remarks)
+    assert not location.disagrees
+
+
+def test_a_line_that_the_noise_record_holds_too_is_no_gap():
     bench, generator = Bench(), np.random.default_rng(9)
-    samples = 2.0 * generator.standard_normal(400) + 1.5 * np.cos(2 * np.pi * 17.0 * 0.01 * np.arange(400))
+    line = 1.5 * np.cos(2 * np.pi * 17.0 * 0.01 * np.arange(400))
+    samples = 2.0 * generator.standard_normal(400) + line
     record = NoiseRecord(float(samples.std()), 399.0, samples, 0.01, "pre-trigger")
     fitted = bench.fit(generator, extra=in_releases(np.full(4, 1.5), hum)(bench))
-    trials = tuple(replace(i, noise_deviation=np.full(4, samples.std())) for i in fitted.trials)
-    found = locate(with_noise(replace(fitted, trials=trials), record))
-    assert any("holds a line at 17 Hz" in remark for remark in found.remarks)
-    assert not found.disagrees
+    deviation = np.full(4, samples.std())
+    trials = tuple(replace(item, noise_deviation=deviation) for item in fitted.trials)
+    location = locate(with_noise(replace(fitted, trials=trials), record))
+    assert any("holds a line at 17 Hz" in remark for remark in location.remarks)
+    assert not location.disagrees
 
 
-def test_the_same_seed_gives_the_same_bits_and_held_out_trials_do_not_count():
+@pytest.fixture(scope="module")
+def error_in_held_out():
+    """Residuals with an error in the trial that is held out."""
     bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
-    fitted = bench.fit(np.random.default_rng(2), extra={1: np.full(4, 50.0)})
-    first, second = locate(fitted, seed=5), locate(fitted, seed=5)
+    return bench.fit(np.random.default_rng(2), extra={1: np.full(4, 50.0)})
+
+
+def test_the_same_seed_gives_the_same_bits(error_in_held_out):
+    first, second = locate(error_in_held_out, seed=5), locate(error_in_held_out, seed=5)
     assert first.tests == second.tests
-    assert [c.p_value for c in first.cells] == [c.p_value for c in second.cells]
-    assert not first.disagrees
-    assert "release 2" not in {cell.trial for cell in first.cells}
+    assert [cell.p_value for cell in first.cells] == [cell.p_value for cell in second.cells]
+
+
+def test_held_out_trials_do_not_count(error_in_held_out):
+    location = locate(error_in_held_out, seed=5)
+    assert not location.disagrees
+    assert "release 2" not in {cell.trial for cell in location.cells}
+
+
+def test_a_campaign_in_which_every_trial_is_held_out_is_refused(error_in_held_out):
+    held_out = replace(error_in_held_out, trials=error_in_held_out.trials[1:2])
     with pytest.raises(FitError, match="every trial is held out"):
-        locate(replace(fitted, trials=fitted.trials[1:2]))
+        locate(held_out)
 
 
-def test_one_channel_and_few_static_points():
+def test_one_channel_of_few_static_points_is_located():
     fitted = Bench().fit(np.random.default_rng(2))
-    item = fitted.trials[-1]
-    kept = item.trial.rows(np.arange(len(item.trial.time)) < 3)
-    trial = replace(kept, channels=("g1",), values=kept.values[:, :1], used=kept.used[:, :1])
-    cut = ("prediction", "residual", "predictive_deviation", "leverage", "sensitivity")
-    part = {key: getattr(item, key)[:3, :1] for key in cut}
-    small = replace(item, trial=trial, noise_deviation=item.noise_deviation[:1], **part)
-    found = locate(replace(fitted, trials=(small,)))
-    assert not found.disagrees
-    assert not found.disagreements
-    assert all(np.isfinite(cell.p_value) for cell in found.cells)
-    # a quarter of a record that does not count leaves a bin of time empty
-    item = fitted.trials[0]
-    used = item.used & (np.arange(len(item.used)) >= len(item.used) // 4)[:, None]
-    late = replace(fitted, trials=(replace(item, trial=replace(item.trial, used=used)),))
-    assert min(cell.count for cell in locate(late).cells if cell.axis == "time") > 0
+    residuals = fitted.trials[-1]
+    rows = residuals.trial.rows(np.arange(len(residuals.trial.time)) < 3)
+    trial = replace(rows, channels=("g1",), values=rows.values[:, :1], used=rows.used[:, :1])
+    names = ("prediction", "residual", "predictive_deviation", "leverage", "sensitivity")
+    small = {name: getattr(residuals, name)[:3, :1] for name in names}
+    item = replace(residuals, trial=trial, noise_deviation=residuals.noise_deviation[:1], **small)
+    location = locate(replace(fitted, trials=(item,)))
+    assert not location.disagrees
+    assert not location.disagreements
+    assert all(np.isfinite(cell.p_value) for cell in location.cells)
+
+
+def test_a_bin_of_time_without_a_sample_is_no_cell():
+    """A quarter of the record does not count."""
+    fitted = Bench().fit(np.random.default_rng(2))
+    residuals = fitted.trials[0]
+    is_late = np.arange(len(residuals.used)) >= len(residuals.used) // 4
+    trial = replace(residuals.trial, used=residuals.used & is_late[:, None])
+    location = locate(replace(fitted, trials=(replace(residuals, trial=trial),)))
+    assert min(cell.count for cell in location.cells if cell.axis == "time") > 0
 
 
 def test_harmonics_of_a_motion_are_those_of_its_phase():
@@ -322,7 +411,6 @@ def _viscous(zeta=0.01, f=5.0, size=1.0):
 
 
 def test_two_modes_are_separated():
-    """A mode that dies away is dropped, the other goes on; pure noise gives no points."""
     drift = 0.2 - 0.01 * TIME
     first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5) + drift, (4.9, 7.5))
     np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
@@ -330,23 +418,43 @@ def test_two_modes_are_separated():
     np.testing.assert_allclose(first.amplitude, np.exp(-0.01 * OMEGA * first.time), rtol=1e-3)
     np.testing.assert_allclose(second.frequency, 7.3, rtol=1e-5)
     np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
+
+
+@pytest.fixture(scope="module", params=[None, 0.01], ids=["unknown noise", "known noise"])
+def mode_that_dies_away(request):
+    """The backbones of a mode that goes on, and of one that dies away in noise."""
     noise = np.random.default_rng(3).standard_normal(TIME.size)
     signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * noise
-    for known in (None, 0.01):
-        first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=known)
-        # errors are those that are made
-        for curve, frequency, ratio in ((first, 5.0, 0.01), (second, 30.0, 0.03)):
-            size = np.exp(-2.0 * np.pi * frequency * ratio * curve.time)
-            for of, true in (("frequency", frequency), ("damping_ratio", ratio), ("amplitude", size)):
-                error = (getattr(curve, of) - true) / getattr(curve, f"{of}_error")
-                assert 0.2 < np.mean(error**2) < 3.0
+    return backbones(TIME, signal, (5.0, 30.0), noise_deviation=request.param)
+
+
+def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on(mode_that_dies_away):
+    first, second = mode_that_dies_away
     assert second.time[-1] < 3.0 < 8.0 < first.time[-1]
     assert np.all(second.amplitude > 4.0 * second.amplitude_error)
     np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)
-    assert backbones(TIME[:600], noise[:600], (5.0,), noise_deviation=1.0)[0].time.size == 0
-    for periods, words in ((0.1, "at least 12"), (500.0, "the record's length")):
-        with pytest.raises(FitError, match=words):
-            backbones(TIME, _viscous(), (5.0,), periods=periods)
+
+
+def test_noise_alone_has_no_backbone():
+    noise = np.random.default_rng(3).standard_normal(TIME.size)
+    (curve,) = backbones(TIME[:600], noise[:600], (5.0,), noise_deviation=1.0)
+    assert curve.time.size == 0
+
+
+@pytest.mark.parametrize(("periods", "sentence"), [(0.1, "at least 12"), (500.0, "the record's length")])
+def test_a_window_that_is_too_short_or_too_long_is_refused(periods, sentence):
+    with pytest.raises(FitError, match=sentence):
+        backbones(TIME, _viscous(), (5.0,), periods=periods)
+
+
+@pytest.mark.parametrize(("mode", "frequency", "ratio"), [(0, 5.0, 0.01), (1, 30.0, 0.03)])
+def test_errors_of_a_backbone_are_those_that_are_made(mode_that_dies_away, mode, frequency, ratio):
+    curve = mode_that_dies_away[mode]
+    amplitude = np.exp(-2.0 * np.pi * frequency * ratio * curve.time)
+    truth = {"frequency": frequency, "damping_ratio": ratio, "amplitude": amplitude}
+    for name, true_value in truth.items():
+        error = (getattr(curve, name) - true_value) / getattr(curve, f"{name}_error")
+        assert 0.2 < np.mean(error**2) < 3.0
 
 
 def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
