@@ -122,39 +122,77 @@ def ends(*columns):
     ]
 
 
-@pytest.mark.parametrize("place", [0, 1, 2, 197, 198, 199])
-def test_a_wrong_reading_is_found_at_the_ends(place):
-    first, second = np.random.default_rng(1).standard_normal((2, 200))
+@pytest.fixture
+def two_columns():
+    """Two columns of noise of 200 readings."""
+    return np.random.default_rng(1).standard_normal((2, 200))
+
+
+ENDS = pytest.mark.parametrize("place", [0, 1, 2, 197, 198, 199])
+
+
+@ENDS
+def test_a_wrong_reading_is_found_at_the_ends(two_columns, place):
+    first, second = two_columns
     second[place] += 20.0
     assert ends(first, second) == [(place, 1)]
-    # in several channels at once, or within the record, it is no single reading at an end
-    first[place] += 20.0
-    assert ends(first, second) == []
-    second[100] += 20.0
+
+
+@ENDS
+def test_a_reading_that_is_off_in_several_channels_is_no_single_reading(two_columns, place):
+    two_columns[:, place] += 20.0
+    assert ends(*two_columns) == []
+
+
+@ENDS
+def test_a_wrong_reading_within_the_record_is_not_one_at_its_end(two_columns, place):
+    _, second = two_columns
+    second[[place, 100]] += 20.0
     assert ends(second) == [(place, 0)]
-    second[100:] *= 30.0 if place < 100 else 1.0  # the roughness at its own end counts
-    second[:100] *= 30.0 if place > 100 else 1.0
+
+
+@ENDS
+def test_the_roughness_at_its_own_end_counts(two_columns, place):
+    _, second = two_columns
+    second[place] += 20.0
+    other_half = slice(100, None) if place < 100 else slice(100)
+    second[other_half] *= 30.0
     assert ends(second) == [(place, 0)]
+
+
+TIME = np.arange(1000) / 200.0
+
+
+def decaying_modes(generator):
+    """Return waves of fast modes that decay, each with a phase of its own."""
+    wave = np.zeros(1000)
+    for frequency in (5.6, 20.0, 35.0, 60.0):
+        angle = 2.0 * np.pi * frequency * TIME
+        amplitude, phase = generator.uniform(10.0, 60.0), generator.uniform(0.0, 6.0)
+        wave += amplitude * np.exp(-0.02 * angle) * np.cos(angle + phase)
+    return wave
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_what_a_wrong_model_leaves_has_no_wrong_ends(seed):
-    """Noise, waves of fast modes that decay, spikes of contact, steps; a record too short to judge."""
+    """Waves of fast modes that decay, spikes of contact, and a step."""
     generator = np.random.default_rng(seed)
-    time = np.arange(1000) / 200.0
-    wave = sum(
-        generator.uniform(10.0, 60.0) * np.exp(-0.02 * 2.0 * np.pi * f * time)
-        * np.cos(2.0 * np.pi * f * time + generator.uniform(0.0, 6.0))
-        for f in (5.6, 20.0, 35.0, 60.0)
-    )  # fmt: skip
-    spikes = np.where(np.arange(1000) % 18 == 4, 30.0 * np.exp(-time), 0.0)
-    step = np.where(time > 0.01, 40.0, 0.0)
-    for signal in (wave, spikes, step):
+    spikes = np.where(np.arange(1000) % 18 == 4, 30.0 * np.exp(-TIME), 0.0)
+    step = np.where(TIME > 0.01, 40.0, 0.0)
+    for signal in (decaying_modes(generator), spikes, step):
         assert ends(signal + generator.standard_normal(1000)) == []
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_has_no_wrong_ends_and_hardly_an_outlier(seed):
+    generator = np.random.default_rng(seed)
     for _ in range(5):
         noise = generator.standard_normal((3, 600))
         assert ends(*noise) == []
         assert sample_outliers(noise[0]).sum() <= 1
         assert not sample_outliers(noise[0, :5]).any()
+
+
+def test_a_record_that_is_constant_or_too_short_has_no_wrong_readings():
     assert not sample_outliers(np.zeros(50)).any()
     assert ends(np.array([30.0, 0.1, -0.2, 0.1, 0.0, 0.2, -0.1])) == []

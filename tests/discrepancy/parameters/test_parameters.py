@@ -77,31 +77,65 @@ def spring(force, p):
 PRIORS = ((1.0, 0.2, -3.0, 5.0), (0.5, 0.3, -3.0, 4.0))
 
 
-def test_a_linear_model_has_the_posterior_of_the_closed_form(tmp_path):
-    values = noisy(line, 1.1, 0.7, seed=3)
-    found = calibrate_parameters(campaign_of(values), choice_of(line, *PRIORS), samples=20_000, seed=4)
-    design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
-    mean, precision = np.array([1.0, 0.5]), np.diag([0.2**-2, 0.3**-2])
-    covariance = np.linalg.inv(precision + design.T @ design / NOISE**2)
-    expected = covariance @ (precision @ mean + design.T @ values / NOISE**2)
-    deviation = np.sqrt(np.diag(covariance))
-    assert found.procedure == "Gaussian"
-    np.testing.assert_allclose(found.samples.mean(axis=0), expected, atol=0.03 * deviation.min())
-    np.testing.assert_allclose(np.cov(found.samples, rowvar=False), covariance, rtol=0.04)
-    prior = 0.5 * (np.trace(precision @ covariance) - 2.0 - np.linalg.slogdet(precision @ covariance)[1])
-    shift = expected - mean
-    assert found.information == pytest.approx(prior + 0.5 * shift @ precision @ shift, rel=0.02)
-    assert found.explained is True
-    assert found.channels[0].before > 5.0 > 1.5 > found.channels[0].after
-    # what is drawn together stays together
-    given = found.given("p1", found.mean("p1") + np.array([-0.01, 0.0, 0.01]))["p2"]
-    slope = np.cov(found.samples, rowvar=False)[0, 1] / found.samples[:, 0].var()
-    np.testing.assert_allclose(np.diff(given), 0.01 * slope, rtol=1e-3)
-    # the file holds all of it
-    again = load_calibration(save_calibration(found, tmp_path / "c.nc"))
-    np.testing.assert_array_equal(again.samples, found.samples)
-    assert (again.priors, again.channels) == (found.priors, found.channels)
-    assert result_bytes(again) == result_bytes(found)
+class LinearPosterior:
+    """The posterior of a linear model by its calibration, and in closed form."""
+
+    def __init__(self):
+        values = noisy(line, 1.1, 0.7, seed=3)
+        choice = choice_of(line, *PRIORS)
+        self.calibration = calibrate_parameters(campaign_of(values), choice, samples=20_000, seed=4)
+        design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
+        self.prior_mean = np.array([1.0, 0.5])
+        self.prior_precision = np.diag([0.2**-2, 0.3**-2])
+        self.covariance = np.linalg.inv(self.prior_precision + design.T @ design / NOISE**2)
+        weighted_readings = self.prior_precision @ self.prior_mean + design.T @ values / NOISE**2
+        self.mean = self.covariance @ weighted_readings
+
+    def information(self):
+        """Return the divergence of the posterior from the prior."""
+        ratio = self.prior_precision @ self.covariance
+        shift = self.mean - self.prior_mean
+        by_spread = 0.5 * (np.trace(ratio) - 2.0 - np.linalg.slogdet(ratio)[1])
+        return by_spread + 0.5 * shift @ self.prior_precision @ shift
+
+
+@pytest.fixture(scope="module")
+def linear_posterior():
+    return LinearPosterior()
+
+
+def test_a_linear_model_has_the_posterior_of_the_closed_form(linear_posterior):
+    calibration, covariance = linear_posterior.calibration, linear_posterior.covariance
+    tolerance = 0.03 * np.sqrt(np.diag(covariance)).min()
+    assert calibration.procedure == "Gaussian"
+    np.testing.assert_allclose(calibration.samples.mean(axis=0), linear_posterior.mean, atol=tolerance)
+    np.testing.assert_allclose(np.cov(calibration.samples, rowvar=False), covariance, rtol=0.04)
+
+
+def test_the_information_of_a_calibration_is_the_divergence_from_its_prior(linear_posterior):
+    expected = linear_posterior.information()
+    assert linear_posterior.calibration.information == pytest.approx(expected, rel=0.02)
+
+
+def test_a_right_model_is_explained_by_its_parameters(linear_posterior):
+    (channel,) = linear_posterior.calibration.channels
+    assert linear_posterior.calibration.explained is True
+    assert channel.before > 5.0 > 1.5 > channel.after
+
+
+def test_parameters_that_are_drawn_together_stay_together(linear_posterior):
+    calibration = linear_posterior.calibration
+    values = calibration.mean("p1") + np.array([-0.01, 0.0, 0.01])
+    slope = np.cov(calibration.samples, rowvar=False)[0, 1] / calibration.samples[:, 0].var()
+    np.testing.assert_allclose(np.diff(calibration.given("p1", values)["p2"]), 0.01 * slope, rtol=1e-3)
+
+
+def test_the_file_of_a_calibration_holds_all_of_it(linear_posterior, tmp_path):
+    calibration = linear_posterior.calibration
+    again = load_calibration(save_calibration(calibration, tmp_path / "c.nc"))
+    np.testing.assert_array_equal(again.samples, calibration.samples)
+    assert (again.priors, again.channels) == (calibration.priors, calibration.channels)
+    assert result_bytes(again) == result_bytes(calibration)
 
 
 def on_grid(law, values, priors):
@@ -141,7 +175,7 @@ def ridge(force, p):
     return force / 10.0 * p[0] * p[1] + 0.5 * (force / 40.0) ** 2 * p[2]
 
 
-@pytest.mark.parametrize(
+CUT_OFF = pytest.mark.parametrize(
     ("procedure", "law", "truth", "priors"),
     [
         ("Gaussian", line, (1.1, 0.7), ((1.0, 0.2, -3.0, 1.098), PRIORS[1])),
@@ -161,34 +195,55 @@ def ridge(force, p):
         ),
     ],
 )
+
+
+@CUT_OFF
 def test_ranges_cut_off_the_posterior(procedure, law, truth, priors):
     values = noisy(law, *truth, seed=3)
-    found = calibrate_parameters(campaign_of(values), choice_of(law, *priors), samples=20_000)
-    assert found.procedure == procedure
-    assert not any("settled" in sentence for sentence in found.findings)
-    for place, (middle, spread) in enumerate(on_grid(law, values, priors), start=1):
-        assert found.mean(f"p{place}") == pytest.approx(middle, abs=0.03 * spread)
-        assert found.standard_deviation(f"p{place}") == pytest.approx(spread, rel=0.03)
+    calibration = calibrate_parameters(campaign_of(values), choice_of(law, *priors), samples=20_000)
+    is_settled = not any("settled" in sentence for sentence in calibration.findings)
+    assert (calibration.procedure, is_settled) == (procedure, True)
+    for number, (mean, deviation) in enumerate(on_grid(law, values, priors), start=1):
+        assert calibration.mean(f"p{number}") == pytest.approx(mean, abs=0.03 * deviation)
+        assert calibration.standard_deviation(f"p{number}") == pytest.approx(deviation, rel=0.03)
 
 
-def test_one_parameter_is_integrated_as_densely_as_one_likes():
-    """Two readings with much noise, a prior that is cut off, noise known from few degrees of freedom."""
+@pytest.fixture(scope="module")
+def noisy_spring():
+    """Readings of a spring with much noise, and their calibration.
+
+    The prior is cut off, and the noise is known from few degrees of freedom.
+    """
     values = spring(FORCE, [0.7]) + 60.0 * NOISE * np.sin(FORCE)
     campaign = campaign_of(values, freedom=4, p1=(1.0, 0.6))
-    found = calibrate_parameters(campaign, choice_of(spring, (1.0, 0.1, 0.72, 3.0)), samples=20_000)
-    assert found.procedure == "quadrature"
+    choice = choice_of(spring, (1.0, 0.1, 0.72, 3.0))
+    return values, calibrate_parameters(campaign, choice, samples=20_000)
+
+
+def test_one_parameter_is_integrated_as_densely_as_one_likes(noisy_spring):
+    values, calibration = noisy_spring
     grid = np.linspace(0.72, 3.0, 200_001)
-    residual = sum(((v - f / 10.0 / grid) / NOISE) ** 2 for f, v in zip(FORCE, values, strict=True))
-    log = -0.5 * (4 + len(FORCE)) * np.log1p(residual / 4) - 0.5 * ((grid - 1.0) / 0.6) ** 2
-    mass = np.cumsum(np.exp(log - log.max()))
-    for share in (0.05, 0.25, 0.5, 0.75, 0.95):
-        expected = grid[np.searchsorted(mass, share * mass[-1])]
-        assert np.quantile(found.samples, share) == pytest.approx(expected, abs=2e-4)
-    assert found.priors[0].stated_by == "the campaign"
-    assert found.explained is False
-    said = " ".join(found.findings)
-    assert "end of its range" in said
-    assert "not explained by these parameters" in said
+    squares = sum(((v - f / 10.0 / grid) / NOISE) ** 2 for f, v in zip(FORCE, values, strict=True))
+    log_likelihood = -0.5 * (4 + len(FORCE)) * np.log1p(squares / 4)
+    log_posterior = log_likelihood - 0.5 * ((grid - 1.0) / 0.6) ** 2
+    mass = np.cumsum(np.exp(log_posterior - log_posterior.max()))
+    assert calibration.procedure == "quadrature"
+    for probability in (0.05, 0.25, 0.5, 0.75, 0.95):
+        expected = grid[np.searchsorted(mass, probability * mass[-1])]
+        assert np.quantile(calibration.samples, probability) == pytest.approx(expected, abs=2e-4)
+
+
+def test_a_prior_of_the_campaign_is_stated_by_it(noisy_spring):
+    _, calibration = noisy_spring
+    assert calibration.priors[0].stated_by == "the campaign"
+
+
+def test_readings_that_the_parameters_do_not_explain_are_found(noisy_spring):
+    _, calibration = noisy_spring
+    findings = " ".join(calibration.findings)
+    assert calibration.explained is False
+    assert "end of its range" in findings
+    assert "not explained by these parameters" in findings
 
 
 @pytest.mark.parametrize("recorded", [True, False])
@@ -212,25 +267,46 @@ def test_the_colour_of_the_noise_is_no_gap_where_its_record_has_it(monkeypatch, 
     assert calibrate_parameters(campaign, choice, samples=20).explained is recorded
 
 
-def test_what_is_not_told_is_said():
-    def tied(force, p):
+@pytest.fixture(scope="module")
+def tied():
+    """A calibration of two parameters of which the sum is told, and of one that does nothing."""
+
+    def tied_law(force, p):
         return force / 10.0 * (p[0] + p[1]) + 0.0 * p[2]
 
     prior = (1.0, 0.1, 0.2, 2.0)
-    campaign = campaign_of(noisy(tied, 1.0, 1.0, 1.0, seed=5))
-    found = calibrate_parameters(campaign, choice_of(tied, prior, prior, prior), samples=2000)
-    assert found.kept_share("p3") == pytest.approx(1.0, abs=0.05)
-    said = " ".join(found.findings)
-    assert "does not tell p3: " in said
-    assert "does not tell p1" not in said  # half of its variance is gone
-    assert "p1 and p2 are told together and hardly apart" in said
-    # one that is not told keeps its prior as it is cut off
-    found = calibrate_parameters(campaign_of(noisy(weak, 1.02, 2.6, seed=2)), choice_of(weak, *WEAK))
-    assert np.sum((found.samples[:, 1] == 1.25) | (found.samples[:, 1] == 3.75)) == 0
-    assert found.kept_share("p2") == pytest.approx(1.0, abs=0.05)
-    said = " ".join(found.findings)
-    assert "does not tell p2: " in said
-    assert "reaches the end" not in said
+    campaign = campaign_of(noisy(tied_law, 1.0, 1.0, 1.0, seed=5))
+    return calibrate_parameters(campaign, choice_of(tied_law, prior, prior, prior), samples=2000)
+
+
+def test_a_parameter_that_is_not_told_is_said(tied):
+    """Of the first one half of the variance is gone."""
+    findings = " ".join(tied.findings)
+    assert tied.kept_share("p3") == pytest.approx(1.0, abs=0.05)
+    assert "does not tell p3: " in findings
+    assert "does not tell p1" not in findings
+
+
+def test_parameters_that_are_told_together_are_said(tied):
+    assert "p1 and p2 are told together and hardly apart" in " ".join(tied.findings)
+
+
+@pytest.fixture(scope="module")
+def weakly_told():
+    """A calibration of a parameter that is told, and of one that is not, with ranges that cut them off."""
+    return calibrate_parameters(campaign_of(noisy(weak, 1.02, 2.6, seed=2)), choice_of(weak, *WEAK))
+
+
+def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(weakly_told):
+    samples = weakly_told.samples[:, 1]
+    assert np.sum((samples == 1.25) | (samples == 3.75)) == 0
+    assert weakly_told.kept_share("p2") == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_parameter_that_is_not_told_does_not_reach_the_end_of_its_range(weakly_told):
+    findings = " ".join(weakly_told.findings)
+    assert "does not tell p2: " in findings
+    assert "reaches the end" not in findings
 
 
 @pytest.mark.parametrize(
@@ -258,20 +334,37 @@ def test_where_a_truth_lies_beyond(truth, prior, refused_beyond, words, said):
     assert (words in " ".join(found.findings)) is said
 
 
-def test_several_maxima_are_told():
-    def even(force, p):
-        return force / 10.0 * p[0] ** 2 + 0.5 * p[1]
+def even(force, p):
+    """Return a law in which the sign of the first parameter cannot be told."""
+    return force / 10.0 * p[0] ** 2 + 0.5 * p[1]
 
-    priors = ((0.05, 1.0, -5.0, 5.0), (0.0, 0.1, -1.0, 1.0))
-    campaign = campaign_of(noisy(even, 0.8, 0.0, seed=6))
-    found = calibrate_parameters(campaign, choice_of(even, *priors), samples=4000)
-    assert found.procedure == "several optima"
-    assert any("has 2 maxima" in sentence for sentence in found.findings)
-    ratio = np.exp(-0.5 * (0.75**2 - 0.85**2))  # equal likelihoods: the prior weighs them
-    assert np.mean(found.samples[:, 0] > 0.0) == pytest.approx(ratio / (1.0 + ratio), abs=0.03)
-    np.testing.assert_allclose(np.abs(found.samples[:, 0]).mean(), 0.8, atol=0.01)
-    few = calibrate_parameters(campaign, choice_of(even, (0.3, 0.7, -5.0, 5.0), priors[1]), samples=4)
-    assert few.procedure == "several optima"  # of which the lesser has no draw
+
+EVEN_READINGS = noisy(even, 0.8, 0.0, seed=6)
+SMALL_OFFSET = (0.0, 0.1, -1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def two_maxima():
+    choice = choice_of(even, (0.05, 1.0, -5.0, 5.0), SMALL_OFFSET)
+    return calibrate_parameters(campaign_of(EVEN_READINGS), choice, samples=4000)
+
+
+def test_several_maxima_are_told(two_maxima):
+    assert two_maxima.procedure == "several optima"
+    assert any("has 2 maxima" in sentence for sentence in two_maxima.findings)
+
+
+def test_the_prior_weighs_maxima_of_equal_likelihood(two_maxima):
+    first = two_maxima.samples[:, 0]
+    ratio = np.exp(-0.5 * (0.75**2 - 0.85**2))
+    assert np.mean(first > 0.0) == pytest.approx(ratio / (1.0 + ratio), abs=0.03)
+    np.testing.assert_allclose(np.abs(first).mean(), 0.8, atol=0.01)
+
+
+def test_of_few_samples_the_lesser_maximum_may_have_none():
+    choice = choice_of(even, (0.3, 0.7, -5.0, 5.0), SMALL_OFFSET)
+    few = calibrate_parameters(campaign_of(EVEN_READINGS), choice, samples=4)
+    assert few.procedure == "several optima"
     np.testing.assert_allclose(few.samples[:, 0], 0.8, atol=0.02)
 
 
