@@ -77,38 +77,70 @@ def laboratory(tmp_path_factory):
     return folder
 
 
-def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
-    """Run, apply, run again, each in another folder: nothing is missing any more."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(laboratory / "verdict", "verdicts/copy")
-    first, then = run("apply", "verdicts/copy").splitlines()
-    assert first == "rig_patched.toml: Geometric (cubic) stiffness at slide, named."
-    text = (tmp_path / "rig_patched.toml").read_text(encoding="utf-8")
-    assert text.startswith("# Geometric (cubic) stiffness at slide, named.")
-    content = tomllib.loads(text)
-    (law,) = content["law"]
+class CommandLineRoundTrip:
+    """A verdict is applied and its campaign run again, each in another folder, as a user does."""
+
+    def __init__(self, laboratory, folder):
+        self.folder = folder
+        self.stored = uav_twin.read_verdict(laboratory / "verdict")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            shutil.copytree(laboratory / "verdict", "verdicts/copy")
+            self.first_line, next_line = run("apply", "verdicts/copy").splitlines()
+            self.words = shlex.split(next_line.removeprefix("Next: uav-twin discrepancy "))
+            self.printed = run(*self.words, "--no-report")
+        self.text = (folder / "rig_patched.toml").read_text(encoding="utf-8")
+        self.model = tomllib.loads(self.text)
+
+
+@pytest.fixture(scope="module")
+def round_trip(laboratory, tmp_path_factory):
+    return CommandLineRoundTrip(laboratory, tmp_path_factory.mktemp("round_trip"))
+
+
+def test_a_patched_model_says_what_it_was_patched_with(round_trip):
+    sentence = "Geometric (cubic) stiffness at slide, named."
+    (law,) = round_trip.model["law"]
+    assert round_trip.first_line == f"rig_patched.toml: {sentence}"
+    assert round_trip.text.startswith(f"# {sentence}")
     assert (law["kind"], law["port"]) == ("power_stiffness", "slide")
+
+
+def test_a_patched_model_has_the_parameters_of_its_verdict(round_trip):
+    """The prior's deviation is 0.02."""
+    parameters = round_trip.stored.verdict.parameters
+    rows = [(row["name"], row["mean"], row["deviation"]) for row in round_trip.model["parameter"]]
+    assert rows == [(item.name, item.mean, item.deviation) for item in parameters]
+    assert parameters[0].deviation < 0.02
+
+
+def test_of_a_patched_model_nothing_is_missing_any_more(round_trip):
+    end = ["--model", "rig_patched.toml", "--out", "verdicts/lab_rig_patched"]
+    assert round_trip.words[-4:] == end
+    assert "Verdict: nothing missing" in round_trip.printed
+    assert "apply" not in round_trip.printed
+
+
+def test_a_verdict_of_nothing_missing_is_not_applied(round_trip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = round_trip.folder / round_trip.words[-1]
+    sentence = run("apply", folder, "--out", "more.json", failed=True)
+    assert "nothing is missing, and the model stands as it is" in sentence
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_of_a_verdict_repeats_the_run_in_any_folder(laboratory, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     stored = uav_twin.read_verdict(laboratory / "verdict")
-    assert [(row["name"], row["mean"], row["deviation"]) for row in content["parameter"]] == [
-        (item.name, item.mean, item.deviation) for item in stored.verdict.parameters
-    ]
-    assert stored.verdict.parameters[0].deviation < 0.02  # the prior's
-    words = shlex.split(then.removeprefix("Next: uav-twin discrepancy "))
-    assert words[-4:] == ["--model", "rig_patched.toml", "--out", "verdicts/lab_rig_patched"]
-    said = run(*words, "--no-report")
-    assert "Verdict: nothing missing" in said
-    assert "apply" not in said
-    assert "nothing is missing, and the model stands as it is" in run(
-        "apply", words[-1], "--out", "more.json", failed=True
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig_patched.toml", "verdicts"]
-    # the command of a verdict repeats the run in any folder
     run(*shlex.split(stored.origin.command)[2:], "--no-report")
     once, again = (
         json.loads((folder / "verdict.json").read_text(encoding="utf-8"))
         for folder in (laboratory / "verdict", tmp_path / "verdicts" / "lab")
     )
     assert once == again
+
+
+def test_the_command_of_a_verdict_of_a_flight_gets_another_model():
     command = "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --model own.toml --seed 0"
     assert _command_with_model(command, Path("two/one.json")) == (
         "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --seed 0 --model two/one.json "
@@ -116,130 +148,249 @@ def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("kind", ["FMU", "structure", "wing"])
-def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
-    """A patch beside the model's own file is a model itself, refused once that file has changed."""
-    file = tmp_path / "rig.toml"
-    if kind == "FMU":
-        shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
-        file = fmu_rig(tmp_path, "rig.fmu")
-    elif kind == "structure":
-        file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
-    choice = choose_model(None if kind == "wing" else file)
-    ports = choice.model.ports
-    port = "tip" if "tip" in ports else ports[0]
-    hidden = "cubic_stiffness", CUBIC, port
-    campaign = simulated(choice.model, "static", 3, hidden, tmp_path / "campaign")
-    found = verdict_of(choice, campaign, SPRING, tmp_path / "verdict")
-    assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
-    applied = uav_twin.apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
+class PythonRoundTrip:
+    """A model with a hidden cubic spring: its verdict, and the model that is patched by it."""
+
+    def __init__(self, kind, file, folder):
+        self.kind, self.file, self.folder = kind, file, folder
+        choice = choose_model(file)
+        ports = choice.model.ports
+        hidden = ("cubic_stiffness", CUBIC, "tip" if "tip" in ports else ports[0])
+        self.campaign = simulated(choice.model, "static", 3, hidden, folder / "campaign")
+        self.verdict = verdict_of(choice, self.campaign, SPRING, folder / "verdict").verdict
+        self.applied = uav_twin.apply_verdict(folder / "verdict", folder / "patched.json")
+        self.patched = choose_model(self.applied.path)
+
+
+@pytest.fixture(scope="module", params=["FMU", "structure", "wing"])
+def python_round_trip(request, foreign_fmu, write_beam, tmp_path_factory):
+    folder, file = tmp_path_factory.mktemp("python"), None
+    if request.param == "FMU":
+        shutil.copy(foreign_fmu("rig2"), folder / "rig.fmu")
+        file = fmu_rig(folder, "rig.fmu")
+    elif request.param == "structure":
+        file = write_beam(folder, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
+    return PythonRoundTrip(request.param, file, folder)
+
+
+def test_a_patch_beside_the_file_of_a_model_is_a_model_itself(python_round_trip):
+    trip = python_round_trip
+    assert trip.verdict.kind is VerdictKind.NAMED, trip.verdict.sentence
+    assert len(trip.patched.model.patch)
+    assert trip.patched.model.patch == trip.verdict.effects[0].patch
+
+
+def test_a_model_that_is_patched_from_python_has_the_calibrated_parameters(python_round_trip):
+    trip = python_round_trip
+    for parameter, calibrated in zip(trip.patched.model.parameters, trip.verdict.parameters, strict=True):
+        assert (parameter.mean, parameter.deviation) == (calibrated.mean, calibrated.deviation)
+
+
+def test_an_applied_verdict_names_the_command_that_runs_again(python_round_trip):
     out = "'verdicts/a campaign_patched'"
-    assert applied.command.endswith(f"--model {tmp_path / 'patched.json'} --out {out}")
-    patched = choose_model(applied.path)
-    assert len(patched.model.patch)
-    assert patched.model.patch == found.verdict.effects[0].patch
-    for item, calibrated in zip(patched.model.parameters, found.verdict.parameters, strict=True):
-        assert (item.mean, item.deviation) == (calibrated.mean, calibrated.deviation)
-    again = verdict_of(patched, campaign, SPRING, tmp_path / "again")
-    assert again.verdict.kind is VerdictKind.NOTHING_MISSING, again.verdict.sentence
-    if kind == "wing":
-        left = tmp_path / "verdict" / "patch.json"
-        channels = read_patch(left).channels
-        assert "tip_displacement" in channels.values()
-        left.unlink()  # as for what leaves none: another member of a group, an unexplained gap
-        assert read_patch(apply_verdict(left.parent, tmp_path / "second.json").path).channels == channels
-        packed = read_fmu(apply_verdict(tmp_path / "verdict", tmp_path / "wing.fmu").path)
-        calibrated = {item.name: item.mean for item in found.verdict.parameters}
-        for name, wanted in (
-            ("effect.cubic_stiffness.active", 1.0),
-            ("young_modulus_factor", calibrated["young_modulus_factor"]),
-            ("damping.alpha", calibrated["damping_alpha"]),
+    file = python_round_trip.folder / "patched.json"
+    assert python_round_trip.applied.command.endswith(f"--model {file} --out {out}")
+
+
+def test_of_a_model_that_is_patched_from_python_nothing_is_missing(python_round_trip, tmp_path):
+    trip = python_round_trip
+    again = verdict_of(trip.patched, trip.campaign, SPRING, tmp_path / "again").verdict
+    assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence
+
+
+WING = pytest.mark.parametrize("python_round_trip", ["wing"], indirect=True)
+
+
+@WING
+def test_a_verdict_that_leaves_no_patch_has_its_channels(python_round_trip, tmp_path):
+    """As it is for another member of a group and for an unexplained gap."""
+    folder = shutil.copytree(python_round_trip.folder / "verdict", tmp_path / "verdict")
+    patch = folder / "patch.json"
+    channels = read_patch(patch).channels
+    patch.unlink()
+    applied = apply_verdict(folder, tmp_path / "second.json")
+    assert "tip_displacement" in channels.values()
+    assert read_patch(applied.path).channels == channels
+
+
+@WING
+def test_a_wing_is_packed_with_its_effects_and_calibrated_parameters(python_round_trip, tmp_path):
+    applied = apply_verdict(python_round_trip.folder / "verdict", tmp_path / "wing.fmu")
+    fmu = read_fmu(applied.path)
+    calibrated = {item.name: item.mean for item in python_round_trip.verdict.parameters}
+    starts = {
+        "effect.cubic_stiffness.active": 1.0,
+        "young_modulus_factor": calibrated["young_modulus_factor"],
+        "damping.alpha": calibrated["damping_alpha"],
+    }
+    assert {name: float(str(fmu.variable(name).start)) for name in starts} == starts
+
+
+@pytest.mark.parametrize(
+    ("python_round_trip", "change"),
+    [("FMU", ("high = 1.3", "high = 1.4")), ("structure", ("density = 2700", "density = 2710"))],
+    indirect=["python_round_trip"],
+)
+def test_a_patch_is_refused_once_the_file_of_its_model_has_changed(python_round_trip, change):
+    trip = python_round_trip
+    text = trip.file.read_text(encoding="utf-8")
+    trip.file.write_text(text.replace(*change), encoding="utf-8")
+    sentence = r"has changed since .* run `uav-twin discrepancy run` again"
+    try:
+        for use in (
+            lambda: choose_model(trip.applied.path),
+            lambda: apply_verdict(trip.folder / "verdict", "x.json"),
         ):
-            assert float(str(packed.variable(name).start)) == wanted
-        return
-    old, new = ("density = 2700", "density = 2710") if kind == "structure" else ("high = 1.3", "high = 1.4")
-    file.write_text(file.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
-    for call in (lambda: choose_model(applied.path), lambda: apply_verdict(tmp_path / "verdict", "x.json")):
-        with pytest.raises(ModelError, match=r"has changed since .* run `uav-twin discrepancy run` again"):
-            call()
+            with pytest.raises(ModelError, match=sentence):
+                use()
+    finally:
+        trip.file.write_text(text, encoding="utf-8")
 
 
-def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
-    """Of a static campaign that cannot tell a compliant root from a crack: the leading one, or another.
+ROOT_OR_CRACK = chosen("root_compliance", "breathing_crack")
 
-    Both say that they are no name, and close the gap.
-    """
-    monkeypatch.chdir(tmp_path)
-    choice = choose_model("three_mass_chain")
-    effects = chosen("root_compliance", "breathing_crack")
-    hidden = "root_compliance", {"compliance_share": 0.11}, ""
-    campaign = simulated(choice.model, "static", 3, hidden, tmp_path / "campaign")
-    verdict = verdict_of(choice, campaign, effects, tmp_path / "verdict").verdict
+
+class GroupVerdict:
+    """The verdict of a static campaign that cannot tell a compliant root from a crack."""
+
+    def __init__(self, folder):
+        self.folder = folder / "verdict"
+        self.campaign = folder / "campaign"
+        choice = choose_model("three_mass_chain")
+        hidden = ("root_compliance", {"compliance_share": 0.11}, "")
+        campaign = simulated(choice.model, "static", 3, hidden, self.campaign)
+        self.verdict = verdict_of(choice, campaign, ROOT_OR_CRACK, self.folder).verdict
+
+
+@pytest.fixture(scope="module")
+def group_verdict(tmp_path_factory):
+    return GroupVerdict(tmp_path_factory.mktemp("group"))
+
+
+def test_a_static_campaign_cannot_tell_a_compliant_root_from_a_crack(group_verdict):
+    verdict = group_verdict.verdict
     assert verdict.kind is VerdictKind.GROUP, verdict.sentence
     assert set(verdict.group) == {"root_compliance", "breathing_crack"}
-    leading, other = verdict.group
-    for words, member in (((), leading), (("--member", other), other)):
-        out = tmp_path / f"{member}.json"
-        told = run("apply", tmp_path / "verdict", "--out", out, *words)
-        assert f"one of a group that the data cannot tell apart: no name (of {leading}, {other})." in told
-        stored = read_patch(out)
-        assert stored.verdict is VerdictKind.GROUP
-        assert stored.sentence.startswith(told.splitlines()[0].split(": ", 1)[1])
-        assert [effect.identifier for effect in stored.effects] == [member]
-        (fitted,) = [item for item in verdict.hypotheses if item.identifiers == (member,)]
-        assert stored.parameters == fitted.parameters
-        again = investigate(
-            uav_twin.read_campaign(tmp_path / "campaign"), out, effects, thorough=False
-        ).verdict
-        assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence
-    refused = run("apply", tmp_path / "verdict", "--member", "overflow", failed=True)
-    assert f"which has '{leading}', '{other}'" in refused
 
 
-def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
-    """Drag with nothing but a stiffness that drifts to explain it, which takes some of the error away."""
+class AppliedMember:
+    """A member of the group that is applied: the leading one unless another one is asked for."""
+
+    def __init__(self, group_verdict, is_leading, folder):
+        self.group = group_verdict
+        leading, other = group_verdict.verdict.group
+        self.name = leading if is_leading else other
+        self.file = folder / f"{self.name}.json"
+        options = () if is_leading else ("--member", other)
+        self.printed = run("apply", group_verdict.folder, "--out", self.file, *options)
+        self.patch = read_patch(self.file)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["leading", "other"])
+def applied_member(request, group_verdict, tmp_path_factory):
+    return AppliedMember(group_verdict, request.param, tmp_path_factory.mktemp("member"))
+
+
+def test_a_member_of_a_group_is_no_name(applied_member):
+    leading, other = applied_member.group.verdict.group
+    sentence = f"one of a group that the data cannot tell apart: no name (of {leading}, {other})."
+    first_sentence = applied_member.printed.splitlines()[0].split(": ", 1)[1]
+    assert sentence in applied_member.printed
+    assert applied_member.patch.verdict is VerdictKind.GROUP
+    assert applied_member.patch.sentence.startswith(first_sentence)
+
+
+def test_a_member_of_a_group_has_the_parameters_of_its_own_fit(applied_member):
+    name, hypotheses = applied_member.name, applied_member.group.verdict.hypotheses
+    (hypothesis,) = [item for item in hypotheses if item.identifiers == (name,)]
+    assert [effect.identifier for effect in applied_member.patch.effects] == [name]
+    assert applied_member.patch.parameters == hypothesis.parameters
+
+
+def test_each_member_of_a_group_closes_the_gap(applied_member):
+    campaign = uav_twin.read_campaign(applied_member.group.campaign)
+    verdict = investigate(campaign, applied_member.file, ROOT_OR_CRACK, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+
+
+def test_what_is_no_member_of_a_group_is_refused(group_verdict):
+    leading, other = group_verdict.verdict.group
+    sentence = run("apply", group_verdict.folder, "--member", "overflow", failed=True)
+    assert f"which has '{leading}', '{other}'" in sentence
+
+
+@pytest.fixture(scope="module")
+def unexplained(tmp_path_factory):
+    """The verdict on drag with nothing but a stiffness that drifts to explain it, and its folder.
+
+    The drift takes some of the error away.
+    """
+    folder = tmp_path_factory.mktemp("unexplained")
     choice = choose_model("single_mass_rig")
-    hidden = "quadratic_damping", {"equivalent_damping_ratio": 0.01}, "slide"
-    campaign = simulated(choice.model, "laboratory", 4, hidden, tmp_path / "campaign")
-    found = verdict_of(choice, campaign, chosen("stiffness_drift"), tmp_path / "verdict")
-    assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
-    assert has_applicable_effects(found.verdict, found.proof)
-    assert not has_applicable_effects(found.verdict, None)
-    larger = replace(found.proof.closed, value=-0.3)
-    assert not has_applicable_effects(found.verdict, replace(found.proof, closed=larger))
-    applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
+    hidden = ("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "slide")
+    campaign = simulated(choice.model, "laboratory", 4, hidden, folder / "campaign")
+    return verdict_of(choice, campaign, chosen("stiffness_drift"), folder / "verdict"), folder / "verdict"
+
+
+def test_the_best_hypothesis_can_be_applied_if_it_takes_error_away(unexplained):
+    investigation, _ = unexplained
+    verdict, proof = investigation.verdict, investigation.proof
+    grown = replace(proof, closed=replace(proof.closed, value=-0.3))
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
+    assert has_applicable_effects(verdict, proof)
+    assert not any(has_applicable_effects(verdict, other) for other in (None, grown))
+
+
+def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(unexplained, tmp_path):
+    applied = apply_verdict(unexplained[1], tmp_path / "patched.json")
+    patch = read_patch(applied.path)
     assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
-    stored = read_patch(applied.path)
-    assert stored.verdict is VerdictKind.UNEXPLAINED
-    assert [effect.identifier for effect in stored.effects] == ["stiffness_drift"]
-    assert stored.sentence.startswith(applied.sentence)
-    with pytest.raises(
-        ModelError, match="only laws at the ports of a lumped model can stand in its own file"
-    ):
-        apply_verdict(tmp_path / "verdict", tmp_path / "patched.toml")
+    assert patch.sentence.startswith(applied.sentence)
+    assert (patch.verdict, [effect.identifier for effect in patch.effects]) == (
+        VerdictKind.UNEXPLAINED,
+        ["stiffness_drift"],
+    )
+
+
+def test_what_is_no_law_at_a_port_does_not_stand_in_the_file_of_a_lumped_model(unexplained, tmp_path):
+    sentence = "only laws at the ports of a lumped model can stand in its own file"
+    with pytest.raises(ModelError, match=sentence):
+        apply_verdict(unexplained[1], tmp_path / "patched.toml")
 
 
 # ---------------------------------------------------------------- files
 
 
-def test_files_are_not_taken_from_their_owner(laboratory, tmp_path, monkeypatch):
+@pytest.fixture
+def own_file(tmp_path, monkeypatch):
+    """A file of the user's in the folder at hand."""
     monkeypatch.chdir(tmp_path)
-    there = tmp_path / "there.toml"
-    there.write_text("mine", encoding="utf-8")
-    for words, message in (
+    file = tmp_path / "there.toml"
+    file.write_text("mine", encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
         (("--out", "there.toml"), "there.toml exists: choose another --out or give --replace"),
-        (("--out", str(laboratory / "rig.toml"), "--replace"), "is what the patched model is made of"),
+        (("--out", "LABORATORY/rig.toml", "--replace"), "is what the patched model is made of"),
         (("--out", "model.xml"), "must end in one of .toml, .json, .fmu"),
         (("--out", "model.fmu"), "only a wing is packed with its effects"),
         (("--member", "free_play"), "has no group: leave it out"),
-    ):
-        said = run("apply", laboratory / "verdict", *words, failed=True)
-        assert message in said
-        assert len(said.strip().splitlines()) == 1
-    assert list(tmp_path.iterdir()) == [there]
-    assert there.read_text(encoding="utf-8") == "mine"
-    run("apply", laboratory / "verdict", "--out", "there.toml", "--replace")
-    assert uav_twin.load_model("there.toml").name.endswith("with geometric (cubic) stiffness")
+    ],
+)
+def test_files_are_not_taken_from_their_owner(laboratory, own_file, options, sentence):
+    words = [word.replace("LABORATORY", str(laboratory)) for word in options]
+    refusal = run("apply", laboratory / "verdict", *words, failed=True)
+    assert sentence in refusal
+    assert len(refusal.strip().splitlines()) == 1
+    assert [(path, path.read_text("utf-8")) for path in own_file.parent.iterdir()] == [(own_file, "mine")]
+
+
+def test_a_file_is_replaced_by_a_patched_model_on_demand(laboratory, own_file):
+    run("apply", laboratory / "verdict", "--out", own_file.name, "--replace")
+    assert uav_twin.load_model(own_file.name).name.endswith("with geometric (cubic) stiffness")
 
 
 def rewritten(file, change):
@@ -275,26 +426,53 @@ def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory, tmp_pa
             call()
 
 
-def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
-    """What a patched model lacks goes into one file with what it had."""
-    first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
-    assert len(first.model.patch)
-    drag = "quadratic_damping", {"equivalent_damping_ratio": 0.02}, "slide"
-    campaign = simulated(first.model, "ringdown", 5, drag, tmp_path / "campaign")
-    found = verdict_of(first, campaign, chosen("quadratic_damping"), tmp_path / "verdict")
-    assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
-    beneath = (str(laboratory / "rig.toml"), str(tmp_path / "first.json"))
-    assert choose_model(tmp_path / "verdict" / "patch.json").beneath == beneath
-    for file in (*beneath, tmp_path / "verdict" / "verdict.json", tmp_path / "verdict" / "patch.json"):
+class SecondVerdict:
+    """A model that is patched by a verdict, and the verdict on drag that this model lacks."""
+
+    def __init__(self, laboratory, folder):
+        self.rig, self.first_file = laboratory / "rig.toml", folder / "first.json"
+        self.folder = folder / "verdict"
+        self.first = choose_model(apply_verdict(laboratory / "verdict", self.first_file).path)
+        drag = ("quadratic_damping", {"equivalent_damping_ratio": 0.02}, "slide")
+        campaign = simulated(self.first.model, "ringdown", 5, drag, folder / "campaign")
+        self.verdict = verdict_of(self.first, campaign, chosen("quadratic_damping"), self.folder).verdict
+
+
+@pytest.fixture(scope="module")
+def second_verdict(laboratory, tmp_path_factory):
+    return SecondVerdict(laboratory, tmp_path_factory.mktemp("second"))
+
+
+def test_what_a_patched_model_lacks_is_named(second_verdict):
+    assert len(second_verdict.first.model.patch)
+    assert [item.identifier for item in second_verdict.verdict.effects] == ["quadratic_damping"]
+
+
+def test_files_beneath_a_patched_model_are_not_replaced(second_verdict):
+    beneath = (str(second_verdict.rig), str(second_verdict.first_file))
+    files = (*beneath, second_verdict.folder / "verdict.json", second_verdict.folder / "patch.json")
+    assert choose_model(second_verdict.folder / "patch.json").beneath == beneath
+    for file in files:
         with pytest.raises(FileNotWrittenError, match="is what the patched model is made of"):
-            apply_verdict(tmp_path / "verdict", file, replace=True)
-    second = apply_verdict(tmp_path / "verdict", tmp_path / "second.toml").path
-    laws = tomllib.loads(second.read_text(encoding="utf-8"))["law"]
+            apply_verdict(second_verdict.folder, file, replace=True)
+
+
+def test_effects_are_applied_upon_each_other_in_the_file_of_the_model(second_verdict, tmp_path):
+    path = apply_verdict(second_verdict.folder, tmp_path / "second.toml").path
+    laws = tomllib.loads(path.read_text(encoding="utf-8"))["law"]
     assert [law["name"] for law in laws] == ["cubic_stiffness", "quadratic_damping"]
-    stored = read_patch(apply_verdict(tmp_path / "verdict", tmp_path / "both.json").path)
-    assert stored.origin.model_file == str((laboratory / "rig.toml").resolve())
-    assert stored.patch == first.model.patch + found.verdict.effects[0].patch
-    assert uav_twin.load_model(tmp_path / "both.json").parameters == uav_twin.load_model(second).parameters
+
+
+def test_effects_are_applied_upon_each_other_in_a_patch(second_verdict, tmp_path):
+    patch = read_patch(apply_verdict(second_verdict.folder, tmp_path / "both.json").path)
+    assert patch.origin.model_file == str(second_verdict.rig.resolve())
+    assert patch.patch == second_verdict.first.model.patch + second_verdict.verdict.effects[0].patch
+
+
+def test_a_patch_and_the_file_of_a_model_have_the_same_parameters(second_verdict, tmp_path):
+    patch = apply_verdict(second_verdict.folder, tmp_path / "both.json").path
+    file = apply_verdict(second_verdict.folder, tmp_path / "second.toml").path
+    assert uav_twin.load_model(patch).parameters == uav_twin.load_model(file).parameters
 
 
 def test_a_built_in_sensor_is_that_of_its_channel():
