@@ -73,49 +73,110 @@ def test_without_magnitude_nothing_changes(effect, setting):
 
 
 @EFFECTS
-def test_it_changes_the_trials_that_it_acts_on_and_no_other(effect, setting):
+def test_it_is_offered_at_places_that_differ(effect, setting):
+    places = effect.places(setting)
     assert effect.unavailable(setting) is None
-    touched, places = set(), effect.places(setting)
     assert len(set(places)) == len(places) > 0
-    for place in places:
+
+
+def relative_changes(effect, setting):
+    """Return the kind of each trial and its largest relative change by the effect at each of its places."""
+    changes = []
+    for place in effect.places(setting):
         patch = effect.patch(setting, medians(effect), place)
-        assert len(patch)
         for trial in setting.campaign.trials:
             change = shown(setting, trial, patch) - trial.values
-            if np.max(np.abs(change) / np.max(np.abs(trial.values), axis=0)) > 1e-3:
-                touched.add(trial.kind)
-            if trial.kind not in effect.acts_on:
-                assert not np.any(change)
-    exempt = {TrialKind.DRIVEN}  # there is none
+            scale = np.max(np.abs(trial.values), axis=0)
+            changes.append((trial.kind, float(np.max(np.abs(change) / scale))))
+    return changes
+
+
+def unchanged_kinds(effect):
+    """Return kinds of trials on which an effect acts, and in which the cantilever does not show it."""
+    kinds = {TrialKind.DRIVEN}  # there is none
     if effect.identifier == "point_mass":
-        exempt |= {TrialKind.FLIGHT}  # the cantilever has no weight
+        kinds |= {TrialKind.FLIGHT}  # the cantilever has no weight
     if effect.identifier in WARM:
-        exempt |= {TrialKind.FORCED, TrialKind.RINGDOWN, TrialKind.FLIGHT}  # one temperature in these trials
-    assert touched | exempt == effect.acts_on | exempt
+        kinds |= {TrialKind.FORCED, TrialKind.RINGDOWN, TrialKind.FLIGHT}  # one temperature in these trials
+    return kinds
 
 
 @EFFECTS
-def test_it_builds_over_its_whole_prior_and_its_shape_is_free_around_the_canonical_one(effect, setting):
-    """Priors are inverted; the effect can be sent to another process."""
-    place, middle = effect.places(setting)[0], medians(effect)
-    named = effect.patch(setting, middle, place)
-    assert effect.patch(setting, {**middle, **effect.canonical_shape()}, place) == named
-    assert pickle.loads(pickle.dumps(effect)).patch(setting, middle, place) == named
-    for item in effect.shape:
-        assert abs(item.prior.standard_normal(item.canonical)) < 2.0
-        moved = {**middle, item.name: item.prior.value(item.prior.standard_normal(item.canonical) + 1.0)}
-        assert effect.patch(setting, moved, place) != named
-    for item in (*effect.parameters, *effect.shape):
+def test_it_changes_the_trials_that_it_acts_on_and_no_other(effect, setting):
+    changes = relative_changes(effect, setting)
+    changed_kinds = {kind for kind, change in changes if change > 1e-3}
+    exempt = unchanged_kinds(effect)
+    assert changed_kinds | exempt == effect.acts_on | exempt
+    assert all(change == 0.0 for kind, change in changes if kind not in effect.acts_on)
+
+
+@EFFECTS
+def test_it_has_a_patch_at_each_place(effect, setting):
+    for place in effect.places(setting):
+        assert len(effect.patch(setting, medians(effect), place))
+
+
+@EFFECTS
+def test_it_can_be_sent_to_another_process(effect, setting):
+    place, values = effect.places(setting)[0], medians(effect)
+    copy = pickle.loads(pickle.dumps(effect))
+    assert copy.patch(setting, values, place) == effect.patch(setting, values, place)
+
+
+@EFFECTS
+def test_its_shape_is_free_around_the_canonical_one(effect, setting):
+    place, values = effect.places(setting)[0], medians(effect)
+    canonical = effect.patch(setting, values, place)
+    assert effect.patch(setting, {**values, **effect.canonical_shape()}, place) == canonical
+    for parameter in effect.shape:
+        u = parameter.prior.standard_normal(parameter.canonical)
+        other = {**values, parameter.name: parameter.prior.value(u + 1.0)}
+        assert abs(u) < 2.0
+        assert effect.patch(setting, other, place) != canonical
+
+
+@EFFECTS
+def test_its_priors_are_inverted(effect):
+    for parameter in (*effect.parameters, *effect.shape):
         for u in (-2.0, -0.3, 0.0, 1.5):
-            assert item.prior.standard_normal(item.prior.value(u)) == pytest.approx(u, abs=1e-9)
-    for u, place in product((-6.0, 0.7, 6.0), effect.places(setting)):
-        values = {item.name: item.prior.value(u) for item in (*effect.parameters, *effect.shape)}
-        patch = effect.patch(setting, values, place)
-        assert ModelPatch.from_list(json.loads(json.dumps(patch.to_list()))) == patch
-        inside = [primitive for primitive in patch if not isinstance(primitive, patches.SENSORS)]
-        assert all(setting.model.supports(type(primitive)) for primitive in inside)
-        assert all(0.0 <= item.station <= LENGTH for item in inside if isinstance(item, PointMass))
-        if not any(isinstance(item, PowerStiffness) for item in inside):  # a load may be too much for these
+            value = parameter.prior.value(u)
+            assert parameter.prior.standard_normal(value) == pytest.approx(u, abs=1e-9)
+
+
+def patches_over_prior(effect, setting):
+    """Return the patches of an effect at each place, at the ends of its priors and within them."""
+    parameters = (*effect.parameters, *effect.shape)
+    return [
+        effect.patch(setting, {parameter.name: parameter.prior.value(u) for parameter in parameters}, place)
+        for u, place in product((-6.0, 0.7, 6.0), effect.places(setting))
+    ]
+
+
+def primitives_of_model(patch):
+    return [primitive for primitive in patch if not isinstance(primitive, patches.SENSORS)]
+
+
+@EFFECTS
+def test_it_is_written_over_its_whole_prior(effect, setting):
+    for patch in patches_over_prior(effect, setting):
+        text = json.dumps(patch.to_list())
+        assert ModelPatch.from_list(json.loads(text)) == patch
+
+
+@EFFECTS
+def test_it_is_supported_by_the_model_over_its_whole_prior(effect, setting):
+    for patch in patches_over_prior(effect, setting):
+        primitives = primitives_of_model(patch)
+        masses = [primitive for primitive in primitives if isinstance(primitive, PointMass)]
+        assert all(setting.model.supports(type(primitive)) for primitive in primitives)
+        assert all(0.0 <= mass.station <= LENGTH for mass in masses)
+
+
+@EFFECTS
+def test_it_has_finite_readings_over_its_whole_prior(effect, setting):
+    """A load may be too much for a stiffness that grows with the displacement."""
+    for patch in patches_over_prior(effect, setting):
+        if not any(isinstance(primitive, PowerStiffness) for primitive in primitives_of_model(patch)):
             assert np.all(np.isfinite(shown(setting, setting.campaign.trials[0], patch)))
 
 
@@ -129,37 +190,82 @@ def test_all_but_the_filter_vanish_with_a_magnitude(setting):
     np.testing.assert_allclose(shown(setting, pushed, slow), pushed.values, atol=1e-8)
 
 
-def test_sizes_in_closed_form(setting):
-    scales, root, span = setting.scales, setting.scales.ports["root"], setting.scales.ports["span"]
-    k, A, w = span.stiffness, span.displacement, span.angular_frequency
+@pytest.fixture
+def span(setting):
+    """The scales of the port at the span: stiffness, amplitude and angular frequency."""
+    return setting.scales.ports["span"]
+
+
+@pytest.fixture
+def root(setting):
+    return setting.scales.ports["root"]
+
+
+def test_quadratic_damping_has_its_equivalent_damping_ratio(setting, span):
+    """zeta = 4 c A w² / (3 pi k)."""
     drag = only(setting, "quadratic_damping", {"equivalent_damping_ratio": 0.01}, "span")
-    at_speed = drag.coefficient / drag.reference_velocity**2
-    assert 4.0 * at_speed * A * w**2 / (3.0 * pi * k) == pytest.approx(0.01)
-    hysteretic = only(setting, "structural_damping", {"loss_factor": 0.03}, "span")
-    assert hysteretic.coefficient / hysteretic.reference_displacement == pytest.approx(0.03 * k)
+    coefficient = drag.coefficient / drag.reference_velocity**2
+    ratio = 4.0 * coefficient * span.displacement * span.angular_frequency**2 / (3.0 * pi * span.stiffness)
+    assert ratio == pytest.approx(0.01)
+
+
+def test_structural_damping_has_its_loss_factor(setting, span):
+    damping = only(setting, "structural_damping", {"loss_factor": 0.03}, "span")
+    coefficient = damping.coefficient / damping.reference_displacement
+    assert coefficient == pytest.approx(0.03 * span.stiffness)
+
+
+def test_friction_is_a_fraction_of_the_elastic_force(setting, span):
     friction = only(setting, "coulomb_friction", {"friction_ratio": 0.02}, "span")
-    assert friction.coefficient == pytest.approx(0.02 * k * A)
-    most = 0.9 * root.static_stiffness * root.displacement
+    assert friction.coefficient == pytest.approx(0.02 * span.stiffness * span.displacement)
+
+
+def test_friction_is_limited_to_what_does_not_hold_a_port_still_and_drag_is_not(setting, root):
+    largest = 0.9 * root.static_stiffness * root.displacement
     strong = {"friction_ratio": 50.0}
     friction = only(setting, "coulomb_friction", strong, "root")
-    assert friction.coefficient == pytest.approx(most)  # more would hold it still, which no drag does
     drag = only(setting, "coulomb_friction", {**strong, "velocity_exponent": 2.0}, "root")
-    assert drag.coefficient > 10.0 * most
+    assert friction.coefficient == pytest.approx(largest)
+    assert drag.coefficient > 10.0 * largest
+
+
+def test_a_high_pass_has_its_corner_as_a_fraction_of_the_first_mode(setting):
     coupling = only(setting, "high_pass", {"corner_ratio": 0.1}, patches.EVERY_CHANNEL)
-    assert 1.0 / coupling.time_constant == pytest.approx(0.1 * scales.angular_frequency)
-    for skin, side, loss, lost in (("upper", -1, 0.2, 0.2), ("lower", 1, 2.0, 0.9)):
-        crack = only(setting, "breathing_crack", {"stiffness_loss": loss}, f"root, {skin} skin")
-        force = -lost * root.static_stiffness * crack.reference_displacement
-        assert (crack.side, crack.exponent, crack.coefficient) == (side, 1.0, pytest.approx(force))
-    root_spring = only(setting, "root_compliance", {"compliance_share": 0.1})
-    assert root_spring.compliance * LENGTH**2 * scales.tip_stiffness == pytest.approx(0.1)
-    waves = {"frequency_ratio": 2.0, "damping_ratio": 0.01, "cosine_ratio": 0.1, "sine_ratio": 0.0}
-    mode = only(setting, "unmodelled_mode", waves, "tip")
-    assert mode.frequency == pytest.approx(2.0 * scales.angular_frequency / (2.0 * pi))
-    assert mode.cosine == pytest.approx(0.1, rel=1e-3)  # the tip is released from its largest reading
+    assert 1.0 / coupling.time_constant == pytest.approx(0.1 * setting.scales.angular_frequency)
+
+
+@pytest.mark.parametrize(("skin", "side"), [("upper", -1), ("lower", 1)])
+@pytest.mark.parametrize(("stiffness_loss", "limited_loss"), [(0.2, 0.2), (2.0, 0.9)])
+def test_a_breathing_crack_takes_at_most_nine_tenths_of_a_stiffness(
+    setting, root, skin, side, stiffness_loss, limited_loss
+):
+    crack = only(setting, "breathing_crack", {"stiffness_loss": stiffness_loss}, f"root, {skin} skin")
+    force = -limited_loss * root.static_stiffness * crack.reference_displacement
+    assert (crack.side, crack.exponent, crack.coefficient) == (side, 1.0, pytest.approx(force))
+
+
+def test_a_root_compliance_has_its_fraction_of_the_tip_compliance(setting):
+    spring = only(setting, "root_compliance", {"compliance_share": 0.1})
+    assert spring.compliance * LENGTH**2 * setting.scales.tip_stiffness == pytest.approx(0.1)
+
+
+def test_an_unmodelled_mode_has_its_frequency_and_amplitude_by_the_first_mode(setting):
+    """The tip is released from its largest reading."""
+    values = {"frequency_ratio": 2.0, "damping_ratio": 0.01, "cosine_ratio": 0.1, "sine_ratio": 0.0}
+    mode = only(setting, "unmodelled_mode", values, "tip")
+    frequency = 2.0 * setting.scales.angular_frequency / (2.0 * pi)
+    assert mode.frequency == pytest.approx(frequency)
+    assert mode.cosine == pytest.approx(0.1, rel=1e-3)
+
+
+def test_a_hum_is_in_all_channels_of_a_quantity(setting):
     values = {"cosine_ratio": 0.01, "sine_ratio": 0.0, "frequency_error": 0.0}
     hum = only(setting, "mains_hum", values, "50 Hz, all strain")
     assert (hum.channel, hum.quantity, hum.frequency) == (patches.EVERY_CHANNEL, "strain", 50.0)
+
+
+def test_sizes_of_single_primitives_are_fractions_of_scales(setting, root):
+    scales = setting.scales
     largest = max(float(np.max(np.abs(trial.values[:, 2]))) for trial in setting.campaign.trials)
     gap = FreePlay("root", pytest.approx(0.9 * root.static_stiffness), pytest.approx(0.1 * root.displacement))
     for identifier, values, place, primitive in (
@@ -178,56 +284,81 @@ def test_sizes_in_closed_form(setting):
         assert only(setting, identifier, values, place) == primitive
 
 
-def test_saturation_loses_its_share_and_all_channels_of_a_quantity_have_one_limit(setting):
-    (saturation,) = chosen("sensor_saturation")
-    assert saturation.places(setting) == ("all strain", "tip", "g0", "g1", "g2")
-    every = only(setting, "sensor_saturation", {"lost_share": 0.01}, "all strain")
+@pytest.fixture
+def saturation(setting):
+    """Saturation of all strains that loses a hundredth of the largest."""
+    return only(setting, "sensor_saturation", {"lost_share": 0.01}, "all strain")
+
+
+def test_saturation_is_offered_at_all_strains_and_at_each_channel(setting):
+    (effect,) = chosen("sensor_saturation")
+    assert effect.places(setting) == ("all strain", "tip", "g0", "g1", "g2")
+    assert effect.patch(setting, {"lost_share": 0.0}, "g0") == ModelPatch()
+
+
+def test_saturation_loses_its_share_of_the_largest_reading(setting, saturation):
     strains = [trial.values[:, 1:] for trial in setting.campaign.trials]
     largest = max(float(np.abs(values).max()) for values in strains)
-    assert (every.channel, every.quantity) == (patches.EVERY_CHANNEL, "strain")
-    assert every.limit == pytest.approx(largest / np.sqrt(0.03))
-    lost = 1.0 - every.limit * np.tanh(largest / every.limit) / largest
+    lost = 1.0 - saturation.limit * np.tanh(largest / saturation.limit) / largest
+    assert saturation.limit == pytest.approx(largest / np.sqrt(0.03))
     assert lost == pytest.approx(0.01, rel=0.02)
+
+
+def test_all_channels_of_a_quantity_saturate_at_one_limit(setting, saturation):
+    assert (saturation.channel, saturation.quantity) == (patches.EVERY_CHANNEL, "strain")
     for trial in setting.campaign.trials:
-        values = shown(setting, trial, ModelPatch((every,)))
+        values = shown(setting, trial, ModelPatch((saturation,)))
+        expected = saturation.limit * np.tanh(trial.values[:, 1:] / saturation.limit)
         np.testing.assert_array_equal(values[:, 0], trial.values[:, 0])
-        wanted = every.limit * np.tanh(trial.values[:, 1:] / every.limit)
-        np.testing.assert_allclose(values[:, 1:], wanted, rtol=1e-12, atol=1e-18)
-    assert saturation.patch(setting, {"lost_share": 0.0}, "g0") == ModelPatch()
+        np.testing.assert_allclose(values[:, 1:], expected, rtol=1e-12, atol=1e-18)
 
 
-def test_observations_are_responses_through_the_sensors_of_a_patch(setting):
-    ring, pull = (
-        next(item for item in setting.campaign.trials if item.kind is kind)
-        for kind in (TrialKind.RINGDOWN, TrialKind.STATIC)
-    )
+def observed(setting, trial, *primitives, **conditions):
+    """Return the readings of a trial under primitives and conditions."""
+    patch, given_conditions = ModelPatch(primitives), Conditions(np.ones(1), **conditions)
+    return observe(setting.model, setting.campaign, trial, patch, given_conditions).values
 
-    def seen(trial, *items, **conditions):
-        given = Conditions(np.ones(1), **conditions)
-        return observe(setting.model, setting.campaign, trial, ModelPatch(items), given).values
 
-    # clocks of patch and conditions add up
-    one = seen(ring, patches.Clock(0.004, 0.001), clock=(0.001, 0.002))
-    assert one == pytest.approx(seen(ring, clock=(0.005, 0.003)), rel=1e-12)
-    assert np.abs(one - seen(ring)).max() > 1e-5
-    # a turned gauge asks for components
-    c, s = np.cos(0.2), np.sin(0.2)
+@pytest.fixture
+def ring(setting):
+    return next(trial for trial in setting.campaign.trials if trial.kind is TrialKind.RINGDOWN)
+
+
+def test_clocks_of_patch_and_conditions_add_up(setting, ring):
+    by_both = observed(setting, ring, patches.Clock(0.004, 0.001), clock=(0.001, 0.002))
+    by_conditions = observed(setting, ring, clock=(0.005, 0.003))
+    assert by_both == pytest.approx(by_conditions, rel=1e-12)
+    assert np.abs(by_both - observed(setting, ring)).max() > 1e-5
+
+
+def test_a_turned_gauge_reads_components_across(setting):
+    pull = next(trial for trial in setting.campaign.trials if trial.kind is TrialKind.STATIC)
     output = setting.campaign.channels["g0"].output
-    parts = tuple((f"{output}{part}", Quantity.STRAIN) for part in ("", *ACROSS))
-    strains = setting.model.respond(pull, parts, ModelPatch(), Conditions(np.ones(1))).values
+    components = tuple((f"{output}{part}", Quantity.STRAIN) for part in ("", *ACROSS))
+    strains = setting.model.respond(pull, components, ModelPatch(), Conditions(np.ones(1))).values
+    turned = observed(setting, pull, patches.SensorRotation("g0", 0.2))[:, pull.channels.index("g0")]
+    c, s = np.cos(0.2), np.sin(0.2)
     assert np.abs(strains[-1]).min() > 1e-6
-    turned = seen(pull, patches.SensorRotation("g0", 0.2))[:, pull.channels.index("g0")]
     assert turned == pytest.approx(strains @ [c**2, s**2, s * c])
-    # a decaying line scales with the release
-    for initial in (np.zeros((0, 2)), np.array([[0.1, 0.0]])):
-        line, bare = (seen(ring, *items, initial=initial)[0] for items in ((LINE,), ()))
-        size = 0.2 * ring.release.displacement * (1.0 + initial[:, 0].sum())
-        assert (line - bare)[ring.channels.index("tip")] == pytest.approx(size)
-    # a channel of another trial changes nothing, one of none is refused
+
+
+@pytest.mark.parametrize("initial", [np.zeros((0, 2)), np.array([[0.1, 0.0]])], ids=["still", "moved"])
+def test_a_decaying_line_scales_with_the_release(setting, ring, initial):
+    with_line = observed(setting, ring, LINE, initial=initial)[0]
+    without = observed(setting, ring, initial=initial)[0]
+    amplitude = 0.2 * ring.release.displacement * (1.0 + initial[:, 0].sum())
+    assert (with_line - without)[ring.channels.index("tip")] == pytest.approx(amplitude)
+
+
+def test_a_channel_of_another_trial_changes_nothing(setting, ring):
     alone = replace(ring, channels=("tip",), values=ring.values[:, :1], used=ring.used[:, :1])
-    assert np.array_equal(seen(alone), seen(alone, SensorGain("g0", 0.2)))
+    with_gain = observed(setting, alone, SensorGain("g0", 0.2))
+    assert np.array_equal(observed(setting, alone), with_gain)
+
+
+def test_a_channel_of_no_trial_is_refused(setting, ring):
     with pytest.raises(CatalogueError, match="'g7', which does not exist; there are tip, g0, g1"):
-        seen(ring, SensorGain("g7", 0.2))
+        observed(setting, ring, SensorGain("g7", 0.2))
 
 
 LINE = patches.DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)
@@ -287,32 +418,57 @@ def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     assert all(reasons[name].endswith(".") for name in absent)
 
 
-def test_flows_are_offered_at_states_and_forces_are_not():
+@pytest.mark.parametrize("name", ["outflow", "overflow"])
+def test_flows_are_offered_at_states_and_change_the_level(name):
     setting = tank_setting()
-    what = setting.campaign.trials[0]
-    for effect in chosen("outflow", "overflow"):
-        assert effect.unavailable(setting) is None
-        assert effect.places(setting) == ("outlet",)
-        middle = {item.name: item.prior.value(0.0) for item in effect.parameters}
-        shown = seen(setting.model, what, {"level": Quantity.LEVEL}, *effect.patch(setting, middle, "outlet"))
-        assert 0.02 < np.abs(shown - what.values).max() / what.values.max() < 0.9
+    trial = setting.campaign.trials[0]
+    (effect,) = chosen(name)
+    values = {parameter.name: parameter.prior.value(0.0) for parameter in effect.parameters}
+    patch = effect.patch(setting, values, "outlet")
+    readings = seen(setting.model, trial, {"level": Quantity.LEVEL}, *patch)
+    relative_change = np.abs(readings - trial.values).max() / trial.values.max()
+    assert effect.unavailable(setting) is None
+    assert effect.places(setting) == ("outlet",)
+    assert 0.02 < relative_change < 0.9
+
+
+def test_forces_are_not_offered_at_states():
     (friction,) = chosen("coulomb_friction")
-    assert "are of states, where flows act and no forces" in str(friction.unavailable(setting))
+    reason = str(friction.unavailable(tank_setting()))
+    assert "are of states, where flows act and no forces" in reason
 
 
-def test_a_port_whose_motion_goes_one_way_shows_no_memory():
-    """A body that falls shows drag and no hysteresis; one that is pushed to and fro may show both."""
+@pytest.fixture
+def falling_body():
+    """The model of a body that falls, and the campaign of its fall."""
     model = model_of(INPUTS.text("falling_body.toml"))
-    falls = asked(TrialKind.DRIVEN, np.linspace(0.0, 1.0, 101), begins=Start.STILL)
-    given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
-    setting = setting_of(given, model)
+    fall = asked(TrialKind.DRIVEN, np.linspace(0.0, 1.0, 101), begins=Start.STILL)
+    height = Channel("height", Quantity.DISPLACEMENT, "height", None)
+    return model, campaign(fall, height=height)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"],
+)
+def test_a_port_whose_motion_goes_one_way_shows_no_memory(falling_body, name):
+    model, fall = falling_body
+    (effect,) = chosen(name)
+    assert "motion that turns" in (effect.unavailable(setting_of(fall, model)) or "")
+
+
+def test_a_port_whose_motion_goes_one_way_shows_drag(falling_body):
+    model, fall = falling_body
+    setting = setting_of(fall, model)
     assert not setting.scales.ports["air"].turns
-    remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
-    for effect in chosen(*remember):
-        assert "motion that turns" in (effect.unavailable(setting) or "")
     assert chosen("quadratic_damping")[0].unavailable(setting) is None
-    still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
-    assert model.scales(still).ports["air"].turns
+
+
+def test_a_port_that_is_pushed_may_turn(falling_body):
+    model, fall = falling_body
+    (trial,) = fall.trials
+    pushed = replace(fall, trials=(trial, replace(trial, name="load", kind=TrialKind.STATIC)))
+    assert model.scales(pushed).ports["air"].turns
 
 
 @pytest.mark.parametrize(
@@ -333,21 +489,35 @@ def test_a_port_stands_for_the_others_of_a_wing_alone(other, places):
 ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}
 
 
-@pytest.mark.parametrize(
-    ("loggers", "places", "motion"), [({}, ("",), True), (ALL, ("",), False), (BOTH, ("rack", "film"), True)]
-)
-def test_each_logger_may_have_a_wrong_clock(loggers, places, motion):
+def shaken_mass(loggers):
+    """Return the setting of a shaken mass that a laser and a camera measure."""
     model = model_of(INPUTS.text("shaken_mass.toml"))
-    read = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
-    what = asked(TrialKind.FORCED, 400, channels=tuple(read), force=np.ones(400), load_place="shaker")
-    shared, own = chosen("logger_clock", "clock_error")
-    given = replace(campaign(what, **read), loggers=loggers)
-    setting = setting_of(given, model)
-    assert shared.unavailable(setting) is None
-    assert shared.places(setting) == places
-    assert (own.unavailable(setting) is None) is motion
-    patch = shared.patch(setting, {"rate_error": 4e-3}, places[0])
+    channels = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
+    shake = asked(TrialKind.FORCED, 400, channels=tuple(channels), force=np.ones(400), load_place="shaker")
+    return setting_of(replace(campaign(shake, **channels), loggers=loggers), model)
+
+
+LOGGERS = pytest.mark.parametrize(
+    ("loggers", "places", "has_own_clock"),
+    [({}, ("",), True), (ALL, ("",), False), (BOTH, ("rack", "film"), True)],
+    ids=["none", "one", "two"],
+)
+
+
+@LOGGERS
+def test_each_logger_may_have_a_wrong_clock(loggers, places, has_own_clock):
+    setting = shaken_mass(loggers)
+    (clock,) = chosen("logger_clock")
+    patch = clock.patch(setting, {"rate_error": 4e-3}, places[0])
+    assert clock.unavailable(setting) is None
+    assert clock.places(setting) == places
     assert patch == ModelPatch((patches.LoggerClock(places[0] or "*", 4e-3),))
+
+
+@LOGGERS
+def test_the_force_may_have_a_clock_of_its_own_unless_one_logger_reads_all(loggers, places, has_own_clock):
+    (clock_error,) = chosen("clock_error")
+    assert (clock_error.unavailable(shaken_mass(loggers)) is None) is has_own_clock
 
 
 # ---------------------------------------------------------------- pages
@@ -361,13 +531,22 @@ def test_the_pages_are_those_of_the_catalogue():
         assert (FOLDER / name).read_text(encoding="utf-8") == text, name
 
 
-def test_every_effect_has_a_small_picture():
-    pictures = {path.stem: path.read_bytes() for path in (FOLDER / "images").iterdir()}
-    assert pictures.keys() == {effect.identifier for effect in library()}
-    for name, data in pictures.items():
-        width, height = struct.unpack(">II", data[16:24])
-        assert len(data) <= 40 * 1024, name
-        assert 500 <= width <= 700, name
-        assert 150 <= height <= 300, name
+PICTURES = {path.stem: path for path in (FOLDER / "images").iterdir()}
+
+
+def test_every_effect_has_a_picture():
+    assert PICTURES.keys() == {effect.identifier for effect in library()}
+
+
+@pytest.mark.parametrize("name", sorted(PICTURES))
+def test_pictures_of_effects_are_small(name):
+    data = PICTURES[name].read_bytes()
+    width, height = struct.unpack(">II", data[16:24])
+    assert len(data) <= 40 * 1024
+    assert 500 <= width <= 700
+    assert 150 <= height <= 300
+
+
+def test_pictures_of_effects_are_drawn_again():
     (effect,) = chosen("cubic_stiffness")
-    assert draw(effect, picture_setting()).startswith(b"\x89PNG")  # again
+    assert draw(effect, picture_setting()).startswith(b"\x89PNG")

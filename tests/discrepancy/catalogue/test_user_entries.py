@@ -47,34 +47,63 @@ def test_what_cannot_be_built_says_once_where(setting):
     assert str(caught.value).count("primitives 1") == 1
 
 
-def test_files_with_one_effect_and_with_several_of_a_family_at_places(write, setting):
+def test_a_file_with_one_effect_adds_it_to_the_catalogue(write, setting):
     catalogue = load_catalogue([write(PYLON)], installed=False)
-    assert len(catalogue) == len(library()) + 1
     pylon = effect_by_identifier("store_pylon", catalogue)
-    assert pylon.unavailable(setting) is None
-    assert pylon.places(setting) == ("",)
     (mass,) = pylon.patch(setting, {"mass_ratio": 0.2})
+    assert len(catalogue) == len(library()) + 1
+    assert (pylon.unavailable(setting), pylon.places(setting)) == (None, ("",))
     assert mass == PointMass(pytest.approx(0.02 * setting.scales.modal_mass), setting.scales.length / 2.0)
-    buffer, gauge = load_catalogue([write(BUFFER)], installed=False)[-2:]
-    assert buffer.places(setting) == ("root", "tip", "span")
+
+
+@pytest.fixture
+def family(write):
+    """The two effects of a file: a buffer at ports, and a gauge."""
+    return load_catalogue([write(BUFFER)], installed=False)[-2:]
+
+
+def test_an_effect_of_a_file_is_built_at_a_port(family, setting):
+    buffer, _ = family
     spring, damper = buffer.patch(setting, {"share": 0.05}, "tip")
     port = setting.scales.ports["tip"]
     assert (spring.port, spring.exponent, spring.side) == ("tip", 2.0, 1)
     assert spring.coefficient == pytest.approx(0.05 * port.stiffness * port.displacement)
     assert damper.displacement_exponent == 0.0
-    (free, _) = buffer.patch(setting, {"share": 0.05, "power": 3.5}, "tip")
-    assert free.exponent == 3.5
-    assert gauge.patch(setting, {"g": 0.8}).to_list() == [
-        {"kind": "sensor_gain", "channel": "g0", "gain": 0.5, "quantity": ""}
-    ]
-    # a place that is no port, a value that no primitive can have
-    for old, new, place, sentence in (
-        ('places = "ports"', 'places = ["flap"]', "flap", "has no port 'flap'; it has root, tip, span"),
-        ('side = "2 - 1"', 'side = "0.5 * power"', "tip", "side must be a number"),
-    ):
-        buffer = load_catalogue([write(BUFFER.replace(old, new))], installed=False)[-2]
-        with pytest.raises(CatalogueError, match=sentence):
-            buffer.patch(setting, {"share": 0.05, "power": 2.5}, place)
+
+
+def test_an_effect_of_a_file_has_places_and_a_free_shape(family, setting):
+    buffer, _ = family
+    (spring, _) = buffer.patch(setting, {"share": 0.05, "power": 3.5}, "tip")
+    assert buffer.places(setting) == ("root", "tip", "span")
+    assert spring.exponent == 3.5
+
+
+def test_a_second_effect_of_a_file_is_built(family, setting):
+    _, gauge = family
+    gain = {"kind": "sensor_gain", "channel": "g0", "gain": 0.5, "quantity": ""}
+    assert gauge.patch(setting, {"g": 0.8}).to_list() == [gain]
+
+
+NO_PORT = ('places = "ports"', 'places = ["flap"]')
+NO_SIDE = ('side = "2 - 1"', 'side = "0.5 * power"')
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "sentence"),
+    [
+        (NO_PORT, "flap", "has no port 'flap'; it has root, tip, span"),
+        (NO_SIDE, "tip", "side must be a number"),
+    ],
+    ids=["a place that is no port", "a value that no primitive can have"],
+)
+def test_an_effect_that_cannot_be_built_is_refused(write, setting, change, place, sentence):
+    buffer = load_catalogue([write(BUFFER.replace(*change))], installed=False)[-2]
+    with pytest.raises(CatalogueError, match=sentence):
+        buffer.patch(setting, {"share": 0.05, "power": 2.5}, place)
+
+
+def test_a_value_that_is_possible_at_the_canonical_shape_alone_is_built_there(write, setting):
+    buffer = load_catalogue([write(BUFFER.replace(*NO_SIDE))], installed=False)[-2]
     assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1
 
 
@@ -174,11 +203,17 @@ def test_an_effect_acts_from_a_parameter_after_an_event_on(pump, write):
 
 def test_events_survive_the_files(pump, tmp_path):
     assert pump.events == (Event("pump_on", ("pumping",), time=2.5, until=8.0),)
+    assert read_campaign(write_campaign(pump, tmp_path / "again")).events == pump.events
+
+
+def test_an_event_has_its_moments_in_its_trial_alone(pump):
     assert pump.event_moments("pumping", ["pump_on"]) == [{"pump_on": 2.5, "pump_on_until": 8.0}]
     assert pump.event_moments("quiet", ["pump_on"]) == []
-    assert read_campaign(write_campaign(pump, tmp_path / "again")).events == pump.events
-    every = ("campaign.toml", 'trial = "pumping", time', "time")
-    (event,) = read_campaign(campaign_folder(tmp_path / "a", "pump", every)).events
+
+
+def test_an_event_without_a_trial_is_of_all_trials(tmp_path):
+    of_all = ("campaign.toml", 'trial = "pumping", time', "time")
+    (event,) = read_campaign(campaign_folder(tmp_path / "a", "pump", of_all)).events
     assert event.trials == ("quiet", "pumping")
 
 

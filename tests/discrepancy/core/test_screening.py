@@ -30,32 +30,53 @@ from fe.runtime.patch import ModelPatch, RunOffset
 from . import kit
 
 
-def test_pairs_and_gains_are_those_of_fits():
-    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
-    problem = kit.closed_problem(seed=12, effect=0.12, gain_deviation=0.2)
-    none = kit.fitted(problem)
-    screen = Screen(problem, none)
-    terms = (
-        EffectTerm(kit.offset_effect(deviation=10.0), "y1"),
-        EffectTerm(kit.drift_effect(deviation=10.0), "y1"),
-    )
-    changes = [next(iter(screen.changes_on_grid(term))) for term in terms]
-    ((misfit, first, second),) = best_pairs(changes, screen.inner_product_signs)
-    found = kit.fitted(problem, *terms)
-    assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
+class ScreenedPair:
+    """A problem with two linear effects with wide priors, for which the screen is the fit."""
+
+    def __init__(self):
+        self.problem = kit.closed_problem(seed=12, effect=0.12, gain_deviation=0.2)
+        self.none = kit.fitted(self.problem)
+        self.screen = Screen(self.problem, self.none)
+        self.terms = (
+            EffectTerm(kit.offset_effect(deviation=10.0), "y1"),
+            EffectTerm(kit.drift_effect(deviation=10.0), "y1"),
+        )
+        self.changes = [next(iter(self.screen.changes_on_grid(term))) for term in self.terms]
+
+    def pairs(self, *changes):
+        """Return the best pairs of changes."""
+        return best_pairs([*changes], self.screen.inner_product_signs)
+
+
+@pytest.fixture(scope="module")
+def screened_pair():
+    return ScreenedPair()
+
+
+def test_the_gain_and_start_of_a_pair_are_those_of_its_fit(screened_pair):
+    ((misfit, first, second),) = screened_pair.pairs(*screened_pair.changes)
+    pair = kit.fitted(screened_pair.problem, *screened_pair.terms)
+    gain = screened_pair.none.objective - pair.objective
     start = np.concatenate((first.best_values, second.best_values))
-    np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
-    same = replace(changes[0], term=terms[1])
-    assert (
-        best_pairs([changes[0], changes[0]], screen.inner_product_signs)
-        == best_pairs([changes[0], same], screen.inner_product_signs)
-        == []
-    )
-    for term, change in zip(terms, changes, strict=True):
-        found = kit.fitted(problem, term)
-        prior = 0.5 * float(found.point.effect @ found.point.effect)
-        assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
-        assert change.best_values[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
+    assert gain == pytest.approx(-misfit, rel=0.02, abs=0.05)
+    np.testing.assert_allclose(start, pair.point.effect, rtol=0.03, atol=1e-3)
+
+
+def test_one_change_alone_is_no_pair(screened_pair):
+    change = screened_pair.changes[0]
+    same_change_of_other_term = replace(change, term=screened_pair.terms[1])
+    assert screened_pair.pairs(change, change) == []
+    assert screened_pair.pairs(change, same_change_of_other_term) == []
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_gain_and_value_of_a_change_are_those_of_its_fit(screened_pair, number):
+    change = screened_pair.changes[number]
+    single = kit.fitted(screened_pair.problem, screened_pair.terms[number])
+    prior = 0.5 * float(single.point.effect @ single.point.effect)
+    gain = screened_pair.none.objective - single.objective + prior
+    assert gain == pytest.approx(change.gain, rel=0.02, abs=0.03)
+    assert change.best_values[0] == pytest.approx(single.point.effect[0], rel=0.02, abs=1e-4)
 
 
 def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
@@ -67,38 +88,73 @@ def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
     assert mode.parameters[0].prior.value(change.effect_values[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("freedom", "kinds", "samples", "gap"),
-    [
+class SimulatedGate:
+    """The gate of the absolute fit in simulated outcomes of one problem."""
+
+    def __init__(self, freedom, kinds, samples, gap):
+        self.problem = kit.closed_problem(
+            seed=1, noise=NoiseRecord(0.02, freedom), kinds=kinds, samples=samples
+        )
+        self.freedom, self.samples, self.gap = freedom, samples, gap
+        self.fit = kit.fitted(self.problem)
+        self.generator = np.random.default_rng(17)
+        self.draw_count = 120 if gap else 300
+        draws = [self.draw() for _ in range(self.draw_count)]
+        self.rejected = sum(check_absolute_fit(self.problem, draw).passed is False for draw in draws)
+        self.first_p_values = [absolute_fit_tests(self.problem, draw)[0][1] for draw in draws]
+
+    def draw(self):
+        """Return a fit with other noise, and with a gap that is spread evenly."""
+        scale = 1.0
+        if self.freedom != inf:
+            scale = self.generator.chisquare(self.freedom, 3) / self.freedom
+        freedom_of_fit = self.problem.sample_counts - self.fit.absorbed_freedom
+        squares = (1.0 + self.gap) * self.generator.chisquare(freedom_of_fit) / scale
+        residuals = tuple(self.generator.standard_normal(part.shape) for part in self.fit.residuals)
+        return replace(self.fit, squares_by_channel=squares, residuals=residuals)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
         (inf, ("static",), 0, 0.0),
         (20.0, ("static", "ringdown"), 60, 0.0),
         (200.0, ("ringdown",), 120, 0.0),  # long enough for whiteness
         (inf, ("ringdown",), 80, 0.5),  # a third more variance, spread evenly
     ],
 )
-def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap):
+def simulated_gate(request):
+    return SimulatedGate(*request.param)
+
+
+def test_absolute_gate_has_its_level_and_its_power(simulated_gate):
     """Rejected at most 1e-3 of the time where nothing is missing, and nearly always beside a gap."""
-    problem = kit.closed_problem(seed=1, noise=NoiseRecord(0.02, freedom), kinds=kinds, samples=samples)
-    found = kit.fitted(problem)
-    generator = np.random.default_rng(17)
-    draws, rejected, of_one = 120 if gap else 300, 0, []
-    for _ in range(draws):
-        scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
-        sums = (1.0 + gap) * generator.chisquare(problem.sample_counts - found.absorbed_freedom) / scale
-        residuals = tuple(generator.standard_normal(r.shape) for r in found.residuals)
-        drawn = replace(found, squares_by_channel=sums, residuals=residuals)
-        rejected += check_absolute_fit(problem, drawn).passed is False
-        of_one.append(absolute_fit_tests(problem, drawn)[0][1])
-    assert gap or kstest(of_one, "uniform").pvalue > 1e-3
-    whiteness = any(name.startswith("whiteness") for name, _ in absolute_fit_tests(problem, found))
-    assert whiteness or samples < 120
-    assert rejected > 112 if gap else rejected <= binom.isf(1e-3, draws, 1e-3)
+    gate = simulated_gate
+    if gate.gap:
+        assert gate.rejected > 112
+    else:
+        assert gate.rejected <= binom.isf(1e-3, gate.draw_count, 1e-3)
+
+
+def test_p_values_of_the_absolute_gate_are_uniform_where_nothing_is_missing(simulated_gate):
+    p_value = kstest(simulated_gate.first_p_values, "uniform").pvalue
+    assert simulated_gate.gap or p_value > 1e-3
+
+
+def test_long_records_are_tested_for_whiteness(simulated_gate):
+    names = [name for name, _ in absolute_fit_tests(simulated_gate.problem, simulated_gate.fit)]
+    assert any(name.startswith("whiteness") for name in names) or simulated_gate.samples < 120
+
+
+def test_the_absolute_gate_tells_the_variance_against_the_recorded_noise(simulated_gate):
+    """Also if the noise was widened for the fit."""
+    problem, fit_of_none = simulated_gate.problem, simulated_gate.fit
     wide = ResidualProcess(np.zeros(3), np.full(3, 2.0), *np.zeros((2, 3)), np.ones(3, dtype=bool))
-    told = dict(absolute_fit_tests(problem, replace(found, residual_process=wide)))["variance of y1"]
-    count = problem.sample_counts[0] - found.absorbed_freedom[0]
-    assert told == pytest.approx(
-        variance_p_value(found.squares_by_channel[0] / count, count / 4.0, freedom / 4.0)
-    )
+    tests = dict(absolute_fit_tests(problem, replace(fit_of_none, residual_process=wide)))
+    count = problem.sample_counts[0] - fit_of_none.absorbed_freedom[0]
+    square = fit_of_none.squares_by_channel[0] / count
+    expected = variance_p_value(square, count / 4.0, simulated_gate.freedom / 4.0)
+    assert tests["variance of y1"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
@@ -180,21 +236,48 @@ def rippled(steepest):
     return replace(kit.offset_effect(), identifier="rippled", build=build)
 
 
-def test_intervals_are_as_wide_as_the_posterior_behind_ripples():
-    problem = kit.closed_problem(seed=3, effect=0.2)
-    smooth = kit.fitted(problem, kit.OFFSET)
-    (course,) = named_effects(problem, smooth)[0].parameters
-    candidate = Candidate((EffectTerm(rippled(course.value), "y1"),))
-    found = fit(problem, candidate, smooth.point)
-    drawn = with_draws(problem, found)
-    (narrow,) = named_effects(problem, found)[0].parameters
-    (wide,) = named_effects(problem, drawn)[0].parameters
-    assert narrow.high - narrow.low < 0.65 * (course.high - course.low)
-    assert wide.high - wide.low == pytest.approx(course.high - course.low, rel=0.3)
-    assert with_draws(problem, found).draws.tobytes() == drawn.draws.tobytes()
-    (patches,) = patch_draws(problem, drawn, seed=1, count=300)
-    offsets = np.array([item.offset for patch in patches for item in patch])
-    assert np.ptp(np.quantile(offsets, (0.05, 0.95))) == pytest.approx(course.high - course.low, rel=0.3)
+class RippledPosterior:
+    """An offset behind ripples, fitted and drawn; and the interval of its course without ripples."""
+
+    def __init__(self):
+        self.problem = kit.closed_problem(seed=3, effect=0.2)
+        smooth = kit.fitted(self.problem, kit.OFFSET)
+        course = self.interval(smooth)
+        self.course_width = course.high - course.low
+        candidate = Candidate((EffectTerm(rippled(course.value), "y1"),))
+        self.fit = fit(self.problem, candidate, smooth.point)
+        self.drawn = with_draws(self.problem, self.fit)
+
+    def interval(self, fit_of_effect):
+        (interval,) = named_effects(self.problem, fit_of_effect)[0].parameters
+        return interval
+
+    def width(self, fit_of_effect):
+        interval = self.interval(fit_of_effect)
+        return interval.high - interval.low
+
+
+@pytest.fixture(scope="module")
+def rippled_posterior():
+    return RippledPosterior()
+
+
+def test_intervals_are_as_wide_as_the_posterior_behind_ripples(rippled_posterior):
+    posterior = rippled_posterior
+    assert posterior.width(posterior.fit) < 0.65 * posterior.course_width
+    assert posterior.width(posterior.drawn) == pytest.approx(posterior.course_width, rel=0.3)
+
+
+def test_draws_repeat_to_the_bit(rippled_posterior):
+    again = with_draws(rippled_posterior.problem, rippled_posterior.fit)
+    assert again.draws.tobytes() == rippled_posterior.drawn.draws.tobytes()
+
+
+def test_patches_of_draws_scatter_as_the_posterior(rippled_posterior):
+    (patches,) = patch_draws(rippled_posterior.problem, rippled_posterior.drawn, seed=1, count=300)
+    offsets = np.array([primitive.offset for patch in patches for primitive in patch])
+    width = np.ptp(np.quantile(offsets, (0.05, 0.95)))
+    assert width == pytest.approx(rippled_posterior.course_width, rel=0.3)
 
 
 # ---------------------------------------------------------------- predictions of held-out trials
@@ -324,19 +407,28 @@ def test_white_noise_has_no_remainder(freedom):
     assert wrong <= 1
 
 
-@pytest.mark.parametrize(
-    ("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)]
-)
-def test_size_time_and_frequency_are_found(size, tau, frequency):
+@pytest.fixture(scope="module", params=[(3.0, 0.15, 0.0), (2.0, 1.5, 9.0), (np.sqrt(0.2), 1e-6, 0.0)])
+def coloured_remainder(request):
+    """Amplitude, time and frequency of what is left in y1, the problem, and what is found of it."""
+    problem, _, remainder = ringing(4, 900, coloured(*request.param))
+    return request.param, problem, remainder
+
+
+def test_size_time_and_frequency_are_found(coloured_remainder):
     """And of white noise a fifth above its record a size, and no time over which it forgets."""
-    problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
+    (amplitude, time, frequency), problem, remainder = coloured_remainder
     first = problem.channel_names.index("y1")
     over_noise = np.sqrt(np.mean([data.trial.noise_factor**-2 for data in problem.trials]))
-    assert left.amplitude[first] == pytest.approx(size * over_noise, rel=0.2)
-    assert left.correlation_time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
-    assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
-    assert np.all(np.delete(left.amplitude, first) == 0.0)
-    assert not left.is_all_recorded_colour
+    assert remainder.amplitude[first] == pytest.approx(amplitude * over_noise, rel=0.2)
+    assert remainder.correlation_time[first] == pytest.approx(time, rel=0.6, abs=0.04)
+    assert 2.0 * np.pi * remainder.frequency[first] == pytest.approx(frequency, abs=1.0)
+
+
+def test_channels_without_a_remainder_have_none(coloured_remainder):
+    _, problem, remainder = coloured_remainder
+    others = np.delete(remainder.amplitude, problem.channel_names.index("y1"))
+    assert np.all(others == 0.0)
+    assert not remainder.is_all_recorded_colour
 
 
 def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():

@@ -13,8 +13,9 @@ TIME = 0.01 * np.arange(12.0)
 SWING = np.sin(TIME)
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-def test_vectors_matrices_and_fields_of_structs_are_columns(tmp_path, compressed):
+@pytest.fixture(params=[False, True], ids=["plain", "compressed"])
+def sheet(request, tmp_path):
+    """The sheet of a file with vectors, a matrix, a struct, and other values."""
     content = {
         "time": TIME[:, None],
         "acc": SWING,
@@ -25,12 +26,22 @@ def test_vectors_matrices_and_fields_of_structs_are_columns(tmp_path, compressed
         "image": np.zeros((40, 60)),
         "calibration": np.arange(3.0),
     }
-    savemat(tmp_path / "lab.mat", content, do_compression=compressed)
-    sheet = read_sheet(tmp_path / "lab.mat")
+    savemat(tmp_path / "lab.mat", content, do_compression=request.param)
+    return read_sheet(tmp_path / "lab.mat")
+
+
+def test_vectors_matrices_and_fields_of_structs_are_columns(sheet):
     assert sheet.heads == ("time", "acc", "w 1", "w 2", "data.force", "data.on")
     assert (sheet.units, sheet.decimal) == (("",) * 6, ".")
-    np.testing.assert_array_equal([float(cell) for cell in sheet.numbers("w 2", ".")], 2.0 * SWING)
+
+
+def test_numbers_of_a_column_have_all_digits_and_truths_are_one(sheet):
+    numbers = [float(cell) for cell in sheet.numbers("w 2", ".")]
+    np.testing.assert_array_equal(numbers, 2.0 * SWING)
     assert sheet.numbers("data.on", ".")[5:7] == ("0", "1")
+
+
+def test_what_is_no_column_is_left_out_with_a_remark(sheet):
     left_out = "left out: 'rate', 'note', 'image' and 'calibration'"
     assert sheet.remark == f"rows 1 to 12 of 6 vectors; {left_out}"
 

@@ -167,32 +167,43 @@ def refusal(path):
     return ""
 
 
+PIECES = [
+    b"", b";", b",", b"\t", b'"', b"\n", b"\r", b"nan", b"1e999", b"\xff", b"[", b"(" * 50, b"9" * 400,
+    b"=", b"#", b":", b"31.2.26 1:2:3",
+]  # fmt: skip
+
+
+def damaged_copy(content, rng):
+    """Return a file of which up to six pieces are exchanged by others."""
+    damaged = bytearray(content)
+    for _ in range(rng.randint(1, 6)):
+        begin, end = sorted(rng.randrange(len(damaged) + 1) for _ in range(2))
+        damaged[begin : min(end, begin + 9)] = rng.choice(PIECES)
+    return bytes(damaged)
+
+
 def test_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
-    """Three hundred, and lines that are long or ambiguous, which take no long time."""
-    rng = random.Random(7)
-    pieces = [
-        b"", b";", b",", b"\t", b'"', b"\n", b"\r", b"nan", b"1e999", b"\xff", b"[", b"(" * 50, b"9" * 400,
-        b"=", b"#", b":", b"31.2.26 1:2:3",
-    ]  # fmt: skip
-    started, outcomes = time.process_time(), set()
+    """Three hundred."""
+    rng, outcomes = random.Random(7), set()
     for odd in [*ODD.values()] * 22:
-        damaged = bytearray(bytes_of(odd))
-        for _ in range(rng.randint(1, 6)):
-            at, until = sorted(rng.randrange(len(damaged) + 1) for _ in range(2))
-            damaged[at : min(until, at + 9)] = rng.choice(pieces)
-        (tmp_path / "odd.csv").write_bytes(bytes(damaged))
-        said = refusal(tmp_path / "odd.csv")
-        outcomes.add("refused" if said else "read")
-        assert "\n" not in said
-        assert said.endswith(".") or not said
+        (tmp_path / "odd.csv").write_bytes(damaged_copy(bytes_of(odd), rng))
+        sentence = refusal(tmp_path / "odd.csv")
+        outcomes.add("refused" if sentence else "read")
+        assert "\n" not in sentence
+        assert sentence.endswith(".") or not sentence
     assert outcomes == {"read", "refused"}
+
+
+def test_lines_that_are_long_or_ambiguous_take_no_long_time(tmp_path):
+    """In seconds of this process, whatever else the machine does."""
+    started = time.process_time()
     for content in (
         b"(" * 200_000, b"a" * 200_000, b"1" * 200_000, b"a [" + b"m " * 90_000 + b"];b\n1;2\n",
         b"1," * 100_000, b'"' * 99_999,
     ):  # fmt: skip
         with pytest.raises(CampaignFileError):
             sheet_of(tmp_path, content + b"\n" + content)
-    assert time.process_time() - started < 60.0  # of this process, whatever else the machine does
+    assert time.process_time() - started < 60.0
 
 
 # ---------------------------------------------------------------- Excel
@@ -236,9 +247,12 @@ def test_excel_workbooks(tmp_path, rows, text):
     sheet = read_sheet(book_of(tmp_path, rows))
     assert text_of(sheet) == text
     assert len(sheet.heads) == len(text[0].split())
-    if rows is ROWS:
-        assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
-        assert "rows 4 to 5" in sheet.remark
+
+
+def test_a_workbook_has_its_name_heads_units_and_rows(tmp_path):
+    sheet = read_sheet(book_of(tmp_path, ROWS))
+    assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
+    assert "rows 4 to 5" in sheet.remark
 
 
 def test_one_of_several_sheets(tmp_path):
@@ -283,8 +297,14 @@ def test_units_mean_what_they_always_did_and_what_laboratories_write():
     for quantity, unit, factor in powers + rows("factors", "others"):
         assert quantity in quantities_of(unit), unit
         assert factor_to_si(quantity, unit) == pytest.approx(factor, rel=1e-15), unit
+
+
+def test_usual_units_are_those_that_are_written_down():
     usual = {(quantity, unit) for quantity, row in UNITS.items() for unit in row.usual}
     assert usual == {row[:2] for row in rows("powers", "factors")}
+
+
+def test_a_unit_is_converted_into_one_of_its_quantity_alone():
     assert conversion_factor("ms", "s") == pytest.approx(1e-3, rel=1e-15)
     with pytest.raises(ValueError, match="cannot become s"):
         conversion_factor("mm", "s")

@@ -154,17 +154,25 @@ def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
         assert rest[0] == pytest.approx(begin, abs=1e-6)
 
 
-def test_a_port_that_a_drive_moves_is_measured_by_its_motion_and_the_force() -> None:
-    """Not by the frequency that it would have if it were let go."""
+@pytest.fixture
+def driven_port() -> Any:
+    """The scales of a port whose motion and force are recorded."""
     time, readings = 0.01 * np.arange(300.0), np.linspace(-50.0, 40.0, 300)[:, None]
-    read = {"channels": ("cell",), "values": readings}
-    what = trial(time, actuator(0.02 * np.sin(2.0 * time)), **read)
-    given = campaign(what, cell=Channel("cell", Quantity.FORCE, "cell", None))
-    found = rig("damper").scales(given).ports["piston"]
-    assert found.displacement * found.angular_frequency == pytest.approx(0.04, rel=1e-3)
-    assert found.displacement * found.stiffness == pytest.approx(50.0)
-    assert found.static_stiffness == pytest.approx(300.0)
-    assert (found.driven, found.free) == (True, False)
+    drive = trial(time, actuator(0.02 * np.sin(2.0 * time)), channels=("cell",), values=readings)
+    driven = campaign(drive, cell=Channel("cell", Quantity.FORCE, "cell", None))
+    return rig("damper").scales(driven).ports["piston"]
+
+
+def test_a_port_that_a_drive_moves_is_measured_by_its_motion_and_the_force(driven_port) -> None:
+    assert driven_port.displacement * driven_port.stiffness == pytest.approx(50.0)
+    assert driven_port.static_stiffness == pytest.approx(300.0)
+    assert (driven_port.driven, driven_port.free) == (True, False)
+
+
+def test_a_port_that_a_drive_moves_has_the_speed_of_its_motion(driven_port) -> None:
+    """It does not have the frequency that it would have if it were let go."""
+    speed = driven_port.displacement * driven_port.angular_frequency
+    assert speed == pytest.approx(0.04, rel=1e-3)
 
 
 def test_a_shaken_base_and_a_hand_on_the_mass() -> None:
