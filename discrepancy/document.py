@@ -64,8 +64,8 @@ _MEANING_OF_VALUE = {
     "port": "Name of the port.",
     "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
     "rate": "Relative change in each unit of time.",
-    "reference_displacement": "Displacement by which that of the law is divided.",
-    "reference_velocity": "Speed by which that of the law is divided.",
+    "reference_displacement": "Displacement by which the displacement of the law is divided.",
+    "reference_velocity": "Speed by which the speed of the law is divided.",
     "run": "Label of the run.",
     "side": "Sign of the displacement on which the law acts; 0 for both.",
     "sine": "Amplitude of the sine.",
@@ -109,11 +109,11 @@ def _number(value: object) -> float:
     if value is None or isinstance(value, str):
         if value not in _WORDS:
             raise ValueError(
-                f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came'
+                f'a number, null, "Infinity" or "-Infinity" is expected, but {value!r} was given'
             )
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise ValueError(f"a finite number is expected, and {value!r} came")
+        raise ValueError(f"a finite number is expected, but {value!r} was given")
     return float(value)
 
 

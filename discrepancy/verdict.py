@@ -19,7 +19,7 @@ class VerdictKind(StrEnum):
     NOTHING_MISSING = "nothing missing"  # the model explains the data
     NAMED = "named"  # one effect, or a set of effects
     NAMED_IN_PART = (
-        "named in part"  # they close most of the gap; the rest is no noise and has no name
+        "named in part"  # they close most of the gap; the rest is not a noise and has no name
     )
     FAMILY = "family"  # an effect of this family with a shape of its own
     GROUP = "group"  # one of a group that these data cannot separate

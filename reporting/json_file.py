@@ -93,7 +93,7 @@ def _object_without_repeated_keys(pairs: list[tuple[str, object]]) -> dict[str, 
 
 
 def _refuse_number(text: str) -> NoReturn:
-    raise ValueError(f"{text[:40]} is no number in JSON")
+    raise ValueError(f"{text[:40]} is not a number in JSON")
 
 
 def _parse_finite_float(text: str) -> float:

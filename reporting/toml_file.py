@@ -415,7 +415,7 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
         expectation = f"{_EXPECTED_TYPES[kind]} is expected"
     else:
         expectation = small(fault["msg"])
-    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
+    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} was given"
     if kind in _WORD_TYPES and isinstance(fault["input"], str):
         words = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
         word = nearest_word(fault["input"], words)

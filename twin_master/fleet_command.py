@@ -74,7 +74,7 @@ def watch(
         typer.Option(
             "--steps",
             min=0,
-            help="Leave an asset alone after so many steps.",
+            help="Stop watching an asset after this many steps.",
         ),
     ] = None,
     ca_file: CertificateOption = None,

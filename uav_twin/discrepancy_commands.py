@@ -246,7 +246,7 @@ def _assess_campaign(
     if calibrate is None:
         return separability, None
     workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU already runs in its own process
-    with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as progress:
+    with stage("Testing the workflow on simulated campaigns", calibrate, "campaigns") as progress:
         self_calibration = self_calibrate(
             tested_campaign,
             choice.model,
@@ -444,7 +444,7 @@ def check(
         _print_check(data, chosen, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
-            "Mend the faults first: conclusions from these data would be wrong."
+            "Correct the faults first: conclusions from these data would be wrong."
         )
 
 
@@ -529,7 +529,7 @@ def apply(
         typer.Option(
             "--member",
             metavar="NAME",
-            help="Of a group: which; the most probable by default.",
+            help="For the verdict group: the member to apply; the most probable by default.",
         ),
     ] = None,
     replace: ReplaceOption = False,

@@ -143,7 +143,9 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     for sentence in result.findings:
         page.add_notice(sentence)
     if not result.findings:
-        page.add_paragraph("Noise and priors allow what is left, and every parameter is told.")
+        page.add_paragraph(
+            "The residuals agree with noise and priors, and the data determine every parameter."
+        )
     parameter_columns, titles = drawn_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
@@ -167,7 +169,7 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     add_titled_table(page, parameters_table(result))
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
-    page.add_section("What is left of the readings")
+    page.add_section("Residuals of the readings")
     if result.readings:
         readings = ReportFigure(
             "readings",

@@ -32,7 +32,7 @@ from reporting.words import counted, one_line
 MATLAB = ".mat"
 EXCEL = (".xlsx", ".xlsm")
 OTHER_FORMATS = {
-    ".xls": ("an Excel file of before 2007", "save it as .xlsx or as CSV"),
+    ".xls": ("an Excel file in the format before 2007", "save it as .xlsx or as CSV"),
     ".ods": ("an OpenDocument spreadsheet", "save it as .xlsx or as CSV"),
     ".tdms": (
         "a LabVIEW TDMS file",

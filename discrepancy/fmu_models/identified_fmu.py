@@ -85,7 +85,7 @@ class IdentifiedFmu(FmuRuns):
     ports, port_inputs : list of str
         Names of the ports, and inputs of their forces.
     displacement_columns, velocity_columns : list of int
-        Columns of the ports' displacements and velocities; -1 for a velocity that is no output.
+        Columns of the ports' displacements and velocities; -1 for a velocity that is not an output.
     release_variables : list of str
         Parameter or input that releases the FMU, and the parameter of its velocity.
     """

@@ -236,7 +236,7 @@ class Conclusion:
         other_names = ", ".join(effect.name for effect in effects if not effect.shape)
         beside_clause = f", beside {other_names}" if other_names else ""
         sentence = (
-            f"An effect of the family {family} is missing, with a shape of its own{beside_clause}."
+            f"An effect of the family {family} is missing, with a fitted shape{beside_clause}."
         )
         return self.build_outcome(
             VerdictKind.FAMILY,

@@ -86,8 +86,8 @@ def _exactness_remark(name: str, nuisance: _Nuisance, share: float) -> str:
     """Return the sentence on a channel whose exact zero or gain explains a share of the misfit."""
     return (
         f"The {nuisance.noun} of the channel {name!r} is exact in the campaign; give "
-        f"`{nuisance.key}`: left free, it closes {100.0 * share:.0f} % of the misfit of the model "
-        "without any effect."
+        f"`{nuisance.key}`: if it is fitted, the misfit of the model without any effect falls by "
+        f"{100.0 * share:.0f} %."
     )
 
 

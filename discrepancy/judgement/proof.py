@@ -298,7 +298,7 @@ def check_held_out(after: ResidualSet) -> Gate:
     held_out_scores = compute_scores(after.held_out)
     excess = chi_square_of(after.held_out).excess
     if not isfinite(excess):
-        return _held_out_gate(None, nan, "No noise record to judge them by.")
+        return _held_out_gate(None, nan, "There is no noise record to judge them by.")
     if excess > HELD_OUT_DEVIATIONS:
         reason = f"On held-out trials χ² per sample is {chi_square_text(held_out_scores)}."
         return _held_out_gate(False, excess, reason)
@@ -379,7 +379,7 @@ def _closed_share_or_reason(
     """
     closed = closed_share(before, after)
     if closed is None:
-        return None, "The model as it was leaves no error at all."
+        return None, "The unchanged model leaves no error at all."
     if closed.trials != "held-out":
         return closed, "No trial was held out."
     chi_square_before = _chi_square_by_diagonal(before.held_out or before)

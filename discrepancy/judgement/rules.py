@@ -353,8 +353,8 @@ class VerdictCase:
             return self._unexplained_verdict(sentence, self.probability, gates)
         if self.family_fit is not None and self.tested_family_set is None:
             reason = (
-                "one of them would need a shape of its own, and with so much freedom nearly "
-                "anything fits."
+                "one of them would need a free shape, and with that much freedom nearly anything "
+                "fits."
             )
         nearest = " with ".join(self.leading_fit.candidate.identifiers)
         clause = f"{reason[0].lower()}{reason[1:]}"

@@ -127,7 +127,8 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     has_samples = any(trial.used.any() for trial in fitted.trials)
     if has_samples and all(cell.axis == "frequency" for cell in cells):
         remarks.append(
-            "The model is so far off that beside the noise no cell of the map can be judged."
+            "The errors of the model are so much larger than the noise that no single cell of the "
+            "map can be judged."
         )
     return Location(any(rejected), tests, cells, tuple(findings), tuple(remarks))
 

@@ -86,8 +86,8 @@ def group_lines(separability: Separability, hint: str = "the table says to which
     )
     if not separability.identifiers or not shows_any:
         return [
-            "These trials show none of the effects that can be tested: nothing moves in what the "
-            "model predicts of them. Say how each trial begins and what drives it."
+            "These trials show none of the effects that can be tested: the model predicts no "
+            "motion in them. State how each trial begins and what drives it."
         ]
     if not separability.groups:
         return [
@@ -138,7 +138,7 @@ def campaign_needs(
         sentences.append(
             f"Give a noise record for {', '.join(without_noise)} (samples at rest, or a standard "
             "deviation with its degrees of freedom): without it the absolute gate cannot be "
-            "applied, and the sizes above take a thousandth of the range for its noise."
+            "applied, and the sizes above assume a thousandth of the range as its noise."
         )
     if not campaign.held_out:
         sentences.append(
@@ -171,8 +171,8 @@ def _sentence_on_group(
     names = listing(name.replace("_", " ") for name in group)
     if not kinds:
         return (
-            f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
-            "load, a known added mass, another temperature, strain beside displacement."
+            f"To tell {names} apart, vary what was kept constant: another amplitude, sign or place "
+            "of the load, a known added mass, another temperature, strain beside displacement."
         )
     texts_of_kinds = " or ".join(WORDS_OF_KINDS[kind] for kind in kinds)
     return f"To tell {names} apart, add {texts_of_kinds}: some of them act there and others do not."

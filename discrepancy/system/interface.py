@@ -188,7 +188,7 @@ class Model(ABC):
         if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
             raise ModelError(
                 f"The trial {trial.name!r} is a ring-down, which {self.quoted_name} cannot begin, "
-                'since it is free, driven or has states; say kind = "driven" and begins = '
+                'since it is free, driven or has states; set kind = "driven" and begins = '
                 '"unknown".'
             )
         is_driven = trial.kind is TrialKind.DRIVEN
@@ -343,7 +343,7 @@ class Model(ABC):
         if conditions.parameters.shape != (count,):
             raise ModelError(
                 f"{capital(self.quoted_name)} has {counted(count, 'parameter')}, but "
-                f"{conditions.parameters.size} came."
+                f"{conditions.parameters.size} were given."
             )
         whole_patch = (self.patch + patch).in_trial(trial.name)
         self.check_trial(trial)

@@ -112,7 +112,7 @@ def arrays_from_bytes(
     except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception
         reason = " ".join(str(cause).split()) or type(cause).__name__
         raise ReducedModelFileError(
-            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it "
+            f"{where} is not a valid archive of plain arrays ({reason}); delete it and build it "
             "anew."
         ) from cause
     missing = [name for name in required if name not in arrays]

@@ -118,7 +118,7 @@ def whole(where: str, text: str) -> int:
     try:
         number = int(text)
     except ValueError:
-        fail(where, f"a whole number is expected, but {short_repr(text)} came.")
+        fail(where, f"a whole number is expected, but {short_repr(text)} was given.")
     if abs(number) > _LARGEST_NUMBER:
         fail(where, f"the number {short_repr(text)} is too large.")
     return number
@@ -135,5 +135,5 @@ def real(where: str, text: str) -> float:
     except ValueError:
         number = nan
     if not isfinite(number):
-        fail(where, f"a real number is expected, but {short_repr(text)} came.")
+        fail(where, f"a real number is expected, but {short_repr(text)} was given.")
     return number

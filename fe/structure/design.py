@@ -336,7 +336,7 @@ def parse_structure(
     Raises
     ------
     InvalidDesignError
-        If the content is not a structure; one sentence names the place, what came and what was
+        If the content is not a structure; one sentence names the place, what was given and what was
         expected.
     """
     if "stiffness_matrix" in content:
@@ -354,7 +354,7 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     DesignFileError
         If the file cannot be read or is not TOML.
     InvalidDesignError
-        If its content is no structure.
+        If its content is not a structure.
     """
     file = Path(path)
     return parse_structure(

@@ -168,8 +168,8 @@ class VectorBinding(Section):
         unit_count = len(self.units)
         yield (
             unit_count != count,
-            f"`unit` must be one text, or one for each of the {count} variables, and {unit_count} "
-            "came",
+            f"`unit` must be one text, or one for each of the {count} variables, but {unit_count} "
+            "were given",
         )
 
 
@@ -195,7 +195,7 @@ class PortBinding(Section):
         for name, vector in self.quantities.items():
             unit = vector.unit
             if isinstance(unit, tuple):
-                yield True, f"{name} must have one unit, and {len(unit)} came"
+                yield True, f"{name} must have one unit, but {len(unit)} were given"
                 continue
             units = PORT_QUANTITIES[name]
             # a unit that is not understood (None) is accepted

@@ -94,7 +94,9 @@ class SspPackage:
         with SspError.instead_of(FmuFileError):
             self.names = check_archive(self.path, size, archive_kind="SSP", remedy="export")
         if SSD_NAME not in self.names:
-            raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
+            raise SspError(
+                f"{self.path} is an archive without {SSD_NAME}, so it is not an SSP file."
+            )
 
     def read(self, name: str) -> bytes:
         """Return the content of a file in the archive."""

@@ -98,7 +98,7 @@ def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     said = run(*words, "--no-report")
     assert "Verdict: nothing missing" in said
     assert "apply" not in said
-    assert "nothing is missing, and the model stands as it is" in run(
+    assert "nothing is missing, and the model needs no change" in run(
         "apply", words[-1], "--out", "more.json", failed=True
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig_patched.toml", "verdicts"]

@@ -110,7 +110,7 @@ DEEP = '{"a":' * 5000 + "1" + "}" * 5000
 @pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
 def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
-    with pytest.raises(NotResumableError, match="is no run folder"):
+    with pytest.raises(NotResumableError, match="is not a run folder"):
         read_config(tmp_path)
     with pytest.raises(RunFolderError, match="not touched"):
         make(tmp_path, "second", replace=True)
@@ -218,7 +218,10 @@ def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
 
 
 def test_what_cannot_be_resumed(tmp_path, library_file):
-    for place, sentence in ((tmp_path / "nothing", "there is no run folder"), (tmp_path, "is no run folder")):
+    for place, sentence in (
+        (tmp_path / "nothing", "there is no run folder"),
+        (tmp_path, "is not a run folder"),
+    ):
         with pytest.raises(NotResumableError, match=sentence):
             resume_run(place)
     folder = tmp_path / "run"

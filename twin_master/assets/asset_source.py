@@ -226,16 +226,16 @@ def calibration_sentence(
     """
     if "campaign" not in record:
         return None
-    roles = f"flown and believed is the {asset}"
+    roles = f"asset and belief are the {asset}"
     if asset != believed:
-        roles = f"flown is the {asset}, and the twin believes the {believed}"
+        roles = f"the asset is the {asset}, and the twin believes the {believed}"
     # Without a believed design of its own, the twin believes what flies.
     believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
     if believed_hash is not None and believed_hash == record.get("design_hash"):
         comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
     else:
-        comparison = "The calibration file does not tell whether these are one and the same."
-    return f"Calibrated was the model {record['model']}; {roles}. {comparison}"
+        comparison = "The calibration file does not say whether these are one and the same."
+    return f"The calibrated model was {record['model']}; {roles}. {comparison}"
 
 
 class AssetSource:

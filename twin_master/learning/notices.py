@@ -12,7 +12,7 @@ from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Sus
 
 CLEARLY_BETTER = float(np.log(10.0))
 """Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
-_OR_THE_ASSET = "or the asset near it is not as the model says, as where it has softened"
+_OR_THE_ASSET = "or the asset near it differs from the model, for example because it has softened"
 """Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
 _LEAST_NAMED_PROBABILITY = 0.1
 """A gauge whose probability to be the one that is off is smaller is not named in an alarm."""
@@ -174,7 +174,7 @@ class NoticeWriter:
         onset = float(np.sum(weight * state.gauge_onset))
         if len(named) > 1:
             sensors = self.wording.name_sensors(named)
-            finding = f"one of {sensors} does not show what the model says"
+            finding = f"one of {sensors} does not show what the model predicts"
         else:
             expected_sign = weight @ np.sign(self.gains)
             amount = "much" if expected_sign[named[0]] > 0.0 else "little"

@@ -208,7 +208,7 @@ class _BackwardScan:
                 observations = f"`--observations {self._path.parent}`"
                 advice = f"begin another watch, in another folder, with {observations}"
             raise NotResumableError(
-                f"the journal decided otherwise after step {number} than this version does: "
+                f"the journal has another decision after step {number} than this version makes: "
                 f"{advice}."
             )
 

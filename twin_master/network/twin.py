@@ -196,7 +196,7 @@ class Twin:
     Raises
     ------
     InvalidModelError
-        If the policy has another shape or is no policy, there is no such control, or the lag is
+        If the policy has another shape or is not a policy, there is no such control, or the lag is
         negative.
     InvalidChoiceError
         If `decide_on` is another word.
@@ -419,7 +419,7 @@ class Twin:
             If the bytes are no such state.
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
-        with InvalidModelError.instead_of(*causes, before="this is no saved state of a twin: "):
+        with InvalidModelError.instead_of(*causes, before="this is not a saved state of a twin: "):
             stored = arrays_from_bytes(state, "the state of the twin")
             arrays = {_FORMER_COUNT.sub("steps", name): value for name, value in stored.items()}
             steps, proposed = arrays["steps"].tolist()

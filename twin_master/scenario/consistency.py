@@ -272,7 +272,7 @@ class ScenarioTables(Section):
             yield (
                 max(sensors) > sensor_count or is_repeated,
                 f"`rewards.health_sensors` must name different sensors from 1 to {sensor_count}, "
-                f"and {comma_list(sensors)} came",
+                f"but {comma_list(sensors)} was given",
             )
         yield value_count_fault("rewards.health_limit", rewards.health_limit, limited_count)
         yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
@@ -306,8 +306,8 @@ class ScenarioTables(Section):
             largest = max(fault.sensor_indices(sensor_count)) + 1
             yield (
                 largest > sensor_count,
-                f"`truth.sensor_faults.sensors` counts from 1 to {sensor_count}, and {largest} "
-                "came",
+                f"`truth.sensor_faults.sensors` counts from 1 to {sensor_count}, but {largest} was "
+                "given",
             )
 
     def _strain_noise_fault(self, key: str, noise: float | tuple[float, ...]) -> Fault:

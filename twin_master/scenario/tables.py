@@ -136,7 +136,8 @@ class Transition(Section):
                 departure = max(abs(sum(row) - 1.0) for row in rows)
                 yield (
                     departure > ROW_SUM_TOLERANCE,
-                    f"each row of `{key}.{state}` must sum to 1, one misses it by {departure:.3g}",
+                    f"each row of `{key}.{state}` must sum to 1, but one differs by "
+                    f"{departure:.3g}",
                 )
 
 
@@ -455,7 +456,10 @@ class Learning(Section):
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)
-        yield does_not_increase, f"`learning.transition_factors` must increase, and {listed} came"
+        yield (
+            does_not_increase,
+            f"`learning.transition_factors` must increase, but {listed} was given",
+        )
         yield (
             len(factors) == 1,
             "`learning.transition_factors` needs two or more factors to choose from",

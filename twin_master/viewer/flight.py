@@ -108,7 +108,7 @@ class Flight:
     Raises
     ------
     NotResumableError, RunFolderError
-        If it is no run folder, if it is damaged, or if the flight is not prepared yet (see
+        If it is not a run folder, if it is damaged, or if the flight is not prepared yet (see
         `is_prepared`).
 
     Attributes
@@ -247,7 +247,7 @@ class Flight:
         self._lines_of_steps[observed_step].observation = begin
 
     def _take_event(self, record: StepRecord, begin: int) -> None:
-        """Update the flight with a line that is no step: notices, a verdict, or a patched model.
+        """Update the flight with a line that is not a step: notices, a verdict, or a patched model.
 
         Its notices are shown with the last step before it. If its verdict has a drawing of the
         missing force, the drawing is added.

@@ -321,7 +321,7 @@ class Watch:
         if self.is_quiet:
             when = f"{self.scenario.mission.step_name.capitalize()} {line['step']}"
             silence = self.seconds_since_step
-            sentence = f"{when}: observations come again, after {silence:.0f} s."
+            sentence = f"{when}: observations arrive again, after {silence:.0f} s."
             notices.append(Notice("heard", sentence).as_record())
         if notices:
             line["notices"] = line.get("notices", []) + notices
@@ -332,7 +332,7 @@ class Watch:
         return line
 
     def write_event(self, **fields: object) -> None:
-        """Write an event that is no step, such as a verdict, as a line into the journal.
+        """Write an event that is not a step, such as a verdict, as a line into the journal.
 
         Parameters
         ----------

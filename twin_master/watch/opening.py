@@ -427,8 +427,8 @@ def _open_watch(
     """Return a context manager that gives the new or resumed watch while its folder is locked."""
     if resume and (replace or overrides != Overrides()):
         raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that "
-            "changes it."
+            "a watch is resumed with the inputs in its folder: leave out options that would change "
+            "them."
         )
     if resume or loaded is None:
         return resume_watch(folder, loaded, progress)

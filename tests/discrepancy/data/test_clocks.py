@@ -173,4 +173,4 @@ def test_what_cannot_be_put_on_one_clock_is_one_sentence(tmp_path):
     lines[5] = lines[5].replace(f",{late[4]},", ",,")
     (tmp_path / "lab.csv").write_text("\n".join(lines) + "\n", "utf-8")
     sentence = refusal(read_sheet(tmp_path / "lab.csv"))
-    assert "lab.csv, line 6: 'acc2' has a reading and 'time2' no time" in sentence
+    assert "lab.csv, line 6: 'acc2' has a reading, but 'time2' has no time" in sentence

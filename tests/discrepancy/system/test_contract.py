@@ -184,7 +184,7 @@ OF_ALL = [
     (TrialKind.STATIC, {"load_place": "nose"}, (), r"place (is )?'nose'"),
     (TrialKind.STATIC, {}, (PowerStiffness("nose", 1.0, 3.0, 0, 1.0),), "port 'nose', which"),
     (TrialKind.RINGDOWN, {"release": None}, (), "does not say how it was released"),
-    (TrialKind.STATIC, {"parameters": np.ones(9)}, (), "parameters, but 9 came"),
+    (TrialKind.STATIC, {"parameters": np.ones(9)}, (), "parameters, but 9 were given"),
 ]
 
 

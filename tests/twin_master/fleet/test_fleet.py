@@ -149,7 +149,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
         file.write(64 * "0" + ' {"shard": 2, "fail')  # a line that the kill cut off
     outcome = fly_fleet(fleet, cut)
     assert (outcome.shards_kept, outcome.shards_flown) == (1, 2)
-    kept = [  # the journal keeps times and is no result
+    kept = [  # the journal keeps times and is not a result
         sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
         for folder in (cut, whole)
     ]

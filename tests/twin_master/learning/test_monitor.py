@@ -81,8 +81,8 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     (alarm,) = (notice for one in watched for notice in one.notices if notice.kind == "alarm")
     assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
     assert (
-        ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
-        f"softened, since about step {alarm.since}"
+        ": gauge 2 (spar) shows too much, or the asset near it differs from the model, for example "
+        f"because it has softened, since about step {alarm.since}"
     ) in alarm.sentence
     assert alarm.sentence.endswith("alarm from 100)")
     assert np.abs(found.filtered - plain.filtered).max() > 0.1

@@ -365,7 +365,7 @@ def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario
 
 
 def missing_in(table: dict[str, Any]) -> str:
-    """Return why a table is no scenario."""
+    """Return why a table is not a scenario."""
     with pytest.raises(ScenarioError) as caught:
         parse_scenario(table, "mine.toml")
     return str(caught.value)

@@ -206,7 +206,7 @@ def test_a_cut_without_a_copy_is_told(begun_log, steps, left):
     size = path.stat().st_size
     path.write_text(HEADER + "".join(map(row, left)))
     assert str(next(messages)[0]) == (
-        f"log.csv was cut at byte {size}, and no copy is beside it: what stood behind that and was not read "
+        f"log.csv was cut at byte {size}, and no copy is beside it: what followed and was not read "
         "yet is lost"
     )
     assert new(messages) == left

@@ -268,7 +268,7 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
         return [(said["step"], [notice["kind"] for notice in said["notices"]]) for said in told]
 
     def refused_message_is_sent() -> bool:
-        """Send one, which is no step; return whether the silence was told."""
+        """Send one, which is not a step; return whether the silence was told."""
         os.write(write, b'{"step": 0, "no_sensor": 1.0}\n')
         return any(notice["kind"] == "quiet" for said in told for notice in said["notices"])
 
