@@ -1,4 +1,4 @@
-"""Write the pages of docs/reference/effects from the catalogue, hand-written paragraphs, and pictures.
+"""Write the pages of docs/reference/effects from the catalogue, paragraphs and pictures.
 
 ``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they
 are.

@@ -39,8 +39,9 @@ _INTRODUCTION = """\
 <!-- Written by `python -m benchmarks.store_page` from `twin_master/store/run.toml`. -->
 # Stores of runs and fleets
 
-This page lists the contents of `run.nc` of a run or a watch, and of `fleet.zarr` of a fleet. Where both have the same contents, they have the same groups, variables, axes, labels and units. In a store of a fleet every variable has the axis `twin`
-before its others.
+This page lists the contents of `run.nc` of a run or a watch, and of `fleet.zarr` of a fleet. Where
+both have the same contents, they have the same groups, variables, axes, labels and units. In a
+store of a fleet every variable has the axis `twin` before its others.
 
 ```python
 import uav_twin

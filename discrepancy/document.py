@@ -33,8 +33,8 @@ PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in
 or second)."""
 
 _MEANING_OF_VALUE = {
-    "along_chord": "How much further aft the force acts.",
-    "along_span": "How much further outboard the force acts.",
+    "along_chord": "Distance by which the force acts further aft.",
+    "along_span": "Distance by which the force acts further outboard.",
     "amplitude": "Change of the zero after `time`.",
     "angle": "Angle by which the gauge is turned.",
     "channel": 'Name of the channel, or "*" for all channels of `quantity`.',
@@ -329,7 +329,7 @@ def read_document(
     content = read_json(path, VerdictFileError)
     schema_of_file = content.pop("schema", None) if isinstance(content, dict) else None
     if schema_of_file != schema and schema_of_file not in older:
-        what = f"of the schema {schema_of_file!r}" if schema_of_file else "no file of this kind"
+        what = f"of the schema {schema_of_file!r}" if schema_of_file else "not a file of this kind"
         raise VerdictFileError(f"{path} is {what}, but {schema!r} is needed.")
     if schema_of_file != schema:
         content = {**absent, **content}

@@ -348,7 +348,7 @@ _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 
 
 def _validation_message(error: ValidationError, model: object, what: str, first_index: int) -> str:
-    """Return the message about the fault that helps the user most, of those pydantic found.
+    """Return the message about the fault, among those of pydantic, that helps the user most.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ _WORDS_THAT_ARE_NO_UNITS = {
 """Names that pint takes for lengths and ratios, and measuring software does not."""
 
 _ERRORS_OF_THE_PARSER = (AssertionError, AttributeError, TypeError, ArithmeticError)
-"""What pint raises of texts that are no units, beside errors of its own."""
+"""What pint raises of texts that are not units, beside errors of its own."""
 
 
 class Meaning(NamedTuple):

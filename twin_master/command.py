@@ -342,7 +342,7 @@ def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
 
 
 def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
-    """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
+    """Return the rows of the table of times: asset, twin, checkpoints, and their total."""
     rows = []
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")
@@ -383,7 +383,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
             *_errors_of_lower_layers(),
             *further_errors,
         )
-        # The system's refusals, such as a full disk, are no defects of the program either.
+        # The system's refusals, such as a full disk, are not defects of the program either.
         if not isinstance(error, (OSError, *our_errors)):
             raise
         sentence = str(error)

@@ -383,7 +383,7 @@ def _write_report(folder: Path) -> None:
 def check_scenario(
     loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
 ) -> run_folder.JsonObject:
-    """Check a scenario and all that it names, and return what it flies and what its twin takes.
+    """Check a scenario and its files; return the asset that flies and the model of the twin.
 
     Parameters
     ----------

@@ -199,7 +199,7 @@ def import_files(
         ),
     ] = False,
 ) -> None:
-    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say.
+    """Make a campaign from the files of a laboratory: show how they are read, and ask for missing information.
 
     Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
     """  # noqa: E501

@@ -419,7 +419,7 @@ def check(
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart.
+    """List the faults of the data, the effects that they can show, and those that they cannot tell apart.
 
     Example: `uav-twin discrepancy check measured --model single_mass_rig`
     """  # noqa: E501

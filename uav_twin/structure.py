@@ -122,7 +122,7 @@ def info(
     memory_limit: MemoryLimitOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it.
+    """Print the parts, masses, modes and responses to the loads of a structure.
 
     Example: `uav-twin structure info bracket --modes 3`
     """

@@ -75,7 +75,7 @@ def result_bytes(calibration: Calibration) -> bytes:
 
 
 def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
-    """Return samples (N, F) of all figures as a group with one chain, as ArviZ expects it."""
+    """Return samples (N, F) of the calibrated quantities as a dataset in the layout of ArviZ."""
     return xr.Dataset(
         {
             figure.name: (
@@ -100,7 +100,7 @@ def load_calibration(path: Path | str) -> Calibration:
     groups, root = _read(path)
     schema = root.get("schema")
     if schema != SCHEMA:
-        kind = f"of the schema {str(schema)!r}" if schema else "no calibration file"
+        kind = f"of the schema {str(schema)!r}" if schema else "not a calibration file"
         raise CalibrationRecordError(
             f"{path} is {kind}, but {SCHEMA!r} is needed; calibrate again with this version."
         )
@@ -186,7 +186,7 @@ def _sample_columns(group: xr.Dataset, names: list[str]) -> Float:
 def _read(path: Path) -> tuple[Groups, Root]:
     """Return the groups and the root attributes of a calibration file."""
     if not path.is_file():
-        state = "no file" if path.exists() else "not there"
+        state = "not a file" if path.exists() else "missing"
         raise CalibrationRecordError(
             f"{path} is {state}; give the {FILE_NAME} that `uav-twin calibrate --out DIR` leaves."
         )

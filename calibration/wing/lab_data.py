@@ -240,7 +240,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         require_one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
-        state = "no folder" if path.exists() else "not there"
+        state = "not a folder" if path.exists() else "missing"
         raise ExperimentFileError(
             f"{path} is {state}; give the folder that holds step1, step2 and step3."
         )

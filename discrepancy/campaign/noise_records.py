@@ -46,7 +46,7 @@ def pre_trigger_record(
         )
     if np.ptp(samples) == 0.0:
         raise CampaignDataError(
-            f"{source}: all samples of the channel {name!r} are {samples[0]!r}, so that there is "
+            f"{source}: all samples of the channel {name!r} have the same value, so that there is "
             "no noise in them; record it with the amplifier on, or state its standard deviation."
         )
     mean = float(np.mean(samples))

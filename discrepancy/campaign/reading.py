@@ -207,7 +207,7 @@ def _check_trial_of_event(
     if not trial.is_dynamic:
         raise CampaignFileError(
             f"{source}: the event {event.name!r} is in the trial {name!r}, which is "
-            f"{trial.kind.value} and has no time."
+            f"{trial.kind.value}: its rows have no time."
         )
 
 

@@ -166,7 +166,7 @@ class TrialSection(records.TrialKeys):
     ] = field(default_factory=dict)
     """Rows that do not count, counted from 1, by the name of the channel."""
     begins: records.Start | None = None
-    """How a forced or driven trial began; by default settled under what acts first."""
+    """How a forced or driven trial began; by default at rest under the first loads."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -241,7 +241,7 @@ class CampaignSection(Section):
     input: Annotated[
         tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_input_in_si)], ...], LIST
     ] = ()
-    """What drives a driven trial, or a static trial of an FMU."""
+    """Inputs of a driven trial, or of a static trial of an FMU."""
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
     """The records."""
     event: Annotated[tuple[Event, ...], LIST] = ()

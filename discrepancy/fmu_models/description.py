@@ -80,8 +80,8 @@ class StaticSection(Section):
     Attributes
     ----------
     settle : bool
-        False: the FMU is quasi-static, and a step gives the equilibrium. True: its motion is
-        followed until it rests.
+        False if the FMU is quasi-static, so that a step gives the equilibrium; true if its motion
+        is followed until it rests.
     step : float
         Communication step [s].
     limit : float
@@ -227,7 +227,7 @@ class FmuModelDescription(ModelDescription):
         Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
         `effect.<id>.<number>`).
     superposition : bool
-        Whether motions are superposed where the FMU proves to be linear; False: every motion is
+        Whether motions are superposed if the FMU proves to be linear; if false, every motion is
         stepped.
     isolated : bool
         Whether the FMU runs in a process of its own.

@@ -434,7 +434,8 @@ def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -
     trial = problem.trials[trial_index].trial
     response = fit.responses[trial_index]
     if trial.kind is TrialKind.STATIC:
-        # subtract the row of least force: temperature and the offset of a run are no response to it
+        # subtract the row of least force: temperature and the offset of a run are not responses to
+        # it
         response = response - response[np.argmin(np.abs(trial.force))]
     gains = problem.shared.gains(fit.point.shared, trial.channels)
     return np.asarray((1.0 + gains) * response)

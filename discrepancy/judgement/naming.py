@@ -45,7 +45,8 @@ def reach_verdict(
     effects : sequence of Effect
         The catalogue.
     on_progress : callable
-        Takes a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     on_search : callable
         Takes each search as it begins.
 

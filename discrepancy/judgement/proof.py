@@ -458,7 +458,7 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
 
 
 def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
-    """Return a sentence on what is left in the residuals of a model that contains the effect.
+    """Return a sentence on the residuals of a model that contains the effect.
 
     Parameters
     ----------

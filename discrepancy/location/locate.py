@@ -290,7 +290,7 @@ def _amplitude_and_time_look_alike(
 
 
 def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
-    """Return what disagrees: a single channel, the mode with most of the excess, or all channels.
+    """Return the subject of a disagreement: a channel, the mode with most excess, or all channels.
 
     A channel or a mode is named only if it has more than half of the excess variance.
 

@@ -240,7 +240,7 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
 
 
 def missing_effects_text(verdict: Verdict) -> str:
-    """Return what the model lacks in a few words, for a card at the top of the page."""
+    """Return a few words on what the model lacks, for a card at the top of the page."""
     members = group_members(verdict)
     if members:
         names = listing(members, "or")
@@ -280,7 +280,7 @@ def deciding_gates(verdict: Verdict) -> list[Gate]:
 
 
 def _meaning(verdict: Verdict) -> str:
-    """Return what the kind of the verdict means, as far as the absolute fit could be judged."""
+    """Return the meaning of the kind of a verdict, which depends on the gate of absolute fit."""
     could_not_judge = any(
         gate.name == "absolute fit" and gate.passed is None for gate in verdict.gates
     )

@@ -135,7 +135,7 @@ def ordered_percent(force: ForceAtPort) -> str:
 
 
 def _sentence_on_law(force: ForceAtPort) -> str:
-    """Return how much of a missing force remains beside its law; empty if it was not tested."""
+    """Return how much of a missing force its law leaves; empty if this was not tested."""
     phrases = []
     for role, remainder in tested_trials(force):
         trials = counted(remainder.trials, f"{role} trial")

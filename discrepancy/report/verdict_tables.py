@@ -111,7 +111,7 @@ CAPTION_OF_SIZES = {
 
 
 def effects_table(content: ReportInput) -> TitledTable:
-    """Return the table of what is added to the model, or could be."""
+    """Return the table of the effects that are added to the model, or could be added."""
     verdict = content.investigation.verdict
     is_named = verdict.kind in NAMING
     is_group = bool(group_members(verdict))

@@ -51,7 +51,8 @@ class Search(FittedCandidates):
         The largest decrease of the misfit by each effect, as expected by the screen at the fit
         without effect [nat].
     on_progress : callable
-        Called with a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     wide_problem : Problem or None
         The problem under the wider noise of `wide_fits`, which is as large as the residuals of the
         best hypothesis.

@@ -40,7 +40,8 @@ def search(
         The catalogue. Effects that cannot act in the campaign are left out. If an event of the
         campaign may have begun or ended an effect, the effect is also tried in that form.
     on_progress : callable
-        Called with a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     on_search : callable
         Called with the search after the fit without effect.
 

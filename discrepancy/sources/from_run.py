@@ -105,7 +105,7 @@ def run_campaign(
 
 
 def _check_scenario(folder: Path, scenario: JsonObject) -> None:
-    """Refuse the run of another asset than the wing, or one with a steady force at the tip."""
+    """Refuse a run whose asset is not the wing, or that has a steady force at the tip."""
     states = {state["name"] for state in scenario["state"]}
     is_of_wing = scenario["observation"].get("role") == STRAIN
     if not is_of_wing or states != {*records.USUAL_REGIONS}:

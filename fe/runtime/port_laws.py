@@ -65,7 +65,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
 # ---------------------------------------------------------------- laws of a patch
 
 Span = tuple[float, float]
-"""Begin and end of a time interval [s]."""
+"""Beginning and end of a time interval [s]."""
 
 
 @dataclass(frozen=True)

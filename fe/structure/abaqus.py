@@ -176,7 +176,7 @@ def _coordinate_system(block: _Block) -> CoordinateSystem:
     """
     numbers: list[float] = []
     for where, values in block.data:
-        # empty values at the end of a line are no numbers
+        # empty values at the end of a line are not numbers
         for text in ",".join(values).rstrip(",").split(","):
             numbers.append(real(where, text))
     if len(numbers) not in (0, 3, 6, 9):

@@ -92,7 +92,7 @@ class Gauged(tables.DesignSection):
 
     gauge: tuple[Gauge, ...] = ()
     rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
-    """Rosettes of gauges, which come behind the single ones."""
+    """Rosettes of gauges, which are numbered after the single gauges."""
 
     @model_validator(mode="after")
     def _add_gauges_of_rosettes(self) -> "Gauged":

@@ -227,7 +227,7 @@ def start_values(
     Raises
     ------
     FmuFileError
-        If they are no numbers, or not as many as the array has elements.
+        If they are not numbers, or not as many as the array has elements.
     """
     text = "0" if placeholders else variable.start or "0"
     value_texts = text.lower().split() or ["0"]

@@ -128,7 +128,7 @@ class Connection:
     convert_units : bool
         Whether the value is converted where the units of the ends differ.
     delayed : bool
-        Whether the target gets the value at the begin of the step, whatever the order of the
+        Whether the target gets the value at the beginning of the step, whatever the order of the
         components.
     """
 

@@ -150,6 +150,6 @@ class CoSimulation(FmuInstance):
         query_status = dll.fmi2GetRealStatus(
             component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached_time)
         )
-        # FMUs of pythonfmu claim at every discarded step that they ended at its begin
+        # FMUs of pythonfmu claim at every discarded step that they ended at its beginning
         if query_status == OK and reached_time.value > self._step_begin.value:
             raise self._ended_error(self._limited_to_step(reached_time.value))

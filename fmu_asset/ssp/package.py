@@ -225,7 +225,7 @@ def _convert_to_ssp1(root: XmlElement, label: str) -> None:
 
 
 def _unsupported_part(element: XmlElement, tag: etree.QName) -> str:
-    """Return what an element has that is not supported, for a message; empty if nothing."""
+    """Return the unsupported part of an element, for a message; empty if all of it is supported."""
     if tag.localname == "Component" and element.get("source") is None:
         return f"the component {element.get('name')!r} without a source"
     if element.get("kind") in ("clock", "structuralParameter"):

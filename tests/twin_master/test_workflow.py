@@ -63,7 +63,7 @@ def test_a_run_that_flies_is_not_replaced_nor_anything_that_is_no_run(tmp_path):
     make(mine, "first", replace=True)  # an empty folder
     (mine / "config.json").unlink()
     thesis = written(mine, "important", name="thesis.txt")
-    for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
+    for place, sentence in ((mine, "left unchanged"), (thesis, "no folder")):
         with pytest.raises(RunFolderError, match=sentence):
             make(place, "second", replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"
@@ -112,7 +112,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
     with pytest.raises(NotResumableError, match="is not a run folder"):
         read_config(tmp_path)
-    with pytest.raises(RunFolderError, match="not touched"):
+    with pytest.raises(RunFolderError, match="left unchanged"):
         make(tmp_path, "second", replace=True)
     for name in ("timing.json", "summary.json"):  # of a run that is finished both are whole
         for file in ("timing.json", "summary.json"):

@@ -157,7 +157,7 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
 
 
 def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> Float:
-    """Return what an asset would observe in every state under every control, without noise.
+    """Return the observations of an asset in every state under every control, without noise.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class AssetSource:
 
     @cached_property
     def file_paths(self) -> dict[str, Path]:
-        """The files of the table, and the calibration file, by the paths of their copies."""
+        """The files of the table and of the calibration; keys are the paths of their copies."""
         section_files = {} if self.section is None else self.section.all_files()
         return {**section_files, **self._scenario.calibration.all_files()}
 

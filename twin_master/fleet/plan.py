@@ -429,7 +429,7 @@ def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
         return []
     files = sorted(folder.glob(pattern))
     if not files:
-        raise FleetError(f'no file fits `{section.pattern_key}s = "{pattern}"` in {folder}.')
+        raise FleetError(f'no file matches `{section.pattern_key}s = "{pattern}"` in {folder}.')
     return files
 
 

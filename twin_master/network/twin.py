@@ -358,7 +358,7 @@ class Twin:
         return self._decide(replace(estimate, notices=tuple(notices)))
 
     def observed(self, step: int) -> Float:
-        """Return what was observed in a kept step: (G,), NaN where nothing was received."""
+        """Return the observation (G,) of a kept step; NaN for a sensor without a reading."""
         return self._kept_steps[step - self._first_in_memory].observation
 
     def control_of(self, step: int) -> int:
@@ -416,7 +416,7 @@ class Twin:
         Raises
         ------
         InvalidModelError
-            If the bytes are no such state.
+            If the bytes are not such a state.
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
         with InvalidModelError.instead_of(*causes, before="this is not a saved state of a twin: "):

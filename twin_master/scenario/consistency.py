@@ -70,7 +70,7 @@ class ScenarioTables(Section):
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
     """The controls that the twin chooses from."""
     action: tuple[Action, ...] = ()
-    """Inspections, repairs and the end of the mission, beside the controls."""
+    """Inspections, repairs and the end of the mission, in addition to the controls."""
     observation: ObservationSection
     """What is observed, and how well."""
     transition: Transition
@@ -278,7 +278,7 @@ class ScenarioTables(Section):
         yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
 
     def _sensor_faults(self) -> Iterator[Fault]:
-        """Yield (is present, message) of each possible fault: what is stated by sensor."""
+        """Yield (is present, message) of each possible fault of values stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
             yield value_count_fault(

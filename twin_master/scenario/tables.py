@@ -292,7 +292,7 @@ class InspectedState(NamedTuple):
 
 
 class Action(Section):
-    """A choice in a step beside the controls, such as an inspection or a repair."""
+    """A choice in a step in addition to the controls, such as an inspection or a repair."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
     name: Name
@@ -546,7 +546,9 @@ class WatchSection(FileSection):
     observations: str | None = None
     """A recorded file that is watched by default, or the name of a shipped one."""
     lag: Count = 50
-    """Steps back over which the twin smooths; a message may be as late."""
+    """Number of past steps over which the twin smooths; a message may be late by this number of
+    steps.
+    """
     longest_gap: Count = 1000
     """Steps that a message may be ahead of the next one; the twin predicts those between."""
     seconds_per_step: Positive | None = None

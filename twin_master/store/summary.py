@@ -123,7 +123,7 @@ def find_fallback(
 ) -> Fallback:
     """Return when the policy calls for another control than the first one, and when it was flown.
 
-    T is the number of steps, S that of states, F that of state factors.
+    T is the number of steps, S the number of states, and F the number of state factors.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ _CONVERSIONS: dict[str, Callable[[str], object]] = {
     "time": float,
     "control": str,
 }
-"""The columns that are no sensor, with the conversion of their cells."""
+"""The columns that are not sensors, with the conversion of their cells."""
 _MISSING_VALUES = ("nan", "null", "none")
 """Cells of these columns that mean that there is no value."""
 

@@ -314,7 +314,8 @@ class Watch:
     def _write_step(self, step: MissionStep) -> JsonObject:
         """Write a step into the journal, with the notices that were pending; return its line.
 
-        If the operator was told that no step comes any more, a notice says that they come again.
+        If a notice has said that no step is received any more, another one says that steps are
+        received again.
         """
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)

@@ -35,7 +35,7 @@ _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
 """A unit whose first name has a power. The prefix has this power, too: a mm2 is 1e-6 m2."""
 _FACTORS_WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 OTHER_KEYS = "step", "time", "control"
-"""The keys of a message that are no sensor."""
+"""The keys of a message that are not sensors."""
 PRESENT_NAMES = {"turn": "step"}
 """The present name of each key of a message, and of each column of a file, by its former name."""
 _UNITS_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -67,7 +67,7 @@ class Message(Reading):
     assumed : bool
         Whether its control was assumed when it was recorded, because no message had named it.
     ignored : dict of str to str
-        The names in it that are no sensor. The value of a name is the known name that it was
+        The names in it that are not sensors. The value of a name is the known name that it was
         probably meant to be, in words; it is empty if there is none.
     """
 
@@ -140,7 +140,7 @@ class MessageReader:
     Attributes
     ----------
     allows_unknown : bool
-        Whether keys that are no sensor are ignored, and not refused.
+        Whether keys that are not sensors are ignored, and not refused.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -222,7 +222,7 @@ class MessageReader:
         return matches[0] if matches else ""
 
     def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
-        """Return a sentence that says which names are no sensor, and what sensors are called.
+        """Return a sentence that says which names are not sensors, and what sensors are called.
 
         Parameters
         ----------

@@ -296,10 +296,10 @@ def watch(
     from_step : int, optional
         The first step in which the patch is believed.
     teach : bool
-        Whether to look for the cause of an alarm, and to believe in later steps what is named and
-        proved.
+        Whether to look for the cause of an alarm, and to believe an effect that is named and proved
+        in later steps.
     allow_unknown : bool
-        Whether to ignore keys and columns that are no sensor.
+        Whether to ignore keys and columns that are not sensors.
     ca_file : Path or str, optional
         The certificate of the authority of an ``mqtts://`` broker.
     replace : bool

@@ -176,7 +176,7 @@ class StreamNotices:
 
     @property
     def has_refusals_to_report(self) -> bool:
-        """Whether enough messages were refused in a row, and the operator was not told yet."""
+        """Whether enough messages were refused in a row, and the operator was not notified yet."""
         return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_reported
 
     def report_refusals(self, next_step: int) -> Notice:
@@ -243,8 +243,8 @@ class StreamNotices:
         is_blind : bool
             Whether the message has no reading of any sensor.
         ignored : dict of str to str
-            The names in the message that are no sensor. The value of a name is the known name that
-            it was probably meant to be, in words; it is empty if there is none.
+            The names in the message that are not sensors. The value of a name is the known name
+            that it was probably meant to be, in words; it is empty if there is none.
         """
         when = f"{self._words.step.capitalize()} {step}"
         notices = self.pop_pending()

@@ -188,7 +188,7 @@ def reversal_correction(
         Correction of the speed at the end.
     position : float
         Correction of the position at the end. If friction holds the port, it is instead the
-        distance from the position at the begin of the step to that of the reversal.
+        distance from the position at the beginning of the step to that of the reversal.
     is_held : float
         1 if friction holds the port from the reversal on, else 0.
     """

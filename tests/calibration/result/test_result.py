@@ -279,7 +279,7 @@ def test_a_folder_is_no_calibration(tmp_path):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(CalibrationRecordError, match="is not there; give the calibration"):
+    with pytest.raises(CalibrationRecordError, match="is missing; give the calibration"):
         load_calibration(tmp_path / "d.nc")
 
 

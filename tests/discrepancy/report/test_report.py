@@ -408,7 +408,7 @@ def test_an_old_verdict_is_not_lost(drag, tmp_path):
     assert not (folder / "notes.txt").exists()
     assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
     (other / "chapter.tex").write_text("x", encoding="utf-8")
-    for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
+    for place, words in ((other, "left unchanged"), (other / "chapter.tex", "no folder")):
         with pytest.raises(FileNotWrittenError, match=words):
             check_verdict_folder(place, replace_it=True)
 

@@ -43,7 +43,7 @@ def assert_holds(arrays: Any, values: Any) -> None:
 
 
 def assert_archive_refused(
-    content: bytes, sentence: str = "not a sound archive of plain arrays"
+    content: bytes, sentence: str = "not a valid archive of plain arrays"
 ) -> None:
     with refused(ReducedModelFileError, sentence):
         arrays_from_bytes(content, "x.npz", ["a"])

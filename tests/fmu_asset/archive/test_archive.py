@@ -91,7 +91,7 @@ def test_a_text_is_refused(tmp_path):
     path = tmp_path / "a.fmu"
     path.write_text("hello", encoding="utf-8")
 
-    assert_file_refused(path, r"not a sound FMU archive .* fetch or build it again")
+    assert_file_refused(path, r"not a valid FMU archive .* fetch or build it again")
 
 
 def test_an_archive_with_a_link_out_of_its_folder_is_refused(fmu, tmp_path):

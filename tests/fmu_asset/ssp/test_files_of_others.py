@@ -332,7 +332,7 @@ def test_half_of_a_file_is_refused(pack, tmp_path):
     damaged = tmp_path / "damaged.ssp"
     damaged.write_bytes(content[: len(content) // 2])
 
-    with pytest.raises(SspError, match=r"not a sound SSP archive|so it is not an SSP file"):
+    with pytest.raises(SspError, match=r"not a valid SSP archive|so it is not an SSP file"):
         read_ssp(damaged, tmp_path / "fmus")
 
     assert not (tmp_path / "fmus").exists()

@@ -182,7 +182,7 @@ def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
     for opened in (open_fleet, learn_fleet, write_fleet_report):
         with pytest.raises(RunFolderError, match="not the folder of a fleet"):
             opened(tmp_path / "other")
-    with pytest.raises(RunFolderError, match="not touched"):
+    with pytest.raises(RunFolderError, match="left unchanged"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
     for lacking, sentence in (

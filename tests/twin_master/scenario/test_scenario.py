@@ -296,9 +296,14 @@ def test_what_options_change_and_what_stays_the_scenarios(folder):
     [
         ("level_turns", (), LIBRARY | FILE, "a strain library brings its own samples"),
         ("level_turns", (OF_CALIBRATION,), {}, "there is no calibration file: give --calibration"),
-        ("three_fmus", (OF_CALIBRATION,), {}, "the design of a calibration is asked for, and there is no"),
+        (
+            "three_fmus",
+            (OF_CALIBRATION,),
+            {},
+            "the scenario asks for the design of a calibration, but there is no",
+        ),
         ("level_turns", (), {"calibration": "half.nc"}, "damaged"),
-        ("level_turns", (), {"calibration": "none.nc"}, "not there"),
+        ("level_turns", (), {"calibration": "none.nc"}, "is missing"),
         ("level_turns", ((BOUND, f'{BOUND}patch = "q.json"\n'),), {}, r"q\.json cannot be read"),
         ("level_turns", (FLOWN_PATCH, HIDDEN), {}, r"effect\.hiden\.active"),
         ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
