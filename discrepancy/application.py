@@ -116,8 +116,9 @@ def apply_verdict(
     if path.suffix == ".toml":
         if not has_laws_only:
             raise ModelError(
-                f"{path}: only laws at the ports of a lumped model can stand in its own file; give "
-                "--out with the ending .json, which can be given wherever a model is expected."
+                f"{path}: only laws at the ports of a lumped model can be written into its own "
+                "file; give --out with the ending .json, which can be given wherever a model is "
+                "expected."
             )
         atomic_write_text(path, _lumped_text(choice, patch))
     else:
@@ -169,8 +170,8 @@ def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> 
         VerdictKind.NAMED_IN_PART: "named in part: the remainder has no name",
         VerdictKind.FAMILY: "of which the family is named, not the law",
         VerdictKind.GROUP: (
-            "one of a group that the data cannot tell apart: no name (of "
-            f"{', '.join(stored.verdict.group)})"
+            "one of a group that the data cannot tell apart, and not a name (group: "
+            "{', '.join(stored.verdict.group)})"
         ),
         VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
     }
@@ -249,7 +250,7 @@ def _patch_to_apply(
 
 _NOTHING_TO_APPLY = {
     VerdictKind.NOTHING_MISSING: "nothing is missing, and the model needs no change",
-    VerdictKind.BELOW_LIMIT: "what may be missing is too small to tell from noise",
+    VerdictKind.BELOW_LIMIT: "an effect may be missing, but it cannot be distinguished from noise",
     VerdictKind.DATA_ERROR: "the data contain a fault; correct them first",
     VerdictKind.UNEXPLAINED: ("none of its hypotheses makes the error of the model smaller"),
 }
@@ -365,7 +366,7 @@ def pack_patched(
     """
     if choice.design is None:
         raise ModelError(
-            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with "
+            f"{path}: only a wing is packed with its effects; for {choice.label} give --out with "
             "the ending .json, which can be given wherever a model is expected."
         )
     effect_tables = []

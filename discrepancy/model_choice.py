@@ -212,8 +212,8 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
         model_file = Path(file).parent / model_file.name
         if not model_file.exists():
             raise ModelError(
-                f"The model {origin.model_file}, on which {file} rests, is gone: put it back "
-                f"there, or beside {Path(file).name}."
+                f"The model {origin.model_file}, on which {file} is based, does not exist any "
+                f"more: put it back there, or into the folder of {Path(file).name}."
             )
     is_shipped_wing = not origin.model_file
     choice = choose_model(None if is_shipped_wing else model_file, progress)

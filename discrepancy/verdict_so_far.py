@@ -38,8 +38,8 @@ class VerdictSoFar:
 
 
 REMARK = (
-    "The search was interrupted: probabilities are among the hypotheses fitted until then, no gate "
-    "was applied, and nothing was proved on held-out trials."
+    "The search was interrupted: probabilities are relative to the hypotheses that were fitted "
+    "until then, no gate was applied, and nothing was proved on held-out trials."
 )
 
 

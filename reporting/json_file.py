@@ -117,7 +117,7 @@ def _parse_integer(digits: str) -> int:
         number = int(digits)
         if _SMALLEST_INTEGER <= number <= _LARGEST_INTEGER:
             return number
-    raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
+    raise ValueError(f"an integer of {len(digits)} digits, but a file may have 64 bits")
 
 
 def _null(_: float) -> None:

@@ -400,7 +400,7 @@ def _compare_returns(
 def _print_design(record: Record, candidates: int) -> None:
     """Print the chosen sensors with their information, and what no candidate separates."""
     for sensor, information in zip(record["sensors"], record["information"], strict=True):
-        terminal.say(f"{sensor}: {information:.3f} bit with those before it.")
+        terminal.say(f"{sensor}: {information:.3f} bit together with the sensors above.")
     terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")
     for levels in record["not_separated"]:
         terminal.say(

@@ -123,7 +123,7 @@ def watch(
         bool,
         typer.Option(
             "--teach",
-            help="Look for the cause of an alarm, and believe what is named.",
+            help="Look for the cause of an alarm, and believe the named effect.",
         ),
     ] = False,
     allow_unknown: Annotated[

@@ -394,7 +394,7 @@ def effects(
         cells = (effect.identifier, effect.name, effect.family, formula(effect.equation))
         rows.append([in_one_line(cell) for cell in cells])
     terminal.print_table(("id", "name", "family", "equation"), rows)
-    terminal.say(f"{counted(len(rows), 'effect')}; --show ID tells everything about one.")
+    terminal.say(f"{counted(len(rows), 'effect')}; --show ID prints everything about one of them.")
 
 
 def _print_effect(effect: "Effect") -> None:

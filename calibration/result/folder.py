@@ -163,7 +163,9 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         "prior_and_posterior",
         corner_figure(titles, [posterior_set, prior_set]),
         title="Prior and posterior",
-        caption="The same with samples of the prior; the histograms have scales of their own.",
+        caption=(
+            "The same figure with samples of the prior. The histograms have scales of their own."
+        ),
     )
     add_figure(page, prior_and_posterior, folder)
     add_titled_table(page, parameters_table(result))
@@ -176,8 +178,8 @@ def begun_page(result: Calibration, folder: Path) -> Page:
             readings_figure(result),
             title="Readings",
             caption=(
-                "The model before and after the calibration, and what was measured with its 95 % "
-                "interval. The vertical scale of each panel is free."
+                "The model before and after the calibration, and the measured values with 95 % "
+                "intervals. Each panel has a vertical scale of its own."
             ),
         )
         add_figure(page, readings, folder)

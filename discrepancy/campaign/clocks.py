@@ -278,7 +278,7 @@ def _rest_samples_in_order(
             )
             cells[column.title] = tuple(column_cells)
     lines = tuple(clocks[0].times.sheet.lines[row] for row in longest.rows)
-    remark = f"{_stamped_columns_text(clocks)}: samples at rest stand in their order"
+    remark = f"{_stamped_columns_text(clocks)}: samples at rest are kept in their order"
     return MergedTable(cells, lines, remark)
 
 

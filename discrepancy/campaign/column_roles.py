@@ -79,7 +79,7 @@ class ColumnReader:
         """Return the record of a column of readings; ask the user for a role or unit it lacks."""
         role = self._determine_role(sheet, head, unit)
         if not unit and role != LEFT_OUT:
-            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
+            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a plain number")
         if not unit or role == LEFT_OUT:
             return LaboratoryColumn(sheet, head, role, unit)
         try:

@@ -120,8 +120,8 @@ def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
         if hold not in (None, records.Hold.SMOOTH):
             raise ValueError(
                 f"the input {recorded.name!r} is a motion, which no drive makes in steps or "
-                "corners: leave `hold` out, or say smooth, or reference = true where it is what a "
-                "controller shall follow"
+                "corners: leave `hold` out, set it to smooth, or set reference = true if a "
+                "controller follows the motion"
             )
         hold = records.Hold.SMOOTH
     return replace(recorded, offset_deviation=deviation, hold=hold)

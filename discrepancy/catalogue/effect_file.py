@@ -335,7 +335,8 @@ def _parse_primitive(
         for key, value in row.items():
             if key not in allowed_keys:
                 raise CatalogueError(
-                    f"{place} has the unknown key {key!r}; known are {', '.join(allowed_keys)}."
+                    f"{place} has the unknown key {key!r}; the known keys are "
+                    f"{', '.join(allowed_keys)}."
                 )
             text = value if isinstance(value, str) else repr(value)
             if key == "kind":

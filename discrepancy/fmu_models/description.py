@@ -260,8 +260,8 @@ class FmuModelDescription(ModelDescription):
             why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
             yield (
                 kind not in CARRIED,
-                f"effects.{kind} is not a primitive that an FMU can carry itself{why}; known are "
-                f"{', '.join(CARRIED)}",
+                f"effects.{kind} is not a primitive that an FMU can carry itself{why}; the known "
+                f"ones are {', '.join(CARRIED)}",
             )
         inputs = self.inputs
         lacks_temperature = inputs.temperature_reference is not None and inputs.temperature is None

@@ -410,8 +410,8 @@ def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
     """
     nearest = f"; the nearest are {', '.join(names[:4])}" if names else ""
     return (
-        "Something may be missing, but too small for these data to tell from noise"
-        f"{noise_clause}{nearest}."
+        "Something may be missing, but it is too small for these data to distinguish from "
+        f"noise{noise_clause}{nearest}."
     )
 
 

@@ -65,6 +65,6 @@ def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: Hypoth
         if (effect.family, effect.place) not in families:
             added.append(effect)
     return (
-        f" {capital(effects_text(added))} may be there beside it, but is not proved: it gains less "
-        "evidence than it costs."
+        f" {capital(effects_text(added))} may be missing, too, but this is not proved: it gains "
+        "less evidence than it costs."
     )

@@ -488,7 +488,7 @@ def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
             f"The size is that of noise ({chi_square_phrase}), but residuals are not white "
             f"(p = {scores.whiteness:.1g})."
         )
-    return f"Nothing that these data can show remains ({chi_square_phrase})."
+    return f"These data show no remaining error ({chi_square_phrase})."
 
 
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:

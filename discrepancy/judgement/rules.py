@@ -280,7 +280,7 @@ class VerdictCase:
         reason = most_probable.absolute_fit.reason
         sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
         if count:
-            sentence = f"There is a gap, and {count} explanations fit it alike."
+            sentence = f"There is a gap, and {count} explanations fit it equally well."
         return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,

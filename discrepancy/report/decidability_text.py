@@ -91,7 +91,8 @@ def group_lines(separability: Separability, hint: str = "the table says to which
         ]
     if not separability.groups:
         return [
-            "Every effect that can be tested here can be told from every other at its prior median."
+            "Every effect that can be tested here can be distinguished from every other one at its "
+            "prior median."
         ]
     lines = []
     for group in separability.groups:

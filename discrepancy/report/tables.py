@@ -207,8 +207,8 @@ def detectable_sizes_table(separability: Separability) -> TitledTable:
         table_of_records(columns, testable_effects(separability)),
         title="Detectable sizes",
         caption=(
-            "From the model, the inputs and the noise alone. Detectable from: the size at which d² "
-            "reaches 25, with all nuisances adapted."
+            "Computed from the model, the inputs and the noise, without the readings. Detectable "
+            "from: the size at which d² reaches 25, with all nuisances adapted."
         ),
     )
 
@@ -322,5 +322,5 @@ def origin_table(origin: Origin) -> TitledTable:
     return TitledTable(
         Table([PageColumn("item"), PageColumn("value")], rows),
         title="Provenance",
-        caption="verdict.json, patch.json and residuals.nc beside this page hold every figure.",
+        caption="verdict.json, patch.json and residuals.nc beside this page contain every number.",
     )

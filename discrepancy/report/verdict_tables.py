@@ -139,7 +139,7 @@ def effects_table(content: ReportInput) -> TitledTable:
     if is_group:
         title = "The members of the group"
     else:
-        title = "What is added" if is_named else "What could be added"
+        title = "What is added" if is_named else "Effects that could be added"
     table = table_of_records(columns, effect_rows(verdict))
     return TitledTable(table, title, " ".join(sentences).rstrip())
 

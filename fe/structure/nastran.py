@@ -299,7 +299,7 @@ def _refuse_continuation(line: _Line) -> NoReturn:
     """Refuse a continuation that belongs to no line."""
     fail(
         line.where,
-        f"the continuation {short_repr(line.head)} stands behind no line that it continues.",
+        f"the continuation {short_repr(line.head)} follows no line that it could continue.",
     )
 
 

@@ -118,8 +118,8 @@ class CoSimulation(FmuInstance):
             self.lost = True
             raise FmuCallError(
                 f"The FMU returned early, at t = {self._reached_time.value:g} s, in "
-                f"{self._step_label()}, though it was told that this is not supported; try a "
-                "smaller step_size in the binding.",
+                f"{self._step_label()}, although early returns are not allowed; try a smaller "
+                "step_size in the binding.",
                 self._last_messages(),
             )
 

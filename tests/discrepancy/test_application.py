@@ -181,7 +181,10 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
     for words, member in (((), leading), (("--member", other), other)):
         out = tmp_path / f"{member}.json"
         told = run("apply", tmp_path / "verdict", "--out", out, *words)
-        assert f"one of a group that the data cannot tell apart: no name (of {leading}, {other})." in told
+        assert (
+            f"one of a group that the data cannot tell apart, and not a name (group: {leading}, {other})."
+            in told
+        )
         stored = read_patch(out)
         assert stored.verdict is VerdictKind.GROUP
         assert stored.sentence.startswith(told.splitlines()[0].split(": ", 1)[1])

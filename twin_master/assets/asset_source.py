@@ -52,8 +52,8 @@ HASHED_COPIES = {
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
 NO_ASSET = (
-    "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` "
-    "takes in, and its `belief` must be a model of its own."
+    "this scenario has no `[asset]`: it is for a real asset, whose observations `uav-twin watch` "
+    "reads, and its `belief` must be a model of its own."
 )
 
 

@@ -111,8 +111,8 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
     """
     if scenario.observation.role == "modes":
         raise FleetError(
-            'a fleet keeps values alone, and `role = "modes"` observes each step with its own '
-            "covariance: fly the scenario with `uav-twin run`."
+            'a fleet stores values without covariances, but with `role = "modes"` each step has a '
+            "covariance of its own: fly the scenario with `uav-twin run`."
         )
     if group.observations:
         _check_recordings(group)

@@ -280,14 +280,14 @@ def _prepare_folder(
         if not resume:
             raise MissionInputError(
                 f"{folder} holds the finished blocks of an interrupted sampling: give --resume to "
-                "go on with them, or --replace to begin anew."
+                "go on with them, or --replace to begin again."
             )
         former_plan = plan_file.read_bytes() if plan_file.is_file() else b""
         if former_plan and former_plan != plan.encode("utf-8"):
             difference = _differing_keys(former_plan, record)
             raise MissionInputError(
                 f"{folder} holds blocks of another FMU, binding, grid or version ({difference}): "
-                "give --replace to begin anew."
+                "give --replace to begin again."
             )
         if former_plan:
             return folder

@@ -457,9 +457,9 @@ class Twin:
             is_finite = False
         if not is_finite:
             raise InvalidObservationError(
-                f"twin {self.name!r}, step {step}: the observation cannot be weighed, for beside "
-                "what was observed before its numbers leave no belief; check the sensors and the "
-                "control in force"
+                f"twin {self.name!r}, step {step}: the observation is so improbable after the "
+                "earlier ones that no belief can be computed; check the sensors and the control "
+                "in force"
             )
         return estimate
 

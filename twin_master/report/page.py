@@ -210,7 +210,7 @@ def render_page(
     tables.add_run_table(page, run, seed)
     page.begin_fold("Versions of the software and hashes of the inputs")
     page.add_paragraph(
-        "Wall-clock times stand in timing.json, so that equal runs give equal reports."
+        "Wall-clock times are only in timing.json, so that equal runs give equal reports."
     )
     tables.add_provenance_table(page, run)
     page.end_fold()

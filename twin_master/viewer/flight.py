@@ -240,7 +240,7 @@ class Flight:
         if not 0 <= observed_step <= record["step"] == last_step:
             step = f"{self.scenario.mission.step_name} {record['step']}"
             raise RunFolderError(
-                f"the journal in {self.folder} tells {step} where {self.steps} was expected: it is "
+                f"the journal in {self.folder} has {step} where {self.steps} was expected: it is "
                 "of another version."
             )
         self._lines_of_steps[-1].belief = begin

@@ -335,8 +335,8 @@ class MessageReader:
         if readings.nested_name and not readings.sensors:
             example = next(iter(self._sensor_of_name))
             raise Refused(
-                f"`{readings.nested_name[:_SHOWN_CHARACTERS]}` holds an object, and no sensor "
-                "stands beside it: sensors stand at the top level of a message, as in "
+                f"`{readings.nested_name[:_SHOWN_CHARACTERS]}` holds an object, and the message "
+                "has no other sensor: sensors must be at the top level of a message, as in "
                 f'{{"step": 0, "{example}": 0.0}}'
             )
         if not self.allows_unknown:

@@ -394,7 +394,7 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
         "with the most damage is "
         f"{fleet.groups[0].members[int(np.argmax(mean.sum(axis=1)))].name} of growing_damage: "
     )
-    for words in (opening, "60 assets in 1 group", "The assets by health", "Who needs attention next"):
+    for words in (opening, "60 assets in 1 group", "The assets by health", "Assets that need attention next"):
         assert words in text
 
     scenario = fleet.groups[0].scenarios[0]
@@ -432,5 +432,5 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
     worst = np.lexsort((-mean.sum(axis=1), -printed, -alarms))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
-    table = fleet_page(folder, ATTENTION_ROWS).partition("Who needs attention next")[2]
+    table = fleet_page(folder, ATTENTION_ROWS).partition("Assets that need attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]

@@ -202,8 +202,8 @@ def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
     ("name", "passed", "caveat"),
     [
         ("absolute fit", False, "It leaves three noises."),
-        ("absolute fit", None, "Whether it leaves noise alone was not tested."),
-        ("shape", True, "Whether it leaves noise alone was not tested."),
+        ("absolute fit", None, "It was not tested whether the residuals are noise."),
+        ("shape", True, "It was not tested whether the residuals are noise."),
         ("held-out trials", False, "It leaves three noises."),
     ],
 )

@@ -220,7 +220,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"step": 2}', b'"step": 1}'), *lines[4:]]))
     ran(watch, feed, 198)
     with pytest.raises(
-        NotResumableError, match=r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
+        NotResumableError, match=r"line 4 .*damaged.*; 3 before it and 195 after it are valid"
     ):
         notices_since(watch, 0)
     # Another watch takes in all but what the line said, and refuses that by name; the refusal says so.
