@@ -55,10 +55,10 @@ fleet.sel(region="z1")["north"]["filtered"]["mean"]    # (twin, step)
 fleet["north"].sel(twin="north-3")["observed"]["strain"]    # (step, sensor)
 ```
 
-A word in upper case stands for a name of the run: ROLE is what is observed, such as `strain`,
-FACTOR a factor of the state, such as `z1`. A unit in upper case is that of the scenario or binding.
-Where sensors have different units, the unit is `see sensor_unit`. Every variable has its unit and
-meaning in `.attrs["units"]` and `.attrs["long_name"]`.
+A word in upper case stands for a name of the run: ROLE is the observed quantity, such as `strain`,
+and FACTOR a factor of the state, such as `z1`. A unit in upper case is that of the scenario or
+binding. Where sensors have different units, the unit is `see sensor_unit`. Every variable has its
+unit and meaning in `.attrs["units"]` and `.attrs["long_name"]`.
 
 Stores of fleets of earlier versions are read in this layout, with one sentence for each file.
 """

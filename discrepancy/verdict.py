@@ -334,7 +334,7 @@ class UnfittedRecord:
 
 @dataclass(frozen=True)
 class MovedUnknown:
-    """A parameter, gain or zero that a fit without effects moves far from what is stated.
+    """A parameter, gain or zero that a fit without effects moves far from its stated value.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ Forces = Annotated[
 
 
 class FmuInputsSection(Section):
-    """`[inputs]`: what a trial sets; each name is one of the binding's, or a variable of the FMU.
+    """`[inputs]`: the inputs that a trial sets, by names of the binding or of the FMU.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ Variable = Annotated[Name, Field(default_factory=lambda section: section.get("na
 
 
 class FmuOutputSection(NamedSection):
-    """`[[output]]`: what a channel's `output` names; `{a..b}` stands for the numbers a to b."""
+    """`[[output]]`: an output for channels; `{a..b}` stands for the numbers from a to b."""
 
     variable: Variable
     """Name in the binding or in the FMU, in which `{a..b}` stands for the numbers a to b; by

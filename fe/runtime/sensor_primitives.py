@@ -247,7 +247,7 @@ class HighPass(Sensor):
 
 
 class SensorLag(Sensor):
-    """A channel shows now what it should have shown `lag` [s] earlier: a late filter or logger.
+    """A channel shows each value `lag` [s] too late, because of a filter or a logger.
 
     A negative lag means that the recorded force is late. A ring-down has no recorded force that a
     reading could lag behind, so a lag changes only forced and driven trials.

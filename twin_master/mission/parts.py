@@ -65,7 +65,7 @@ GivenEstimator = Estimator | Callable[[TwinBeforeFlight], Estimator] | str
 
 @dataclass(frozen=True)
 class TwinParts:
-    """The parts of a twin that a user gives in the place of those of the scenario.
+    """The parts of a twin that a user gives instead of those of the scenario.
 
     Attributes
     ----------

@@ -73,7 +73,7 @@ class Overflow(PortForce):
     v0 is `reference_velocity`.
 
     A flow that begins at a level, such as that of an overflow or a relief valve. At a port whose
-    speed is a filling level, F is a flow out of what is full.
+    speed is a filling level, F is a flow out of the full store.
     """
 
     depends_on_speed: ClassVar[bool] = True

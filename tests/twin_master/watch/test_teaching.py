@@ -51,7 +51,7 @@ if kind is None:
     sys.exit("Nothing can be said.")
 place = out.with_name("." + out.name)
 place.mkdir()
-gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves only noise."}]
 verdict = {"kind": kind, "sentence": "It is so.", "gates": gates, "effects": []}
 (place / "verdict.json").write_text(json.dumps({"verdict": verdict}))
 (place / "patch.json").write_text(json.dumps(patch))
@@ -226,7 +226,7 @@ def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp
 )
 def test_a_group_that_differs_at_other_loads_is_not_tried(tmp_path, members, tried):
     """Gauge 17 showed 12 % too little; saturation was the most probable of its group, and was adopted."""
-    gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+    gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves only noise."}]
     folder = verdict_folder(tmp_path / "verdict", gates)
     effects = [{"patch": ModelPatch((member,)).to_list()} for member in members]
     verdict = {"kind": "group", "sentence": "Either is missing.", "gates": gates, "effects": effects}
