@@ -299,7 +299,9 @@ def _advice_on_error(folder: Path) -> Iterator[None]:
                 "where the scenario itself is to be changed, fly the changed one with --replace."
             )
         else:
-            error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
+            error.add_note(
+                "Nothing was flown yet: correct the cause, and fly again with --replace."
+            )
         raise
 
 

@@ -63,8 +63,11 @@ def run(
             "--model",
             show_default="the shipped wing",
             autocompletion=complete_model,
-            help="A calibration.nc, a wing design, a structure, a lumped model or a description of "
-            "an FMU (.toml), one of them patched (.json), or the name of a shipped lumped model.",
+            help=(
+                "A calibration.nc, a wing design, a structure, a lumped model or a description of "
+                "an FMU (.toml), one of these with a patch (.json), or the name of a shipped "
+                "lumped model."
+            ),
         ),
     ] = None,
     out: Annotated[

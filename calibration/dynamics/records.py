@@ -178,7 +178,7 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
 
 
 def find_records(path: Path) -> tuple[Path, ...]:
-    """Return the files that `read_records` reads: all files of the best kind that there is.
+    """Return the files that `read_records` reads: all files of the kind that it prefers.
 
     Raises
     ------

@@ -84,7 +84,7 @@ class Problem:
     campaign : Campaign
         The trials and noise records.
     model : Model
-        The model as it is.
+        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
 

@@ -338,9 +338,9 @@ class IdentifiedFmu(FmuRuns):
         amount = float(solution.root)
         if not abs(missing_displacement(amount)) <= 1e-6 * abs(displacement):
             raise ModelError(
-                f"Nothing that [release] names puts {release.output!r} of the FMU model "
-                f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or "
-                "output there."
+                f"No parameter or force in [release] moves {release.output!r} of the FMU model "
+                f"{self.description.name!r} to {displacement:g} m; correct displacement, hold or "
+                "output in [release]."
             )
         return release_values | {name: amount}
 

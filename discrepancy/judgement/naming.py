@@ -48,7 +48,7 @@ def reach_verdict(
         The function that receives a line for the progress display: the fit that runs, and how many
         remain.
     on_search : callable
-        Takes each search as it begins.
+        The function that receives each search when it begins.
 
     Returns
     -------

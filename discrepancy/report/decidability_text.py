@@ -202,9 +202,11 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     names = [detectability.effect.identifier.replace("_", " ") for detectability in hidden]
     improvement = f"with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials"
     if len(names) == 1:
-        return [f"At its prior median {names[0]} would not be seen; it would be {improvement}."]
+        return [
+            f"At its prior median {names[0]} would not be detectable; it would be {improvement}."
+        ]
     first = nearest.effect.identifier.replace("_", " ")
     return [
-        f"At their prior medians {listing(names)} would not be seen; {first} would be the first, "
-        f"{improvement}."
+        f"At their prior medians {listing(names)} would not be detectable; {first} would be the "
+        f"first, {improvement}."
     ]

@@ -178,7 +178,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     """
     row_titles = {"force": "missing force"}
     if missing.law:
-        row_titles["left"] = "what is left"
+        row_titles["left"] = "remaining force"
     name_of_force, displacement_unit, speed_unit = port_motion_units(missing.at_port)
     if displacement_unit:
         motions = {

@@ -62,7 +62,7 @@ OPENING = {
 TEXT_WITHOUT_EFFECT = {
     VerdictKind.NOTHING_MISSING: "nothing",
     VerdictKind.DATA_ERROR: "the data",
-    VerdictKind.BELOW_LIMIT: "nothing that could be seen",
+    VerdictKind.BELOW_LIMIT: "nothing that could be detected",
 }
 """The text of the first card for verdicts that name no effect."""
 

@@ -50,7 +50,7 @@ def search(
     Search
         All candidates that were fitted, with their evidence.
     """
-    on_progress("fitting the model as it is")
+    on_progress("fitting the unchanged model")
     start = problem.prior_mean_point(Candidate())
     no_effect = fit(problem, Candidate(), start, iterations=SEARCH.no_effect_iterations)
     no_effect = refit_from_first_readings(

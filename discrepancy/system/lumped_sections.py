@@ -81,7 +81,7 @@ class Damping(Section):
     """Factor on the stiffness matrix [s]."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the fault that there is not exactly one kind of damping."""
+        """Yield a fault unless exactly one kind of damping is given."""
         has_coefficients = self.alpha is not None or self.beta is not None
         kinds = [self.ratios is not None, self.matrix is not None, has_coefficients]
         yield kinds.count(True) != 1, "give exactly one of ratios, matrix, or alpha and beta"

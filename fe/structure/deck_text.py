@@ -114,7 +114,7 @@ def lines_of(
 
 
 def whole(where: str, text: str) -> int:
-    """Return a text as a whole number; `where` says file and line of it."""
+    """Return a text as a whole number; `where` names its file and line, for messages."""
     try:
         number = int(text)
     except ValueError:

@@ -282,7 +282,7 @@ def expand_connection(
     if len(sources) != len(targets):
         raise CouplingError(
             f"The connection from {source!r} to {target!r} joins {len(sources)} ends to "
-            f"{len(targets)}; the two patterns must stand for equally many."
+            f"{len(targets)}; both patterns must stand for the same number of ends."
         )
     connections = []
     for source_name, target_name in zip(sources, targets, strict=True):

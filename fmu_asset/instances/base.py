@@ -374,7 +374,7 @@ class FmuInstance(Instance):
         Parameters
         ----------
         verb : {"Set", "Get"}
-            What is done.
+            Whether variables are set or read.
         groups : tuple of VariableGroup
             The groups, which follow one another in the block.
         doubles : C array of double

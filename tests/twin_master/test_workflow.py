@@ -270,4 +270,6 @@ def test_an_error_before_the_first_step_says_how_to_begin_anew(tmp_path, library
     monkeypatch.setattr(workflow, "prepare_knowledge", broken)
     with pytest.raises(MissionInputError) as caught:
         fly(tmp_path / "run", library_file)
-    assert caught.value.__notes__ == ["Nothing was flown yet: once this is mended, fly again with --replace."]
+    assert caught.value.__notes__ == [
+        "Nothing was flown yet: correct the cause, and fly again with --replace."
+    ]

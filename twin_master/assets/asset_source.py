@@ -284,7 +284,7 @@ class AssetSource:
 
     @property
     def description(self) -> str:
-        """What flies or is believed, in words."""
+        """A phrase for the asset that flies or the model that is believed."""
         return str(self.label)
 
     @property

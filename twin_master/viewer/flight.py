@@ -429,5 +429,5 @@ def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
 
 
 def is_prepared(folder: Path) -> bool:
-    """Return whether a run folder has all that precedes the first step, and can be viewed."""
+    """Return whether a run folder is complete up to the first step, so that it can be viewed."""
     return (folder / KNOWLEDGE_NAME).is_file()

@@ -269,7 +269,7 @@ class Watch:
             intake.restore(last_line.get("intake"))
             if last_line:
                 step_name = self.scenario.mission.step_name
-                self.progress.note(f"The watch goes on at {step_name} {self.twin.steps}.")
+                self.progress.note(f"The watch continues at {step_name} {self.twin.steps}.")
             self.intake = intake
             self.filtered = None
             self.is_quiet = "quiet" in last_line

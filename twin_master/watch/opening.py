@@ -478,4 +478,4 @@ def _advice_after_error(watched: Watch) -> str:
             "What was observed is kept: go on with "
             f"`uav-twin watch --resume --out {watched.folder}`."
         )
-    return "Nothing was observed yet: once this is mended, watch again with --replace."
+    return "Nothing was observed yet: correct the cause, and watch again with --replace."

@@ -227,7 +227,9 @@ def test_a_mapping_may_name_values_that_its_set_lacks(join, tmp_path):
     wiring = join(('source="chance"', 'source="luck"'))
 
     assert {*wiring.left_out} == {"damage.seed"}
-    assert "damage.seed (its set lacks the value)" in left_out_sentence(wiring, tmp_path)
+    assert "damage.seed (its parameter set has no such value)" in left_out_sentence(
+        wiring, tmp_path
+    )
 
 
 def test_start_values_of_outputs_are_set(foreign_fmu):
