@@ -46,7 +46,10 @@ def simulate(
         Path | None,
         typer.Option(
             "--binding",
-            help="Its binding file; without one, all outputs in the FMU's units.",
+            help=(
+                "Binding file of the FMU; without one, all outputs are given in the units of the "
+                "FMU."
+            ),
         ),
     ] = None,
     inputs: Annotated[
@@ -101,12 +104,13 @@ def simulate(
         )
     if binding is not None and (stop_time is not None or step_size is not None or values):
         raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says "
-            "these itself."
+            "--stop-time, --step-size and --set are for a simulation without --binding, because a "
+            "binding states these itself."
         )
     if interpolation is not None and inputs is None:
         raise FmuInputError(
-            "--interpolation says how inputs go on between the rows of --inputs: give these."
+            "--interpolation says how inputs go on between the rows of --inputs: give --inputs, "
+            "too."
         )
     isolated = not in_process
     # Without a binding: the default experiment of the FMU
@@ -166,7 +170,7 @@ def simulate_system(
         typer.Option(
             "--iterations",
             min=1,
-            help="How often a step of a circle of components is made at most.",
+            help="Largest number of iterations of a step if components form a loop.",
         ),
     ] = 1,
     delay: Annotated[
@@ -265,7 +269,9 @@ def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
-        raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
+        raise FmuInputError(
+            f"--interpolation must be zero-order or linear, but {kind!r} was given."
+        )
     return binding.with_header(interpolation=kind)
 
 

@@ -79,12 +79,12 @@ class ColumnReader:
         """Return the record of a column of readings; ask the user for a role or unit it lacks."""
         role = self._determine_role(sheet, head, unit)
         if not unit and role != LEFT_OUT:
-            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
+            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a plain number")
         if not unit or role == LEFT_OUT:
             return LaboratoryColumn(sheet, head, role, unit)
         try:
             if role == "temperature" and unit == "K":
-                raise ValueError("a temperature must be in degC, and 'K' came")
+                raise ValueError("a temperature must be in degC, but 'K' was given")
             is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN
             is_output = is_driven and self._output_quantity(role) is not None
             if role == "force" and is_driven and not is_output:
@@ -165,7 +165,7 @@ class ColumnReader:
         Raises
         ------
         ValueError
-            If the role is no output of the model.
+            If the role is not an output of the model.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
         possible = possible_quantities(unit, answer)

@@ -34,7 +34,7 @@ MOST_PRINTED_EXPERIMENTS = 3
 
 
 def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
-    """Yield what is printed of an investigation: lines, and the table of the effects' parameters.
+    """Yield the printed lines of an investigation, and the table of the effects' parameters.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def check_lines(
     faults: Sequence[DataFault],
     separability: Separability | None,
 ) -> Iterator[str | Table]:
-    """Yield what is printed of a campaign: its faults, and which effects it can decide on.
+    """Yield the printed lines on a campaign: its faults, and the effects that it can decide on.
 
     Parameters
     ----------

@@ -160,9 +160,9 @@ class StructureModel(SystemModel):
         for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port "
-                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
-                    "[[port]] out of the file."
+                    f"The port {port!r} of the structure {self.name} moves exactly as its port "
+                    f"{other_port!r} does, so that no reading can distinguish their forces: remove "
+                    "this [[port]] from the file."
                 )
 
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:

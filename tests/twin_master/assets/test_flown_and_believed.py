@@ -110,7 +110,7 @@ def cell(content: dict[str, Any], draw: str) -> list[float]:
         (lambda content: content.pop("observations"), "lacks the entry 'observations'"),
         (lambda content: content["observations"].pop("40"), "lacks the entry '40'"),
         (lambda content: cell(content, "0.994").pop(), r"\[20\]\[0\]\[3g\]\[0.994\] must hold 24 finite"),
-        (lambda content: cell(content, "mean").__setitem__(1, float("nan")), "NaN is no number in JSON"),
+        (lambda content: cell(content, "mean").__setitem__(1, float("nan")), "NaN is not a number in JSON"),
         (lambda content: content.update(states=[[0, 20]]), "levels of 2 regions"),
         (lambda _: '{"states": [[0', "not valid JSON"),
         (lambda _: "[1, 2]", "not in the published format"),
