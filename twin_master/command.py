@@ -109,6 +109,14 @@ def run(
             help="Run the FMU in this process instead of a worker.",
         ),
     ] = False,
+    no_notices: Annotated[
+        bool,
+        typer.Option(
+            "--no-notices",
+            help="Give no notices and alarms. Many seeds then fly side by side, in a small "
+            "fraction of the time.",
+        ),
+    ] = False,
     view: ViewOption = False,
     with_scenario: Annotated[
         str | None,
@@ -154,6 +162,7 @@ def run(
         ssp=ssp,
         library=library,
         learnt=learnt,
+        no_notices=no_notices,
     )
     parts = TwinParts(policy, sensor_model, estimator)
     if seeds is not None:

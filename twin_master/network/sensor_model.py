@@ -193,6 +193,16 @@ class GaussianSensorModel(QuantityModel):
             )
 
     @property
+    def has_own_likelihood(self) -> bool:
+        """Whether a subclass computes the density of an observation in a way of its own."""
+        own = type(self)
+        return (
+            own.log_likelihood is not GaussianSensorModel.log_likelihood
+            or own.log_likelihood_sequence is not GaussianSensorModel.log_likelihood_sequence
+            or own.log_density_of_draws is not GaussianSensorModel.log_density_of_draws
+        )
+
+    @property
     def extra_arguments(self) -> Mapping[str, Any]:
         """Keyword arguments of a subclass that `GaussianSensorModel` does not have."""
         return {}
