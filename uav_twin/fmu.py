@@ -479,7 +479,7 @@ def _is_design(what: str) -> bool:
     return what == "uav_wing" or "planform" in _table_of_file(what)
 
 
-def _table_of_file(path: str) -> Mapping[str, Any]:
+def _table_of_file(path: str) -> Mapping[str, object]:
     """Return the table of a TOML file; empty if there is no such file, or it is not TOML."""
     from reporting.toml_file import read_toml
 
