@@ -1,6 +1,8 @@
 """The command line and the one name to import: what commands say and refuse, what `uav_twin` hands on."""
 
 import ast
+import contextlib
+import inspect
 import json
 import os
 import pydoc
@@ -323,6 +325,23 @@ def test_what_a_function_takes_can_be_imported_from_uav_twin_or_is_what_another_
     types = " ".join(re.findall(r"^\w[\w, ]* : (.*)$", parameters, re.MULTILINE))
     classes = {*re.findall(r"\b[A-Z]\w+", types)} & {*classes_of_packages()}
     assert classes - {*uav_twin.__all__} - returned - {"LoadedScenario", "Fleet"} == set()
+
+
+def test_help_shows_types_by_their_names_and_not_the_unions_that_numpy_makes_of_them():
+    """As annotations are written, `ArrayLike` and `Float`; numpy spells them out in hundreds of letters."""
+    spelt_out = []
+    for name in uav_twin.__all__:
+        public = getattr(uav_twin, name)
+        functions = {name: public}
+        if inspect.isclass(public):
+            for member, function in inspect.getmembers(public, inspect.isfunction):
+                if member == "__init__" or not member.startswith("_"):
+                    functions[f"{name}.{member}"] = function
+        for title, function in functions.items():
+            with contextlib.suppress(ValueError):  # of a protocol or record without a signature
+                if "numpy." in str(inspect.signature(function)):
+                    spelt_out.append(title)
+    assert spelt_out == []
 
 
 MODULE, NAME = "import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"

@@ -3,6 +3,8 @@
 A flight that was interrupted is continued with the first shard that is not in the store.
 """
 
+from __future__ import annotations
+
 import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -94,7 +96,7 @@ class FleetOutcome:
         title = f"Fleet of {self.twins} twins in {self.folder}"
         return html_table(title, ("result", *figures), figure_rows(figures))
 
-    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+    def plot(self, axes: Axes | Sequence[Axes] | None = None) -> list[Axes]:
         """Draw the believed states of all twins over the steps, with the median of the truth.
 
         Parameters
@@ -441,7 +443,7 @@ class _FleetFlight:
             }
         )
 
-    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[object]]":
+    def _open_group(self, group_name: str) -> Mapping[str, zarr.Array[object]]:
         """Return the arrays of a group in the store, by their paths."""
         import zarr
 

@@ -13,6 +13,8 @@ of at most 1 / c, in however many steps they are compared (Ville 1939; Ramdas, G
 Shafer 2023).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -3,6 +3,8 @@
 Kapteyn et al. 2021, eqs. (30) and (32).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
