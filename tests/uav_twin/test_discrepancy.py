@@ -183,6 +183,10 @@ def test_the_documented_files_print_the_documented_tables():
     done = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
     assert done.returncode == 1
     assert [row for row in done.stdout.splitlines() if row.startswith("Fault: ")] == checked.splitlines()
+    stored_hashes = re.findall(r"SHA-256 ([0-9a-f]{64})\b", Path("lab/campaign.toml").read_text("utf-8"))
+    printed_hashes = re.findall(r"SHA-256 ([0-9a-f]+)", done.stdout)
+    assert len(stored_hashes) == 2  # a line of the output has 12 digits of each, once
+    assert printed_hashes == [stored[:12] for stored in stored_hashes]
 
 
 # ---------------------------------------------------------------- a terminal
