@@ -112,6 +112,14 @@ def run(
             help="Run the FMU in this process instead of a worker.",
         ),
     ] = False,
+    no_notices: Annotated[
+        bool,
+        typer.Option(
+            "--no-notices",
+            help="Give no notices and alarms. Many seeds then fly side by side, in a small "
+            "fraction of the time.",
+        ),
+    ] = False,
     view: ViewOption = False,
     with_scenario: Annotated[
         str | None,
@@ -157,6 +165,7 @@ def run(
         ssp=ssp,
         library=library,
         learnt=learnt,
+        no_notices=no_notices,
     )
     parts = TwinParts(policy, sensor_model, estimator)
     if seeds is not None:
@@ -167,11 +176,7 @@ def run(
         engine = choose_engine(workers, cluster)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
-    if workers is not None or cluster is not None:
-        raise typer.BadParameter(
-            "belongs to --seeds: one mission flies alone.",
-            param_hint="--workers" if cluster is None else "--cluster",
-        )
+    _refuse_processes_of_one_mission(workers, cluster)
     has_changes = out is not None or policy is not None or overrides != Overrides()
     if resume is None:
         folder, fly_mission = _new_mission(scenario, out, overrides, parts, replace=replace)
@@ -179,6 +184,15 @@ def run(
         folder = resume
         fly_mission = _resumed_mission(scenario, folder, parts, has_changes=replace or has_changes)
     _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
+
+
+def _refuse_processes_of_one_mission(workers: int | None, cluster: str | None) -> None:
+    """Refuse the options --workers and --cluster where only one mission flies."""
+    if workers is not None or cluster is not None:
+        raise typer.BadParameter(
+            "belongs to --seeds: one mission flies alone.",
+            param_hint="--workers" if cluster is None else "--cluster",
+        )
 
 
 def _wrong_use_of_seeds() -> typer.BadParameter:

@@ -5,6 +5,8 @@ the scenario for the true state: eqs. (9) and (10) of Kapteyn et al. 2021 with t
 weights.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path

@@ -4,6 +4,8 @@
 which takes no time.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager

@@ -321,8 +321,13 @@ def _understand_files(
     understanding = LaboratoryImport(sheets, answers)
     if model is None:
         return understanding
-    quantity_of_output = choose_model(model).model.output_quantity
-    return LaboratoryImport(understanding.sheets, answers, quantity_of_output)
+    chosen_model = choose_model(model).model
+    return LaboratoryImport(
+        understanding.sheets,
+        answers,
+        chosen_model.output_quantity,
+        chosen_model.outputs_with_quantities,
+    )
 
 
 _DECIMAL_MARKS = {".": "points", ",": "commas"}

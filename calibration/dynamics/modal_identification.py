@@ -8,6 +8,8 @@ squares with the modes common to all channels; the covariance is that of the lea
 white noise of its own on each channel.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args

@@ -54,6 +54,8 @@ class LaboratoryImport:
         the column or file that they are about.
     quantity_of : callable, optional
         Returns the quantity of a model's output. Without it any name can be that of an output.
+    outputs : sequence of str
+        The model's outputs with quantity and unit, as questions and refusals list them.
 
     Raises
     ------
@@ -66,10 +68,12 @@ class LaboratoryImport:
         sheets: Sequence[Sheet],
         answers: Answers,
         quantity_of: OutputQuantity | None = None,
+        outputs: Sequence[str] = (),
     ) -> None:
         self.sheets = sheets
         self.answers = answers
         self._quantity_of = quantity_of
+        self._outputs = outputs
         self._questionnaire = Questionnaire(answers)
         self._clocks: dict[str, MergedTable] = {}
         names = [sheet.name for sheet in sheets]
@@ -84,7 +88,7 @@ class LaboratoryImport:
         self.kinds = {name: self._kind_of_file(name) for name in names}
         self._noise_file = self._only_noise_file()
         self.decimals = {sheet.name: self._decimal_mark(sheet) for sheet in sheets}
-        reader = ColumnReader(self._questionnaire, self.kinds, quantity_of)
+        reader = ColumnReader(self._questionnaire, self.kinds, quantity_of, outputs)
         self.columns: list[LaboratoryColumn] = []
         for sheet in sheets:
             for head, unit in zip(sheet.heads, sheet.units, strict=True):
@@ -122,6 +126,15 @@ class LaboratoryImport:
         """The remark on zeros and gains that nobody stated; empty if all are stated."""
         return self._deviations.assumed
 
+    @property
+    def outputs_sentence(self) -> str:
+        """The outputs that a column can measure; empty if the role of every column is known."""
+        if not any(option == "column" for option, _ in self.questions):
+            return ""
+        if self._outputs:
+            return f"The model has the outputs {listing(self._outputs)}."
+        return "To have the outputs of your model listed, give --model."
+
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
         """Return the import with one more answer.
 
@@ -135,7 +148,8 @@ class LaboratoryImport:
             The answer.
         """
         of_option = {**self.answers.get(option, {}), subject: answer}
-        return LaboratoryImport(self.sheets, {**self.answers, option: of_option}, self._quantity_of)
+        answers = {**self.answers, option: of_option}
+        return LaboratoryImport(self.sheets, answers, self._quantity_of, self._outputs)
 
     # ---------------------------------------------------------------- files
 
@@ -267,7 +281,8 @@ class LaboratoryImport:
             those of the laboratory's files.
         """
         if self.questions:
-            raise CampaignFileError(missing_answers(self.questions))
+            message = f"{missing_answers(self.questions)} {self.outputs_sentence}"
+            raise CampaignFileError(message.rstrip())
         trial_files = [file for file in self.kinds if file != self._noise_file]
         content: dict[str, Any] = {
             "format": FORMAT,

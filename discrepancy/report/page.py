@@ -38,7 +38,7 @@ from discrepancy.verdict import Estimate, Gate, NamedEffect, Verdict, VerdictKin
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.record_table import add_titled_table
-from reporting.words import capital, counted, listing
+from reporting.words import capital, counted, listing, with_short_hashes
 
 LONGEST_CARD = 60
 """Most characters of a card of the page; the sentence below it has all names."""
@@ -401,7 +401,7 @@ def _add_data(book: _PictureBook, investigation: Investigation) -> None:
         book.page.add_notice(fault.sentence)
     remarks = remarks_beside_faults(investigation)
     for remark in remarks:
-        book.add_paragraph(f"• {remark}")
+        book.add_paragraph(f"• {with_short_hashes(remark)}")
     if not investigation.faults and not remarks:
         book.add_paragraph("No fault was found.")
     add_titled_table(book.page, tables.trials_table(investigation.campaign))

@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import Scales
@@ -95,8 +96,10 @@ class Model(ABC):
 
     @property
     def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs as they are listed in a sentence."""
-        return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
+        """The outputs with quantity and SI unit, as they are listed in a sentence."""
+        return tuple(
+            f"{name} ({quantity_with_unit(quantity)})" for name, quantity in self.quantities.items()
+        )
 
     # ------------------------------------------------------------ what each kind of model defines
 

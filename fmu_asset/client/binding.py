@@ -26,7 +26,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
@@ -159,11 +159,23 @@ class Binding(Section):
     port: dict[str, PortBinding] = Field(default_factory=dict)
     record: RecordBinding = Field(default_factory=RecordBinding)
     limits: WorkerLimits = Field(default_factory=WorkerLimits)
+    _file: str = PrivateAttr(default="")
 
     @property
     def name(self) -> str:
         """Name of the binding."""
         return self.binding.name
+
+    @property
+    def title(self) -> str:
+        """Name of the binding, and the file that it was read from, for messages."""
+        return f"{self.name} ({self._file})" if self._file else self.name
+
+    def with_file(self, file: str) -> "Binding":
+        """Return the binding with the file that it was read from, which messages name."""
+        binding = self.model_copy()
+        binding._file = file
+        return binding
 
     @property
     def step_size(self) -> float:
@@ -290,10 +302,10 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
     ------
     BindingError
         If the file is missing, not TOML, has an unknown or missing key or a wrong type, or maps one
-        FMU variable to two inputs.
+        FMU variable to two inputs. The message states all such faults of the file.
     """
     content = read_toml(os.fspath(path), BindingError, what="binding file")
-    return parse_binding(content, where=str(path))
+    return parse_binding(content, where=str(path)).with_file(str(path))
 
 
 def parse_binding(content: Mapping[str, object], *, where: str = "the binding") -> Binding:
@@ -311,20 +323,23 @@ def parse_binding(content: Mapping[str, object], *, where: str = "the binding") 
     BindingError
         As `load_binding`.
     """
-    binding = validate(Binding, dict(content), where, BindingError, what="a binding")
+    binding = validate(
+        Binding, dict(content), where, BindingError, what="a binding", all_faults=True
+    )
+    faults = []
     if not binding.observation:
-        raise BindingError(
-            f"In {where}, there is no [observation.<name>] table; say what is measured."
-        )
+        faults.append("there is no [observation.<name>] table; say what is measured")
     user_of_variable: dict[str, str] = {}
     for role in (*INPUT_ROLES, "parameter"):
         table: Mapping[str, ScalarBinding] = getattr(binding, role)
         for key, scalar in table.items():
             label = f"{role}.{key}"
             if scalar.variable in user_of_variable:
-                raise BindingError(
-                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
-                    f"{user_of_variable[scalar.variable]} and {label}; keep one."
+                faults.append(
+                    f"the FMU variable {scalar.variable!r} is set by both "
+                    f"{user_of_variable[scalar.variable]} and {label}; keep one"
                 )
             user_of_variable[scalar.variable] = label
+    if faults:
+        raise BindingError(f"In {where}, {'; '.join(faults)}.")
     return binding

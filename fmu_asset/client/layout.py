@@ -274,7 +274,7 @@ def with_structural_parameters(
     lengths: dict[str | None, int] = {}
     for name, value in binding.binding.structural_parameters.items():
         label = f"structural_parameters.{name}"
-        location = f"{label} of the binding {binding.name}"
+        location = f"{label} of the binding {binding.title}"
         variable = find_variable(description, name, location, "structuralParameter").variable
         low, high = variable.bounds
         slot = InputSlot(label, (0,), low, high, IDENTITY, variable)

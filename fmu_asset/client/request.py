@@ -165,7 +165,7 @@ class RequestBlock:
         for position in positions:
             if position in user_of_position:
                 raise BindingError(
-                    f"In the binding {resolver.binding.name}, {bound.label} and "
+                    f"In the binding {resolver.binding.title}, {bound.label} and "
                     f"{user_of_position[position]} set the same value of {variable.name!r}; keep "
                     "one."
                 )
@@ -176,7 +176,7 @@ class RequestBlock:
         """Refuse linear interpolation if the FMU, or all of its inputs, cannot follow it."""
         description = self._resolver.description
         request = (
-            f"The binding {self._resolver.binding.name} asks for linear interpolation of inputs, "
+            f"The binding {self._resolver.binding.title} asks for linear interpolation of inputs, "
             "but"
         )
         if not description.can_interpolate_inputs:

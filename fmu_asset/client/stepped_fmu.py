@@ -1,5 +1,7 @@
 """Communication steps of an FMU with a binding, one by one or many at once."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from fmu_asset.errors import FmuEndedError, FmuError
@@ -281,7 +283,7 @@ class SteppedFmu(OpenedFmu):
         return None
 
     def _run_and_check_start(
-        self, requests: Float, replies: Float, counter: "_StepCounter"
+        self, requests: Float, replies: Float, counter: _StepCounter
     ) -> FmuError | None:
         """Make a block of steps; repeat it in a new instance if a reset proves not to have worked.
 

@@ -77,7 +77,10 @@ def public_functions() -> Iterator[tuple[str, object]]:
             yield name, value
         if inspect.isclass(value):
             for member, function in inspect.getmembers(value, inspect.isfunction):
-                if member == "__init__" or not member.startswith("_"):
+                # pydantic gives sections methods, such as `copy`, whose hints it does not import
+                is_of_pydantic = function.__module__.startswith("pydantic.")
+                is_public = member == "__init__" or not member.startswith("_")
+                if is_public and not is_of_pydantic:
                     yield f"{name}.{member}", function
 
 

@@ -104,6 +104,21 @@ def test_everything_that_is_not_said_is_named_at_once():
         "--release NAME=... for 'swing.csv' (how far the point was held",
     ):
         assert part in sentence
+    assert sentence.strip().endswith("To have the outputs of your model listed, give --model.")
+
+
+def test_the_outputs_of_the_model_are_listed_with_their_units_where_a_column_may_be_one_of_them():
+    Path("swing.csv").write_bytes(TWO["swing.csv"])
+    outputs = "displacement (displacement in m) and leaf_strain (strain without a unit)"
+    options = ("swing.csv", "--kind", "ringdown", "--release", "8mm", "--decimal", ",", "--model", MODEL)
+    assert f"The model has the outputs {outputs}." in refused(*IMPORT, *options)
+    wrong = ("--column", "Weg=deflection", "--unit", "Weg=mm")
+    assert f"the model has no output 'deflection'; it has {outputs}; say another." in refused(
+        *IMPORT, *options, *wrong
+    )
+    _, screen = in_a_terminal(["deflection", "displacement", "mm", "", "", "y"], *options, "--out", "lab")
+    assert screen.index(f"The model has the outputs {outputs}.") < screen.index("Weg: column")
+    assert [channel.output for channel in read_campaign("lab").channels.values()] == ["displacement"]
 
 
 def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumptions_only():
@@ -171,6 +186,10 @@ def test_the_documented_files_print_the_documented_tables():
     done = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
     assert done.returncode == 1
     assert [row for row in done.stdout.splitlines() if row.startswith("Fault: ")] == checked.splitlines()
+    stored_hashes = re.findall(r"SHA-256 ([0-9a-f]{64})\b", Path("lab/campaign.toml").read_text("utf-8"))
+    printed_hashes = re.findall(r"SHA-256 ([0-9a-f]+)", done.stdout)
+    assert len(stored_hashes) == 2  # a line of the output has 12 digits of each, once
+    assert printed_hashes == [stored[:12] for stored in stored_hashes]
 
 
 # ---------------------------------------------------------------- a terminal

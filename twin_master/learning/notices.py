@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
+from twin_master.network.sensor_model import GaussianSensorModel
 
 CLEARLY_BETTER = float(np.log(10.0))
 """Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
@@ -105,6 +106,22 @@ class NoticeWriter:
             )
             notices.append(Notice("gauge_back", sentence, (g + 1,), float(readings[g])))
         return notices
+
+    def report_own_likelihood(self, sensor_model: GaussianSensorModel) -> list[Notice]:
+        """Return the notice that a user's sensor model has a likelihood that alarms do not use.
+
+        Alarms compare faults of gauges under Gaussian noise. The list is empty if the likelihood of
+        the sensor model is the Gaussian one, too.
+        """
+        if not sensor_model.has_own_likelihood:
+            return []
+        sentence = (
+            f"Notices and alarms take the noise of the {self.wording.sensor}s as Gaussian, with "
+            "the predictions and standard deviations of the sensor model "
+            f"{type(sensor_model).__qualname__}; the likelihood of that sensor model decides on "
+            "the belief alone. Say `notice = false` in the scenario if Gaussian noise does not fit."
+        )
+        return [Notice("gaussian", sentence)]
 
     def report_followed_hypothesis(
         self, state: WatchState, hypotheses: Sequence[Hypothesis], step: int

@@ -4,6 +4,8 @@ They are the factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Eve
 of the twin passes `stochastic_matrix`, which checks it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -257,7 +259,7 @@ class GraphicalModel:
         levels: Mapping[str, Sequence[float]],
         tables: Mapping[str, Mapping[str, ArrayLike]],
         prior: Mapping[str, ArrayLike] | None = None,
-    ) -> "GraphicalModel":
+    ) -> GraphicalModel:
         """Return the model of factors that change independently, given the control.
 
         Kapteyn et al. 2021, eqs. (28)-(29).

@@ -8,6 +8,8 @@ Rewards for health, control and error follow with their uncertainty, eqs. (9)-(1
 says which value is a limit, what a control is worth and how an error is scaled.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple

@@ -3,6 +3,8 @@
 It never receives the true state.
 """
 
+from __future__ import annotations
+
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -207,7 +209,7 @@ class Twin:
         name: str,
         model: GraphicalModel,
         sensor_model: SensorModel,
-        policy: "ArrayLike | Planner",
+        policy: ArrayLike | Planner,
         *,
         prediction_steps: int = 10,
         decide_on: DecisionBasis = "filtered",

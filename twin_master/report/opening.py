@@ -44,7 +44,7 @@ class _Switch:
     factor : str
         The title of the factor, with its article.
     level : str
-        The level with its unit.
+        The level with its unit, and whether the true value that is nearest to it is smaller.
     is_always_reached : bool
         Whether the level is the lowest, so that the policy leaves the first control in every state.
     """
@@ -94,11 +94,18 @@ def _switch(run: Run, fallback: Fallback) -> _Switch | None:
     """Return the level at which the policy leaves the first control; None if there is none."""
     if fallback.switch_state is None or fallback.switch_level is None:
         return None
-    factor = run.factors[run.scenario.state_names.index(fallback.switch_state)]
+    factor_index = run.scenario.state_names.index(fallback.switch_state)
+    factor = run.factors[factor_index]
     level = factor.scale * fallback.switch_level
+    level_text = f"{level:.4g} {factor.unit}".rstrip()
+    if fallback.called_for_step is not None and run.true_state is not None:
+        true_value = run.true_state[fallback.called_for_step, factor_index]
+        slack = run.model.states.factors[factor_index].slack
+        if true_value < fallback.switch_level - slack:
+            level_text += " (to the nearest level)"
     return _Switch(
         factor=_with_article(factor.title),
-        level=f"{level:.4g} {factor.unit}".rstrip(),
+        level=level_text,
         is_always_reached=level <= factor.levels[0],
     )
 

@@ -1,5 +1,7 @@
 """A watch from its observations to its report, begun or resumed, and its run up to a step."""
 
+from __future__ import annotations
+
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -185,7 +187,7 @@ def copy_of_run_until(
         yield copy
 
 
-def open_run(folder: Path | str) -> "xr.DataTree":
+def open_run(folder: Path | str) -> xr.DataTree:
     """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
 
     A watch that goes on, or was killed, is read as it would be if it had ended after the last step
