@@ -38,6 +38,7 @@ from discrepancy.judgement.remarks import (
     sentence_with_times,
     verdict_with_untested_effects,
 )
+from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
@@ -239,6 +240,7 @@ def investigate(
         not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
+        sensors=sensor_estimates(problem, fit),
         force=None if missing is None else missing.at_port,
     )
     return Investigation(
