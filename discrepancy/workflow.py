@@ -52,6 +52,7 @@ from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
+from discrepancy.system.names_of_model import campaign_in_names_of
 from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
 from discrepancy.verdict_remarks import (
     effects_not_fitted,
@@ -315,7 +316,9 @@ def _read_input(
 def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign with outliers marked and trials held out, and the faults of its data.
+    """Return the campaign in the names of its model, with outliers marked and trials held out.
+
+    The faults of its data are returned, too.
 
     Parameters
     ----------
@@ -339,6 +342,7 @@ def check_and_prepare(
                 f"have; it has {', '.join(names) or 'none'}: correct the name, or leave "
                 f"[parameters.{parameter}] out."
             )
+    campaign = campaign_in_names_of(campaign, model)
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))

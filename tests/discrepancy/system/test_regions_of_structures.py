@@ -1,15 +1,21 @@
 """A loss of stiffness in a damage region that a structure file declares is a cause that is tried."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.library import library
 from discrepancy.errors import ModelError
+from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.model_choice import choose_model
+from discrepancy.system.load_change import DEFAULT_PLACE
+from discrepancy.system.names_of_model import campaign_in_names_of
 from discrepancy.system.structures import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -19,7 +25,8 @@ from fe.runtime.patch import ModelPatch, RegionStiffnessLoss
 from fe.structure.design import load_structure
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures import rig_text
-from tests.discrepancy.rigs import asked, chosen, hiding, seen, setting_of, simulated
+from tests.discrepancy.bench import Bench
+from tests.discrepancy.rigs import asked, chosen, hiding, measured, seen, setting_of, simulated
 from tests.refusals import refused
 
 OUTPUTS = {"tip": Quantity.DISPLACEMENT, "g1": Quantity.STRAIN, "g2": Quantity.STRAIN}
@@ -122,3 +129,51 @@ def test_an_unknown_region_is_refused(model) -> None:
     wing = WingModel.of_design().wing
     with refused(InvalidPatchError, "damage region 'z7', but the wing has z1, z2"):
         wing.stiffness(1.0, (), ModelPatch((RegionStiffnessLoss("z7", LOSS),)))
+
+
+# ---------------------------------------------------------------- names of the structure's own
+
+OWN_NAMES = {'"z1"': '"heel"', '"z2"': '"web"'}
+
+
+def test_the_residuals_have_the_names_of_the_structure(write_beam, tmp_path) -> None:
+    """A campaign that names no load place and no region has neither those of the wing."""
+    own = choose_model(write_beam(tmp_path, OWN_NAMES, cells=2)).model
+    campaign = simulated(own, "static", 3)
+    trials = tuple(replace(trial, load_place=DEFAULT_PLACE) for trial in campaign.trials)
+    investigation = investigate(replace(campaign, trials=trials), own, chosen("load_cell"), seed=3)
+    path = write_residuals(tmp_path / "residuals.nc", investigation.after)
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        for group in tree.children.values():
+            assert group["region"].values.tolist() == ["heel", "web"]
+            assert json.loads(group.attrs["load_place"]) == "push"
+            assert not any(word in str(group.attrs) for word in ("z1", "z2", "tip_load"))
+    for fitted, stored in zip(investigation.after.trials, read_residuals(path).trials, strict=True):
+        assert stored.trial.regions == fitted.trial.regions == ("heel", "web")
+        np.testing.assert_array_equal(stored.trial.health, fitted.trial.health)
+
+
+def test_the_residuals_of_a_model_without_regions_have_none(tmp_path) -> None:
+    campaign, rig = measured()
+    named = campaign_in_names_of(campaign, rig)
+    assert {trial.regions for trial in named.trials} == {()}
+    fitted = Bench().fit(np.random.default_rng(1))
+    trials = tuple(
+        replace(item, trial=replace(item.trial, regions=(), health=item.trial.health[:, :0]))
+        for item in fitted.trials
+    )
+    trials = tuple(
+        replace(item, trial=replace(item.trial, health_deviation=item.trial.health)) for item in trials
+    )
+    path = write_residuals(tmp_path / "residuals.nc", replace(fitted, trials=trials))
+    for stored in read_residuals(path).trials:
+        assert stored.trial.regions == ()
+        assert stored.trial.health.shape == (len(stored.trial.time), 0)
+
+
+def test_a_stated_loss_of_a_region_that_is_not_there_is_refused(model) -> None:
+    campaign = simulated(model, "static", 3)
+    first, *others = campaign.trials
+    lost = replace(first, regions=("z1", "rib"), health=first.health + np.array([0.0, 0.1]))
+    with refused(ModelError, "loss of the damage region 'rib', but the model 'beam' has z1, z2"):
+        investigate(replace(campaign, trials=(lost, *others)), model, RIVALS)
