@@ -10,7 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.effect_pictures import FLOWS, draw, picture_of, picture_patch, picture_setting
+from benchmarks.effect_pictures import (
+    FLOWS,
+    REGION_LOSSES,
+    draw,
+    picture_of,
+    picture_patch,
+    picture_setting,
+)
 from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import KIND_NAMES
@@ -106,7 +113,7 @@ def pages() -> dict[str, str]:
         f"{effect.identifier}.md": page(
             effect,
             texts[effect.identifier],
-            picture_setting(effect) if effect.identifier in FLOWS else beam,
+            picture_setting(effect) if effect.identifier in (*FLOWS, *REGION_LOSSES) else beam,
         )
         for effect in library()
     }

@@ -64,6 +64,7 @@ _MEANING_OF_VALUE = {
     "port": "Name of the port.",
     "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
     "rate": "Relative change in each unit of time.",
+    "region": "Name of the damage region.",
     "reference_displacement": "Displacement by which the displacement of the law is divided.",
     "reference_velocity": "Speed by which the speed of the law is divided.",
     "run": "Label of the run.",

@@ -359,6 +359,48 @@ class MovedUnknown:
     unit: str
 
 
+class SensorValue(StrEnum):
+    """What is estimated of a channel."""
+
+    GAIN = "gain"
+    ZERO = "zero"
+
+
+@dataclass(frozen=True)
+class SensorEstimate:
+    """The gain of a channel or its zero in a trial, fitted in the hypothesis of the verdict.
+
+    Attributes
+    ----------
+    channel : str
+        Name of the channel.
+    kind : SensorValue
+        "gain" or "zero". A gain is given by its relative error.
+    trial : str
+        Name of the trial in which the channel has this zero; empty for a gain, which is the same in
+        all trials.
+    value, deviation : float
+        Fitted value and its posterior standard deviation [unit of the entry]. The stated value is
+        zero.
+    stated_deviation : float
+        Stated standard deviation of the value; infinite if the value was not stated [unit of the
+        entry].
+    deviations : float
+        Fitted value in stated standard deviations; not a number if the value was not stated [1].
+    unit : str
+        Unit in SI; "1" for a gain.
+    """
+
+    channel: str
+    kind: SensorValue
+    trial: str
+    value: Number
+    deviation: Number
+    stated_deviation: Number
+    deviations: Number
+    unit: str
+
+
 @dataclass(frozen=True)
 class NotFitted:
     """An effect that was not fitted, the reason, and the largest predicted `gain` [nat]."""
@@ -439,6 +481,13 @@ class Verdict:
     moved : tuple of MovedUnknown
         Parameters, gains and zeros that the fit without any effect moves by more than two of their
         stated standard deviations, the farthest first.
+    moved_within_prior : tuple of MovedUnknown
+        Unknowns that the fit without any effect moves by one to two of their stated standard
+        deviations, if these are so wide that the move is at least 2 % of the stated value (for a
+        zero, of the largest reading) and three posterior standard deviations.
+    sensors : tuple of SensorEstimate
+        Gains of the channels, and their zeros in each fitted trial, in the hypothesis that stands
+        for the verdict.
     """
 
     kind: VerdictKind
@@ -461,6 +510,8 @@ class Verdict:
     force: ForceAtPort | None = None
     unfitted: tuple[UnfittedRecord, ...] = ()
     moved: tuple[MovedUnknown, ...] = ()
+    moved_within_prior: tuple[MovedUnknown, ...] = ()
+    sensors: tuple[SensorEstimate, ...] = ()
 
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]

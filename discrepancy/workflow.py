@@ -38,6 +38,7 @@ from discrepancy.judgement.remarks import (
     sentence_with_times,
     verdict_with_untested_effects,
 )
+from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
@@ -51,6 +52,7 @@ from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
+from discrepancy.system.names_of_model import campaign_in_names_of
 from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
 from discrepancy.verdict_remarks import (
     effects_not_fitted,
@@ -239,6 +241,7 @@ def investigate(
         not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
+        sensors=sensor_estimates(problem, fit),
         force=None if missing is None else missing.at_port,
     )
     return Investigation(
@@ -314,7 +317,9 @@ def _read_input(
 def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign with outliers marked and trials held out, and the faults of its data.
+    """Return the campaign in the names of its model, with outliers marked and trials held out.
+
+    The faults of its data are returned, too.
 
     Parameters
     ----------
@@ -338,6 +343,7 @@ def check_and_prepare(
                 f"have; it has {', '.join(names) or 'none'}: correct the name, or leave "
                 f"[parameters.{parameter}] out."
             )
+    campaign = campaign_in_names_of(campaign, model)
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))

@@ -21,8 +21,14 @@ from .conclusion import (
     is_negligible_instrument_error,
 )
 from .in_part import verdict_in_part, verdict_naming_laws_only, verdict_without_negligible_effect
-from .moved_unknowns import moved_sentence, moved_unknowns
+from .moved_unknowns import (
+    hiding_sentences,
+    moved_sentence,
+    moved_unknowns,
+    unknowns_moved_within_prior,
+)
 from .proof import check_held_out
+from .remarks import KINDS_WITHOUT_GAP
 from .rules import VerdictCase, decide_verdict, most_probable_sets
 from .verdict_checks import check_against_trials
 
@@ -60,9 +66,20 @@ def reach_verdict(
         _verdict_of_two_searches(problem, effects, on_progress, on_search)
     )
     verdict = outcome.verdict
-    unknowns = moved_unknowns(problem, outcome.search.no_effect)
-    sentence = f"{verdict.sentence} {moved_sentence(unknowns)}".strip()
-    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=unknowns))
+    no_effect = outcome.search.no_effect
+    moved = moved_unknowns(problem, no_effect)
+    moved_within_prior = unknowns_moved_within_prior(problem, no_effect)
+    if verdict.kind in KINDS_WITHOUT_GAP:
+        sentences = hiding_sentences(moved, moved_within_prior)
+    else:
+        sentences = moved_sentence(moved)
+    verdict = replace(
+        verdict,
+        sentence=f"{verdict.sentence} {sentences}".strip(),
+        moved=moved,
+        moved_within_prior=moved_within_prior,
+    )
+    return outcome._replace(verdict=verdict)
 
 
 def _verdict_of_two_searches(

@@ -12,6 +12,7 @@ from discrepancy.location.locate import Location
 from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.report.figures import ReportInput
+from discrepancy.report.sensor_table import sensor_table
 from discrepancy.report.sizes import size_sentence
 from discrepancy.report.text import (
     NAMING,
@@ -186,9 +187,16 @@ def verdict_card(verdict: Verdict) -> str:
     """Return the verdict in one line: what is missing, where, how large, and how sure that is.
 
     The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval.
+    a named effect with its 90 % interval. If nothing is missing, the parameter, gain or zero that
+    the fit moves farthest is mentioned.
     """
     clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
+    moved = (*verdict.moved, *verdict.moved_within_prior)
+    if verdict.kind in KINDS_WITHOUT_GAP and moved:
+        clauses.append(
+            f"but with {moved[0].name} moved by {abs(moved[0].deviations):.1f} stated deviations, "
+            "where an error of the model may hide"
+        )
     parameters: list[Estimate] = []
     if verdict.kind in NAMING:
         for effect in verdict.effects:
@@ -349,13 +357,14 @@ def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
 
 
 def _add_reasons(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on the gates, the compared hypotheses, and the model's parameters."""
+    """Add the section on gates, compared hypotheses, parameters, and fitted gains and zeros."""
     verdict = investigation.verdict
     book.page.add_section("Why this verdict")
     add_titled_table(book.page, verdict_tables.gates_table(verdict))
     add_titled_table(book.page, verdict_tables.evidence_table(verdict))
     add_titled_table(book.page, verdict_tables.not_compared_table(verdict))
     add_titled_table(book.page, tables.parameters_table(investigation))
+    add_titled_table(book.page, sensor_table(verdict.sensors, investigation.campaign.channels))
 
 
 def _add_proof(book: _PictureBook, investigation: Investigation) -> None:

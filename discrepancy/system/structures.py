@@ -99,6 +99,7 @@ class StructureModel(SystemModel):
         self.model = model
         self.name = model.name
         self.regions = model.regions
+        self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
         # loads
         units = zip(model.controls, model.control_units, strict=True)
@@ -197,10 +198,13 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, and errors of its forces.
+        It carries sensors, laws at its ports, losses of its damage regions, and errors of its
+        forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
+        if primitive is changes.RegionStiffnessLoss:
+            return bool(self.regions)
         if primitive is changes.LoadGain:
             return bool(self.forces)
         return primitive in SENSORS
@@ -345,6 +349,7 @@ class WingModel(SystemModel):
         validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
         self.parameters = wing_priors(validity, **prior)
         self.regions = arrays.regions
+        self.largest_losses = {region: validity[region][1] for region in arrays.regions}
         self.length = self.wing.span
         self.stations = (0.0, self.wing.span)
         self.port_rows = self.wing.port_rows

@@ -75,6 +75,13 @@ class ModulusTemperature(Primitive):
     coefficient: Annotated[float, "1/K"]
 
 
+class RegionStiffnessLoss(Primitive):
+    """A damage region loses `loss` of the stiffness that it has in a trial."""
+
+    region: str
+    loss: Annotated[float, "1"]
+
+
 class StiffnessDrift(Primitive):
     """The whole stiffness drifts within a record: K (1 + `rate` t), t since its start."""
 
@@ -160,6 +167,7 @@ SENSORS = (
 """Primitives that change readings of sensors, but not the motion of the structure."""
 _PRIMITIVE_TYPES: tuple[type[Primitive], ...] = (
     *STRUCTURE,
+    RegionStiffnessLoss,
     StiffnessDrift,
     *LAWS,
     *LOADS,
