@@ -197,7 +197,7 @@ def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_
         assert source.write_field(tmp_path / "wing.vtu", health, control)
     table["belief"]["patch"] = str(write_patch(tmp_path, SensorGain("g5", 0.1)))
     patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-    with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
+    with pytest.raises(MissionInputError, match="predicts strains, but `frequency`"):
         asset_source(patched).check()
 
 
