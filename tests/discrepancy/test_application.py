@@ -125,7 +125,7 @@ def test_a_verdict_of_nothing_missing_is_not_applied(round_trip, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     folder = round_trip.folder / round_trip.words[-1]
     sentence = run("apply", folder, "--out", "more.json", failed=True)
-    assert "nothing is missing, and the model stands as it is" in sentence
+    assert "nothing is missing, and the model needs no change" in sentence
     assert not list(tmp_path.iterdir())
 
 
@@ -293,7 +293,7 @@ def applied_member(request, group_verdict, tmp_path_factory):
 
 def test_a_member_of_a_group_is_no_name(applied_member):
     leading, other = applied_member.group.verdict.group
-    sentence = f"one of a group that the data cannot tell apart: no name (of {leading}, {other})."
+    sentence = f"one of a group that the data cannot tell apart, and not a name (group: {leading}, {other})."
     first_sentence = applied_member.printed.splitlines()[0].split(": ", 1)[1]
     assert sentence in applied_member.printed
     assert applied_member.patch.verdict is VerdictKind.GROUP

@@ -274,7 +274,7 @@ def page_of_soft_wing(soft: SimpleNamespace) -> str:
 
 def test_the_report_of_a_calibration_stands_beside_table_1(page_of_soft_wing):
     assert "Calibration of soft" in page_of_soft_wing
-    assert "This calibration beside Table 1 of the paper" in page_of_soft_wing
+    assert "This calibration and Table 1 of the paper" in page_of_soft_wing
 
 
 def test_the_report_of_a_calibration_fetches_nothing_and_names_no_folder(page_of_soft_wing):

@@ -198,6 +198,6 @@ def test_a_search_of_faulty_data_ends_with_a_sentence_and_a_report(faulty_campai
     out = tmp_path / "v"
     sentence = refused("discrepancy", "run", faulty_campaign, *RIG, "--out", out)
     page = (out / "report.html").read_text("utf-8")
-    assert "shows about 1000 times what the model says (mm given as m?)" in sentence
+    assert "shows about 1000 times what the model predicts (mm given as m?)" in sentence
     assert sorted(path.name for path in out.iterdir()) == ["report.html", "verdict.json"]
     assert "Proof" not in page

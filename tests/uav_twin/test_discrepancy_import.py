@@ -6,6 +6,7 @@ import re
 import select
 import shlex
 import signal
+import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from decimal import Decimal
@@ -121,6 +122,7 @@ def test_everything_that_is_not_said_is_named_at_once():
         "--release NAME=... for 'swing.csv' (how far the point was held",
     ):
         assert part in sentence
+    assert sentence.strip().endswith("To have the outputs of your model listed, give --model.")
 
 
 SAMPLES_AT_REST = "time [s],x [um],temperature [degC]\n" + "".join(
@@ -149,7 +151,7 @@ def test_samples_at_rest_of_two_files_are_refused():
         Path(name).write_text(SAMPLES_AT_REST, "utf-8")
     Path("push.csv").write_text(PUSH, "utf-8")
     done = command(*IMPORT, "push.csv", "n1.csv", "n2.csv", *PUSH_OPTIONS)
-    sentence = "Noise is read from one file, and n1.csv and n2.csv came: give one of them."
+    sentence = "Noise is read from one file, but n1.csv and n2.csv were given: give one of them."
     assert (done.returncode, done.stderr.strip()) == (1, sentence)
 
 
@@ -183,7 +185,7 @@ def test_a_channel_in_millivolts_per_volt_is_a_signal(pushed):
 
 
 def test_how_a_trial_begins_is_assumed_until_it_is_said(pushed):
-    assumption = "(assumed: say `begins`"
+    assumption = "(assumed; set `begins`"
     file = Path("lab/campaign.toml")
     stated = file.read_text("utf-8").replace('"driven"', '"driven"\nbegins = "still"')
     assert assumption in " ".join(pushed.remarks)
@@ -235,15 +237,34 @@ def test_the_documented_files_print_the_documented_tables(block):
     assert documented == shown
 
 
-def test_the_documented_import_writes_the_documented_file_and_has_the_documented_faults():
+@pytest.fixture
+def documented_check(here: Path) -> tuple[DocumentedImport, subprocess.CompletedProcess[str]]:
+    """The documented import, and what the check of its campaign prints."""
     page = DocumentedImport()
     page.documented_and_shown(page.given)
-    checked = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
-    faults = [row for row in checked.stdout.splitlines() if row.startswith("Fault: ")]
+    return page, command("discrepancy", "check", "lab", "--model", "single_mass_rig")
+
+
+def test_the_documented_import_writes_the_documented_file(documented_check):
+    page, _ = documented_check
     beginning = page.written.rpartition("...")[0]
     assert Path("lab/02_release.csv").read_text("utf-8").startswith(beginning)
+
+
+def test_the_documented_campaign_has_the_documented_faults(documented_check):
+    page, checked = documented_check
+    faults = [row for row in checked.stdout.splitlines() if row.startswith("Fault: ")]
     assert checked.returncode == 1
     assert faults == page.checked.splitlines()
+
+
+def test_a_line_of_the_output_has_12_digits_of_each_hash_once(documented_check):
+    _, checked = documented_check
+    toml = Path("lab/campaign.toml").read_text("utf-8")
+    stored_hashes = re.findall(r"SHA-256 ([0-9a-f]{64})\b", toml)
+    printed_hashes = re.findall(r"SHA-256 ([0-9a-f]+)", checked.stdout)
+    assert len(stored_hashes) == 2
+    assert printed_hashes == [stored[:12] for stored in stored_hashes]
 
 
 # ---------------------------------------------------------------- a terminal
@@ -280,7 +301,7 @@ def answered_import(here: Path) -> tuple[str, Campaign]:
 def test_a_terminal_is_asked_again_after_a_wrong_answer(answered_import):
     screen, _ = answered_import
     kinds = "static, ringdown, forced, driven, flight or noise"
-    assert f"--kind must be {kinds}, and 'swinging' came." in screen
+    assert f"--kind must be {kinds}, but 'swinging' was given." in screen
     assert "--zero of 'Weg' must be a standard deviation such as 0.1mm or 1%" in screen
     assert "Write lab?" in screen
 
@@ -426,7 +447,7 @@ def swings(*names: str, first_column: bool = True) -> None:
 
 
 ASSUMED_ZEROS_AND_GAINS = (
-    "Zeros and gains that nobody stated are assumed to be known: "
+    "Zeros and gains without a stated standard deviation are assumed to be known: "
     "the zero of 'x' to 0.2 um and the gain of 'x' to 2 %."
 )
 
@@ -484,7 +505,7 @@ def test_a_table_without_a_time_has_the_interval_that_is_stated():
     assert read_campaign("a").trials[0].time.tolist() == [0.02 * k for k in range(16)]
     swings("b.csv")
     sentence = refused(*IMPORT, "b.csv", "--kind", "driven", *PLAIN, "--interval", "b.csv=0.02")
-    assert "b.csv has a column of times, and --interval came for it" in sentence
+    assert "b.csv has a column of times, but --interval was given for it" in sentence
 
 
 def test_a_table_of_one_column_has_the_interval_that_is_stated():
@@ -538,7 +559,7 @@ def test_a_force_in_a_unit_of_length_is_refused(push_in_pounds):
     file = Path("forced/campaign.toml")
     file.write_text(file.read_text("utf-8").replace('"lbf"', '"mm"'), "utf-8")
     sentence = refused("discrepancy", "check", "forced", *RIG)
-    assert "force must have a unit such as N, mN or kN, and 'mm' came" in sentence
+    assert "force must have a unit such as N, mN or kN, but 'mm' was given" in sentence
 
 
 @pytest.mark.parametrize(
@@ -557,7 +578,7 @@ def test_a_scale_of_a_mere_number_keeps_the_unit_and_one_of_another_unit_is_refu
     said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=-1")
     assert read_campaign("a").trials[0].values[0, 0] == pytest.approx(20e-6, rel=1e-14)
     sentence = refused(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=200 N/V", "--out", "b")
-    assert "--scale of 'x' is for cells in V, and they are in um" in sentence
+    assert "--scale of 'x' is for cells in V, but they are in um" in sentence
 
 
 def test_channels_keep_the_units_and_digits_of_the_files():
@@ -565,3 +586,17 @@ def test_channels_keep_the_units_and_digits_of_the_files():
     said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
     assert 'unit = "um"' in Path("a/campaign.toml").read_text("utf-8")
     assert Path("a/01_a.csv").read_text("utf-8").splitlines()[:3] == ["time,x", "0.0,-20.0", "0.01,-10.0"]
+
+
+def test_the_outputs_of_the_model_are_listed_with_their_units_where_a_column_may_be_one_of_them():
+    Path("swing.csv").write_bytes(TWO["swing.csv"])
+    outputs = "displacement (displacement in m) and leaf_strain (strain without a unit)"
+    options = ("swing.csv", "--kind", "ringdown", "--release", "8mm", "--decimal", ",", "--model", MODEL)
+    assert f"The model has the outputs {outputs}." in refused(*IMPORT, *options)
+    wrong = ("--column", "Weg=deflection", "--unit", "Weg=mm")
+    assert f"the model has no output 'deflection'; it has {outputs}; say another." in refused(
+        *IMPORT, *options, *wrong
+    )
+    _, screen = in_a_terminal(["deflection", "displacement", "mm", "", "", "y"], *options, "--out", "lab")
+    assert screen.index(f"The model has the outputs {outputs}.") < screen.index("Weg: column")
+    assert [channel.output for channel in read_campaign("lab").channels.values()] == ["displacement"]

@@ -18,7 +18,7 @@ from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.history_files import read_histories
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
-from scenarios import binding_files
+from scenarios import binding_files, scenario_files
 from tests.command_line import command, refused, said
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members
 from tests.refusals import Inputs
@@ -235,7 +235,7 @@ def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
     given.write_text("time,u\n0,0\n")
     for more, sentence in (
         (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
-        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, and 'cubic' came"),
+        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, but 'cubic' was given"),
     ):
         assert sentence in refused("fmu", "simulate", *wanted, *more, "--replace", code=None)
 
@@ -433,3 +433,21 @@ def test_from_a_script_to_a_library(tmp_path):
     ):
         assert words in refused(*sample, *extra)
         assert out.read_bytes() == content
+
+
+def test_an_input_that_nobody_sets_is_warned_about_once(foreign_fmu, tmp_path):
+    inputs = tmp_path / "inputs.csv"
+    inputs.write_text("time,power\n120,1\n180,2\n", encoding="utf-8")
+    words = ("--binding", ROOM, "--inputs", inputs, "--in-process")
+    told = said("fmu", "simulate", foreign_fmu("room2"), *words)
+    assert told.count("2 inputs stay at their start values, because nobody sets them: ") == 1
+
+    binding = binding_files()["gear_pump"].read_text("utf-8")
+    without_pressure = re.sub(r"(?s)\[control\.pressure\].*?\n\n", "", binding)
+    (tmp_path / "pump.toml").write_text(without_pressure, encoding="utf-8")
+    scenario = re.sub(r", pressure = \d+\.0", "", scenario_files()["pump_wear"].read_text("utf-8"))
+    scenario = scenario.replace('binding = "gear_pump"', 'binding = "pump.toml"')
+    (tmp_path / "mine.toml").write_text(scenario, encoding="utf-8")
+    checked = command("scenario", "check", tmp_path / "mine.toml")
+    assert checked.returncode == 0, checked.stderr
+    assert checked.stderr.count("nobody sets it: pressure (150 bar)") == 1

@@ -1,6 +1,8 @@
 """`uav-twin ssp` and `run x.ssp` as a user calls them."""
 
+import io
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +160,33 @@ def test_the_words_of_ssp_2_are_read(system, tmp_path):
 def test_the_wing_of_a_design(tmp_path):
     said("ssp", "export", "uav_wing", "--out", tmp_path / "wing.ssp")
     assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", tmp_path / "wing.ssp")
+
+
+def members_of_component(system: Path, component: str) -> set[str]:
+    """Return the first folders and files inside the FMU of a component of an SSP file."""
+    with zipfile.ZipFile(system) as archive:
+        content = archive.read(f"resources/{component}.fmu")
+    with zipfile.ZipFile(io.BytesIO(content)) as fmu:
+        return {name.partition("/")[0] for name in fmu.namelist()} | {*fmu.namelist()}
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_fmus_of_a_design_are_exported_as_the_user_says(tmp_path):
+    """A compiled FMU has no Python inside, and other components stay as they are."""
+    said("ssp", "export", "uav_wing", "--kind", "compiled", "--out", tmp_path / "wing.ssp")
+    said("ssp", "export", "three_fmus", "--kind", "compiled", "--out", tmp_path / "three.ssp")
+    said("ssp", "export", "three_fmus", "--out", tmp_path / "as_said.ssp")
+    python = {
+        (system, component): any(
+            name.endswith(".py") for name in members_of_component(tmp_path / f"{system}.ssp", component)
+        )
+        for system, component in (
+            ("wing", "uav_wing"),
+            ("three", "wing"),
+            ("three", "gauges"),
+            ("as_said", "wing"),
+        )
+    }
+    assert [*python.values()] == [False, False, True, True]
+    assert "no problem found" in said("ssp", "check", tmp_path / "three.ssp")

@@ -100,7 +100,7 @@ def test_verify_names_the_checks_that_broke_their_limit(file, monkeypatch):
     done = command("structure", "verify", file, "--modes", "2")
     assert done.returncode == 1
     assert "BROKEN" in done.stdout
-    assert done.stderr.strip().endswith("1 of 4 checks broke their limit: 2 modes, frequencies.")
+    assert done.stderr.strip().endswith("1 of 4 checks exceeded their limits: 2 modes, frequencies.")
 
 
 class ReducedBeam:
@@ -316,7 +316,7 @@ def test_a_campaign_tells_the_modulus_and_not_the_mass(calibrated_mission):
 def test_a_mission_says_what_was_calibrated_what_flies_and_what_is_believed(calibrated_mission):
     calibration, file = calibrated_mission.calibration, calibrated_mission.file
     beginning = (
-        f"Calibrated was the model {calibration.model}; flown is the FMU of the structure bracket, and"
+        f"The calibrated model was {calibration.model}; flown is the FMU of the structure bracket, and"
     )
     end = calibrated_mission.believed
     assert calibration.design_hash == packed_design_hash(file.parents[1] / "bracket.fmu")

@@ -94,7 +94,7 @@ NO_SIDE = ('side = "2 - 1"', 'side = "0.5 * power"')
         (NO_PORT, "flap", "has no port 'flap'; it has root, tip, span"),
         (NO_SIDE, "tip", "side must be a number"),
     ],
-    ids=["a place that is no port", "a value that no primitive can have"],
+    ids=["a place that is not a port", "a value that no primitive can have"],
 )
 def test_an_effect_that_cannot_be_built_is_refused(write, setting, change, place, sentence):
     buffer = load_catalogue([write(BUFFER.replace(*change))], installed=False)[-2]

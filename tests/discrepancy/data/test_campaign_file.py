@@ -240,9 +240,9 @@ def test_temperatures_and_angles_come_out_in_si(heated):
 def test_trials_begin_as_they_say_or_settled(heated):
     first, second = heated.trials
     remarks = " ".join(heated.remarks)
-    settled = "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed"
+    settled = "The trial 'second' is taken to begin at rest under the loads of the first sample (assumed"
     assert (first.begins, second.begins, second.inputs) == (Start.UNKNOWN, Start.SETTLED, ())
-    assert "The trial 'first' is begun in a state that is fitted." in remarks
+    assert "The trial 'first' is taken to begin in a state that is fitted." in remarks
     assert settled in remarks
 
 
@@ -349,7 +349,8 @@ def test_what_a_campaign_accepts_is_read_and_written(tmp_path):
 def test_a_word_that_is_no_fault_cannot_be_accepted(tmp_path):
     change = (TOML, 'name = "tip"', 'name = "tip"\naccept = ["frozen"]')
     with refused(
-        CampaignFileError, "'frozen' is no fault that can be accepted; these are clipped, dead, held"
+        CampaignFileError,
+        "'frozen' is not a fault that can be accepted; those that can are clipped, dead, held",
     ):
         read_campaign(campaign_folder(tmp_path / "a", PLAIN, change))
 

@@ -193,7 +193,7 @@ def test_clocks_whose_names_and_places_contradict_each_other_are_refused(tmp_pat
 def test_clocks_that_neither_names_nor_places_tell_apart_are_refused(tmp_path):
     heads = ("time a [s]", "time b [s]", "acc1 [m/s2]", "acc2 [m/s2]")
     beside = table(tmp_path, heads, FAST, FAST, readings(FAST), readings(FAST))
-    assert "neither names nor places say it" in refusal(beside)
+    assert "neither the names nor the places of the columns show it" in refusal(beside)
 
 
 def test_a_clock_that_goes_back_is_refused(tmp_path):
@@ -217,4 +217,4 @@ def test_a_reading_without_a_time_is_refused_by_its_line(tmp_path):
     lines = file.read_text("utf-8").splitlines()
     lines[5] = lines[5].replace(f",{LATE[4]},", ",,")
     file.write_text("\n".join(lines) + "\n", "utf-8")
-    assert "lab.csv, line 6: 'acc2' has a reading and 'time2' no time" in refusal(read_sheet(file))
+    assert "lab.csv, line 6: 'acc2' has a reading, but 'time2' has no time" in refusal(read_sheet(file))

@@ -133,7 +133,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other(c
 
 def test_a_closed_gap_gains_log_score_and_leaves_nothing(closing_proof):
     assert closing_proof.log_score_gain > 5.0 * closing_proof.log_score_gain_error > 0.0
-    assert closing_proof.remaining.startswith("Nothing that these data can show remains")
+    assert closing_proof.remaining.startswith("These data show no remains")
 
 
 def test_the_gain_of_log_score_does_not_depend_on_the_own_noise_of_the_later_fit(
@@ -222,7 +222,7 @@ def test_a_share_of_few_blocks_has_no_interval():
 
 
 def test_one_noise_is_under_both_errors_where_none_is_recorded():
-    """What each hypothesis leaves in fitted trials is its own noise, which is no measure of its error."""
+    """What each hypothesis leaves in fitted trials is its own noise, which is not a measure of its error."""
     bare = with_noise(Bench(amplitudes=MANY, held_out=HELD).fit(np.random.default_rng(7)), None)
     trials = [replace(item, noise_deviation=0.01 * item.noise_deviation) for item in bare.trials]
     assert closed_share(bare, replace(bare, trials=tuple(trials))).value == pytest.approx(0.0)

@@ -153,7 +153,7 @@ def test_gates_say_what_they_compare(drag, page):
 
 def test_a_group_is_no_name(drag):
     page = page_of(drag, kind=VerdictKind.GROUP)
-    assert "The best hypothesis, which is no name, explains" in page
+    assert "The best hypothesis, which is not named, explains" in page
 
 
 def test_a_proof_without_a_gap_says_so(drag):
@@ -539,7 +539,7 @@ def test_an_old_verdict_is_replaced_on_demand_only(drag, old_verdict):
     assert stat.S_IMODE(old_verdict.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
 
 
-@pytest.mark.parametrize(("name", "sentence"), [(".", "not touched"), ("chapter.tex", "no folder")])
+@pytest.mark.parametrize(("name", "sentence"), [(".", "left unchanged"), ("chapter.tex", "no folder")])
 def test_what_is_no_verdict_is_never_replaced(tmp_path, name, sentence):
     (tmp_path / "chapter.tex").write_text("x", encoding="utf-8")
     with pytest.raises(FileNotWrittenError, match=sentence):

@@ -274,7 +274,7 @@ def test_a_folder_of_another_kind_is_refused(folder_of_another_kind, reader):
 
 
 def test_a_folder_of_another_kind_is_not_replaced(folder_of_another_kind, library_file):
-    with pytest.raises(RunFolderError, match="not touched"):
+    with pytest.raises(RunFolderError, match="left unchanged"):
         fly_fleet(growing(library_file, count=2), folder_of_another_kind, replace_old=True)
 
 

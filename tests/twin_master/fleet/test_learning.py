@@ -513,10 +513,10 @@ def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
     worst_off = grown_group.plan.members[int(np.argmax(grown_group.loss))].name
     opening = (
         f"60 of 60 assets have flown. In {len(delays)} assets the damage called for another control; the "
-        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%. The worst off is "
-        f"{worst_off} of growing_damage: "
+        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%. The asset "
+        f"with the most damage is {worst_off} of growing_damage: "
     )
-    for words in (opening, "60 assets in 1 group", "The assets by health", "Who needs attention next"):
+    for words in (opening, "60 assets in 1 group", "The assets by health", "Assets that need attention next"):
         assert words in text
 
 
@@ -560,7 +560,7 @@ def test_the_report_names_who_needs_attention(grown_group):
     percentage = np.rint(100.0 * np.maximum(leaving, 0.0))
     order = np.lexsort((-grown_group.loss, -percentage, -alarms))
     page = fleet_page(grown_group.folder, ATTENTION_ROWS)
-    table = page.partition("Who needs attention next")[2]
+    table = page.partition("Assets that need attention next")[2]
     assert max(leaving) > min(leaving) + 0.1
     assert len(set(percentage)) < len(set(leaving))
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in order[:50]]

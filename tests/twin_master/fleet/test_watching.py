@@ -439,7 +439,7 @@ def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_f
     done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "north/wing-0 is not watched: " in done.stderr
-    assert "`colour` is no sensor" in done.stderr
+    assert "`colour` is not a sensor" in done.stderr
 
 
 def test_a_fleet_with_an_asset_whose_messages_are_refused_ends_with_exit_code_1(fleet_file, tmp_path):
@@ -492,7 +492,7 @@ def test_a_lost_asset_has_its_reason(partly_lost):
 
 @pytest.mark.parametrize(
     ("line", "sentence"),
-    [(LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")],
+    [(LOGS.replace("logs", "none"), "no recording matches"), ("count = 2", "north has none")],
 )
 def test_a_fleet_without_recordings_is_refused(fleet_file, tmp_path, line, sentence):
     with pytest.raises(FleetError, match=sentence):

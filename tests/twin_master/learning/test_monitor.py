@@ -116,8 +116,8 @@ def test_an_alarm_names_the_gauge_and_the_step_from_which_on_it_is_off(loose_gau
     notices = [notice for estimate in loose_gauge.watched for notice in estimate.notices]
     (alarm,) = (notice for notice in notices if notice.kind == "alarm")
     cause = (
-        ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
-        f"softened, since about step {alarm.since}"
+        ": gauge 2 (spar) shows too much, or the asset near it differs from the model, for example "
+        f"because it has softened, since about step {alarm.since}"
     )
     assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
     assert cause in alarm.sentence
@@ -479,7 +479,7 @@ def test_each_fault_has_an_alarm(two_faults):
 
 def test_a_notice_says_what_belief_and_decision_follow(two_faults):
     sentences = [notice.sentence for notice in two_faults.notices if notice.kind == "hypothesis"]
-    asset = "Or the asset near it is not as the model says, as where it has softened: these data"
+    asset = "Or the asset near it differs from the model, for example because it has softened: these data"
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
     assert asset in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]
@@ -487,7 +487,10 @@ def test_a_notice_says_what_belief_and_decision_follow(two_faults):
 
 def test_a_notice_says_that_no_state_is_believed_and_the_control_is_the_safest(two_faults):
     sentences = [notice.sentence for notice in two_faults.notices if notice.kind == "hypothesis"]
-    assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
+    assert (
+        "no state explains the gauges: no state is believed, and the twin proposes the safest control"
+        in sentences[-2]
+    )
 
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():

@@ -178,7 +178,7 @@ def test_a_file_that_is_no_policy_is_refused(learning_scenario, tmp_path, conten
     empty.touch()
     policy = learning_scenario if content == "a scenario" else empty
     sentence = refused("run", learning_scenario, "--policy", policy, "--out", tmp_path / "run")
-    assert "is no policy" in sentence
+    assert "is not a policy" in sentence
     assert "pickle" not in sentence
 
 

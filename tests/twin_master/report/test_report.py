@@ -403,7 +403,7 @@ def test_lost_gauges_of_the_last_steps_have_their_numbers(last_steps):
 @pytest.mark.parametrize("now", [49, 999, 1050])
 def test_a_present_outside_the_last_steps_is_refused(last_steps, hold, tmp_path, now):
     hold(last_steps)
-    with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
+    with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, but {now} was given"):
         report.write_report(tmp_path, now=now)
 
 

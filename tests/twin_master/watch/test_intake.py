@@ -395,7 +395,7 @@ def test_an_unknown_name_that_is_allowed_is_passed_over(allowing):
 
 def test_a_gauge_in_a_wrong_unit_is_refused_also_where_unknown_names_are_allowed(allowing):
     refusal = MessageReader(allowing).read(b'{"strain_2_bar": 1e-4}')
-    assert "`bar` is no unit of sensor 2" in str(refusal)
+    assert "`bar` is not a unit of sensor 2" in str(refusal)
 
 
 def test_a_message_may_have_one_unit_for_all_sensors(allowing):

@@ -96,7 +96,9 @@ def test_a_gap_of_a_clock_that_is_known_is_a_gap_however_long(watch, mission):
     decisions = decisions_of(watch, messages)
     assert decisions[-1]["step"] == 1001
     told = sentence(decisions, "gap")
-    assert told.startswith("Steps 2 to 1000: no message came, and the belief is predicted through 999 steps")
+    assert told.startswith(
+        "Steps 2 to 1000: no message was received, and the belief is predicted over 999 steps"
+    )
     assert "milliseconds" not in told
 
 
@@ -104,7 +106,7 @@ def test_a_gap_is_told_once_by_a_watch_that_ends_within(watch, mission, tmp_path
     messages = [line(mission, step, step=step) for step in (0, 1, 9)]
     decisions = decisions_of(watch, messages, steps=4) + decisions_of(watch, messages[2:])
     assert kinds(decisions) == [(2, "gap")]
-    assert sentence(decisions, "gap").startswith("Steps 2 to 8: no message came")
+    assert sentence(decisions, "gap").startswith("Steps 2 to 8: no message was received")
     assert decisions[-1]["step"] == 9
 
 
@@ -119,7 +121,7 @@ def refused_in_rows(watch, mission) -> list[dict[str, Any]]:
 def test_refusals_in_a_row_are_told_once(refused_in_rows):
     told = sentence(refused_in_rows, "refused")
     assert kinds(refused_in_rows) == [(1, "refused"), (2, "taken")]
-    assert "Since step 1, 3 messages came, and all were refused" in told
+    assert "Since step 1, 3 messages were received, and all were refused" in told
 
 
 def test_it_is_told_with_the_last_decision_that_messages_are_taken_again(refused_in_rows, watch):

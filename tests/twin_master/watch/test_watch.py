@@ -378,7 +378,7 @@ def damaged_watch(long_watch: LongWatch, tmp_path: Path) -> Watch:
 
 
 def test_a_damaged_line_that_is_read_is_refused_with_the_numbers_of_whole_ones(damaged_watch):
-    sentence = r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
+    sentence = r"line 4 .*damaged.*; 3 before it and 195 after it are valid"
     with pytest.raises(NotResumableError, match=sentence):
         notices_since(damaged_watch, 0)
 
