@@ -310,7 +310,7 @@ def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
 
 def test_what_cannot_be_resumed(tmp_path, library_file):
     for place, sentence in (
-        (tmp_path / "nothing", "there is not a run folder"),
+        (tmp_path / "nothing", "there is no run folder"),
         (tmp_path, "is not a run folder"),
     ):
         with pytest.raises(NotResumableError, match=sentence):

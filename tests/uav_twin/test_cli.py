@@ -138,7 +138,7 @@ def test_the_master_script_is_the_same_command(tmp_path):
     environment = os.environ | {"COLUMNS": "200"}
     done = subprocess.run(line, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 1
-    assert "there is not a run folder" in done.stderr
+    assert "there is no run folder" in done.stderr
 
 
 FLIGHT = (  # `run --no-report`
