@@ -149,18 +149,18 @@ def read_lengths(path: Path) -> Lengths:
     table = lab_table(path, GEOMETRY_FILE)
     names = table.cells("parameter", _NEEDED_BY)
     table.refuse_repeated(names, "parameter", "keep one of them")
-    missing = [published for published in PUBLISHED_NAMES if published not in names]
-    if missing:
+    missing_names = [published for published in PUBLISHED_NAMES if published not in names]
+    if missing_names:
         raise ExperimentFileError(
-            f"{table.name} lacks the row {' and '.join(missing)}; "
+            f"{table.name} lacks the row {' and '.join(missing_names)}; "
             f"{comma_list(PUBLISHED_NAMES)} are needed."
         )
     designed = _lengths_in_millimetres(table, "designed")
-    measured = _lengths_in_millimetres(table, "manufactured")
+    measured_lengths = _lengths_in_millimetres(table, "manufactured")
     lengths = {}
     for published, name in PUBLISHED_NAMES.items():
         row = names.index(published)
-        lengths[name] = MeasuredLength(name, 1e-3 * designed[row], 1e-3 * measured[row])
+        lengths[name] = MeasuredLength(name, 1e-3 * designed[row], 1e-3 * measured_lengths[row])
     return Lengths(**lengths)
 
 

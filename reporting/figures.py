@@ -542,7 +542,7 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
             look += f' {name}="{value}"'
     label = html.escape(description)
     view_box = attributes["viewBox"]
-    full = (
+    full_drawing = (
         f'<svg viewBox="{view_box}" role="img" aria-label="{label}">'
         f'<g id="{prefix}-{_DRAWING}"{look}>{content}</g></svg>'
     )
@@ -553,7 +553,7 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
         widths = [float(tile_box.split()[2]) for tile_box in tile_boxes]
         for tile_box, width in zip(tile_boxes, widths, strict=True):
             tiles.append(_tile_element(tile_box, width, f"{prefix}-{_DRAWING}"))
-    return InlineDrawing(full, tuple(tiles), is_wide=max(widths) > NARROW)
+    return InlineDrawing(full_drawing, tuple(tiles), is_wide=max(widths) > NARROW)
 
 
 def _tile_element(view_box: str, width: float, drawing: str) -> str:

@@ -47,7 +47,7 @@ def _inner_types(annotation: object, step: int | str) -> list[object]:
     """Return the types of the value at a key or an index of a value; empty if it has none there."""
     if isinstance(step, int):
         entries = [entry for entry in get_args(annotation) if entry is not Ellipsis]
-        return [inner for entry in entries for inner in _alternatives(entry)]
+        return [inner_type for entry in entries for inner_type in _alternatives(entry)]
     types_of_keys = _types_of_keys(annotation)
     if step in types_of_keys:
         return [*_alternatives(types_of_keys[step])]

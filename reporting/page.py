@@ -68,11 +68,11 @@ class Table:
     rows: Sequence[Sequence[str]]
 
     def __post_init__(self) -> None:
-        needed = len(self.columns)
+        cells_needed = len(self.columns)
         for number, row in enumerate(self.rows):
-            if len(row) != needed:
+            if len(row) != cells_needed:
                 raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; {needed} are needed."
+                    f"Row {number} of a table has {len(row)} cells; {cells_needed} are needed."
                 )
 
 

@@ -312,11 +312,11 @@ def _check_columns(columns: Sequence[str], name: str, errors: TableErrors) -> No
 def _width_message(row: _Row, columns: Sequence[str], *, has_header: bool, has_commas: bool) -> str:
     """Return the message about a row whose number of cells is not that of the columns."""
     cells = counted(len(row.cells), "cell")
-    wanted = counted(len(columns), "column")
+    wanted_columns = counted(len(columns), "column")
     if has_header:
-        message = f"{cells} came, and the header has {wanted}."
+        message = f"{cells} came, and the header has {wanted_columns}."
     else:
-        message = f"{cells} came, and {wanted} ({', '.join(columns)}) are expected."
+        message = f"{cells} came, and {wanted_columns} ({', '.join(columns)}) are expected."
     has_more_cells = len(row.cells) > len(columns)
     if has_commas and has_more_cells and all(is_number(cell) for cell in row.cells):
         message += " A decimal comma makes two cells of a number: write it with a point."

@@ -363,17 +363,17 @@ def _validation_message(error: ValidationError, model: object, what: str, first_
     """
     faults = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
-    unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
-    if unknown:
-        return _unknown_keys_message(unknown, model, what, first_index)
-    missing = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
-    if not missing:
+    unknown_key_faults = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
+    if unknown_key_faults:
+        return _unknown_keys_message(unknown_key_faults, model, what, first_index)
+    missing_key_faults = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
+    if not missing_key_faults:
         return _value_message(faults[0], first_index)
     keys = []
-    for fault in missing:
+    for fault in missing_key_faults:
         keys += [short_repr(location) for location in _missing_locations(fault, first_index)]
-    if missing[0]["type"] == MISSING_KEY and len(keys) <= 1:
-        return _value_message(missing[0], first_index)
+    if missing_key_faults[0]["type"] == MISSING_KEY and len(keys) <= 1:
+        return _value_message(missing_key_faults[0], first_index)
     return f"{listing(keys)} {is_or_are(len(keys))} missing"
 
 

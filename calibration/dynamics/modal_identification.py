@@ -188,11 +188,11 @@ def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
     # The correlations of a block have 2 `lags` lags. A decay is not divided into blocks, but must
     # be longer than its correlations.
     blocks = BLOCKS if kind == "ambient" else 4
-    needed = blocks * 2 * lags
-    if len(record) < needed:
+    samples_needed = blocks * 2 * lags
+    if len(record) < samples_needed:
         raise ExperimentDataError(
-            f"the record has {len(record)} samples; {needed} are needed to tell modes and their "
-            "covariance: record longer, or take a smaller sampling rate."
+            f"the record has {len(record)} samples; {samples_needed} are needed to tell modes and "
+            "their covariance: record longer, or take a smaller sampling rate."
         )
 
 
@@ -306,8 +306,10 @@ class _AmbientIdentification:
         ]
         covariances = []
         for position, number in enumerate(numbers):
-            changed = np.array([values_of_poles[position] for values_of_poles in changed_values])
-            derivative = (changed - self.poles.modal_values(number)) / _DIFFERENCE_STEP
+            changed_modal_values = np.array(
+                [values_of_poles[position] for values_of_poles in changed_values]
+            )
+            derivative = (changed_modal_values - self.poles.modal_values(number)) / _DIFFERENCE_STEP
             covariances.append(derivative.T @ derivative / (block_count * (block_count - 1)))
         return covariances
 
@@ -440,7 +442,7 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
         for of_channel, derivative in ((channel, by_amplitude), (0, by_first_amplitude)):
             # Order of the unknowns: the poles (K Re s, K Im s), and then for each channel K Re A,
             # K Im A and the offset. For an analytic w(A), dRe w = Re w' dRe A - Im w' dIm A.
-            real = 2 * count + of_channel * (2 * count + 1) + number
-            imaginary = real + count
-            gradient[1 + channel, [real, imaginary]] = derivative.real, -derivative.imag
+            real_row = 2 * count + of_channel * (2 * count + 1) + number
+            imaginary_row = real_row + count
+            gradient[1 + channel, [real_row, imaginary_row]] = derivative.real, -derivative.imag
     return np.asarray(gradient @ fit.covariance @ gradient.T)

@@ -167,9 +167,9 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
     """
     files = find_records(path)
     if not files:
-        raw, _, read_off = FILE_PATTERNS
+        raw_pattern, _, read_off_pattern = FILE_PATTERNS
         raise ExperimentFileError(
-            f"{path} holds no ring-down record; {raw} or {read_off} is needed, "
+            f"{path} holds no ring-down record; {raw_pattern} or {read_off_pattern} is needed, "
             f"there or in its folder {STEP_FOLDER}."
         )
     return tuple(_read_record(file) for file in files)

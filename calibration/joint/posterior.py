@@ -321,14 +321,14 @@ def _comparison_with_wing(
     def compare(states: Float) -> Comparison:
         outputs = wing.outputs(states)
         stiffness = outputs[:, :1]
-        predicted = outputs[:, columns]
+        predicted_values = outputs[:, columns]
         # A load differs from k x by R_f + k^2 R_x, see `residual_variance`; a frequency by the
         # reading's error and the model's.
         load_difference = static.load - stiffness * static.displacement
         load_deviation = np.sqrt(residual_variance(static, stiffness))
-        reading_deviation = np.hypot(deviation, relative_error * predicted)
+        reading_deviation = np.hypot(deviation, relative_error * predicted_values)
         return Comparison(
-            difference=np.hstack([load_difference, value - predicted]),
+            difference=np.hstack([load_difference, value - predicted_values]),
             deviation=np.hstack(
                 [np.broadcast_to(load_deviation, load_difference.shape), reading_deviation]
             ),

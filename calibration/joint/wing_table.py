@@ -203,8 +203,8 @@ class WingTable:
                 f"for {prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a "
                 "model with a wider range."
             )
-        scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
-        return _evaluate(scaled, self.coefficient)
+        unit_points = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
+        return _evaluate(unit_points, self.coefficient)
 
     def outputs(self, states: Float) -> Float:
         """Return the outputs of states.
@@ -224,36 +224,38 @@ class WingTable:
         OutsideValidityError
             If a state lies outside the range of the model or is not finite.
         """
-        frequency = self.frequency(states)
+        frequencies = self.frequency(states)
         # Each array is (N, 1), so that it is combined with the two columns of frequencies.
         factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]  # each (N, 1)
-        ratio = rayleigh_damping_ratio(alpha, beta, frequency)
-        total_mass = 2.0 * servo + pitot
-        return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, total_mass])
+        damping_ratios = rayleigh_damping_ratio(alpha, beta, frequencies)
+        total_masses = 2.0 * servo + pitot
+        return np.hstack(
+            [self.stiffness.stiffness(factor), frequencies, damping_ratios, total_masses]
+        )
 
 
-def _evaluate(scaled: Float, coefficient: Float) -> Float:
+def _evaluate(unit_points: Float, coefficients: Float) -> Float:
     """Return the frequencies (N, 2) [Hz] of a table at scaled parameters.
 
     Parameters
     ----------
-    scaled : (N, 3) array
+    unit_points : (N, 3) array
         The parameters, scaled to [-1, 1].
-    coefficient : (I, J, K, 2) array
+    coefficients : (I, J, K, 2) array
         The Chebyshev coefficients of ln f1 and ln f2.
     """
-    x, y, z = scaled.T
-    return np.asarray(np.exp(chebval3d(x, y, z, coefficient)).T)
+    x, y, z = unit_points.T
+    return np.asarray(np.exp(chebval3d(x, y, z, coefficients)).T)
 
 
-def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int]) -> Float:
+def _interpolate(unit_points: Float, frequencies: Float, degrees: tuple[int, int, int]) -> Float:
     """Return the polynomials of ln f1 and ln f2 that pass through frequencies at nodes.
 
     Parameters
     ----------
-    scaled : (N, 3) array
+    unit_points : (N, 3) array
         The nodes, in parameters scaled to [-1, 1].
-    frequency : (N, 2) array
+    frequencies : (N, 2) array
         The frequencies there [Hz].
     degrees : (int, int, int)
         The degrees I - 1, J - 1, K - 1 of the polynomials in the parameters, with N = I J K.
@@ -263,9 +265,9 @@ def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int])
     (I, J, K, 2) array
         The Chebyshev coefficients.
     """
-    x, y, z = scaled.T
-    coefficient = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequency))
-    return np.asarray(coefficient.reshape(*(degree + 1 for degree in degrees), 2))
+    x, y, z = unit_points.T
+    coefficients = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequencies))
+    return np.asarray(coefficients.reshape(*(degree + 1 for degree in degrees), 2))
 
 
 def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
@@ -305,15 +307,15 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     # The first point of the sequence is a corner of the range.
     halton = qmc.Halton(3, scramble=False).random(_CHECK_COUNT + 1)[1:]
     check_points = 2.0 * halton - 1.0
-    expected = _model_frequencies(model, limits, check_points)
+    model_frequencies = _model_frequencies(model, limits, check_points)
     error = np.inf
     for degrees in _DEGREES:
         grid = _chebyshev_grid(degrees)
-        coefficient = _interpolate(grid, _model_frequencies(model, limits, grid), degrees)
-        relative_errors = _evaluate(check_points, coefficient) / expected - 1.0
+        coefficients = _interpolate(grid, _model_frequencies(model, limits, grid), degrees)
+        relative_errors = _evaluate(check_points, coefficients) / model_frequencies - 1.0
         error = float(np.abs(relative_errors).max())
         if error <= tolerance:
-            return WingTable(limits, coefficient, curve, error)
+            return WingTable(limits, coefficients, curve, error)
     raise PosteriorError(
         "the flapwise frequencies of the model are not smooth over its range: a polynomial errs by "
         f"{error:.2g} where {tolerance:.2g} are allowed; build a model with a narrower range of "
@@ -321,7 +323,7 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     )
 
 
-def _model_frequencies(model: ReducedModel, limits: Float, scaled: Float) -> Float:
+def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -> Float:
     """Return the flapwise frequencies (N, 2) [Hz] of a model at scaled parameters (N, 3).
 
     Parameters
@@ -330,14 +332,14 @@ def _model_frequencies(model: ReducedModel, limits: Float, scaled: Float) -> Flo
         The wing.
     limits : (3, 2) array
         The ranges of the parameters.
-    scaled : (N, 3) array
+    unit_points : (N, 3) array
         The parameters, scaled to [-1, 1].
     """
     centre = limits.mean(axis=1)
     half_width = 0.5 * np.diff(limits, axis=1)[:, 0]
     lower, upper = limits.T
     # A node at an end may leave the range by a rounding error.
-    states = np.clip(centre + half_width * scaled, lower, upper)
+    states = np.clip(centre + half_width * unit_points, lower, upper)
     frequencies = []
     for state in states.tolist():
         modes = model.modes(**dict(zip(_PARAMETERS, state, strict=True)))

@@ -327,13 +327,13 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, object]:
     parameter : str
         The parameter or quantity of which the twin has several values.
     """
-    measured = calibration.measured
+    measured_tables = calibration.measured
     return {
         **plain_record(calibration),
         "parameter": parameter,
         "prior": _prior_record(calibration, parameter),
         "posterior": _density(calibration.draws_of(parameter)),
-        "data": {str(name): measured[name].values.tolist() for name in measured},
+        "data": {str(name): measured_tables[name].values.tolist() for name in measured_tables},
     }
 
 

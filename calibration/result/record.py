@@ -221,8 +221,8 @@ class Calibration:
         for prior in self.priors:
             name = prior.name
             posterior = plus_minus(self.mean(name), self.standard_deviation(name))
-            stated = plus_minus(*self.prior_moments(name))
-            rows.append([prior.figure.title, stated, posterior, prior.figure.shown_unit])
+            prior_text = plus_minus(*self.prior_moments(name))
+            rows.append([prior.figure.title, prior_text, posterior, prior.figure.shown_unit])
         title = f"Calibration of {self.asset}: parameters of {self.model}"
         return html_table(title, ("parameter", "prior", "posterior", "unit"), rows, self.findings)
 
@@ -417,8 +417,8 @@ class Calibration:
             other_draws = self.draws_of(prior.name)
             covariance = float(np.mean((draws - draws.mean()) * (other_draws - other_draws.mean())))
             slope = covariance / variance if variance else 0.0
-            expected = other_draws.mean() + slope * (values - draws.mean())
-            expectations[prior.name] = np.clip(expected, other_draws.min(), other_draws.max())
+            expected_draws = other_draws.mean() + slope * (values - draws.mean())
+            expectations[prior.name] = np.clip(expected_draws, other_draws.min(), other_draws.max())
         return expectations
 
     @property

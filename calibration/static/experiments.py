@@ -176,15 +176,15 @@ def read_measurements(path: Path) -> LoadDisplacementData:
 def _refuse_other_units(file: str, load: Float, displacement_mm: Float) -> None:
     """Refuse loads (N,) [N] and displacements (N,) [mm] whose ratio shows other units."""
     stiffness = float(np.median(load / displacement_mm))  # N/mm
-    expected = EXPECTED_TIP_STIFFNESS * 1e-3
-    ratio = stiffness / expected
+    expected_stiffness = EXPECTED_TIP_STIFFNESS * 1e-3
+    ratio = stiffness / expected_stiffness
     if 1.0 / _PLAUSIBLE_FACTOR <= ratio <= _PLAUSIBLE_FACTOR:
         return
-    nearest = min(_UNIT_ERRORS, key=lambda error: abs(math.log(ratio / error.factor)))
-    remedy = nearest.remedy
-    if abs(math.log(ratio / nearest.factor)) > math.log(_UNIT_TOLERANCE):
+    nearest_unit_error = min(_UNIT_ERRORS, key=lambda error: abs(math.log(ratio / error.factor)))
+    remedy = nearest_unit_error.remedy
+    if abs(math.log(ratio / nearest_unit_error.factor)) > math.log(_UNIT_TOLERANCE):
         remedy = "check the columns, their units (N and mm) and the wing"
     raise ExperimentDataError(
         f"{file}: load over displacement is {stiffness:.3g} N/mm, {ratio:.3g} times the "
-        f"{expected:.3g} N/mm expected before calibration; {remedy}."
+        f"{expected_stiffness:.3g} N/mm expected before calibration; {remedy}."
     )

@@ -67,10 +67,10 @@ def _reading_disagreements(result: Calibration, *, is_published: bool) -> list[s
         is_noticeable = is_frequency and abs(difference) > NOTICEABLE_FREQUENCY
         if not is_noticeable and score <= NOTICEABLE:
             continue
-        measured = figure.shown(reading.value, reading.deviation)
+        measured_text = figure.shown(reading.value, reading.deviation)
         model = figure.shown(result.mean(name), result.standard_deviation(name))
         sentence = (
-            f"{capital(figure.title)}: measured {measured}, calibrated model {model}, "
+            f"{capital(figure.title)}: measured {measured_text}, calibrated model {model}, "
             f"{_percent(difference)} off ({score:.1f} standard deviations)."
         )
         if name == "frequency_2" and is_published:

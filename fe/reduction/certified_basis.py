@@ -452,14 +452,16 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
         First the worst state, then always the one with the largest product of its bound and its
         distance from all that are chosen.
     """
-    scaled = states / np.maximum(np.ptp(states, axis=0), 1e-300)
-    chosen = [int(bounds.argmax())]
+    scaled_states = states / np.maximum(np.ptp(states, axis=0), 1e-300)
+    chosen_numbers = [int(bounds.argmax())]
     distance = np.full(len(states), np.inf)
-    while len(chosen) < count:
-        distance_from_last = np.linalg.norm(scaled - scaled[chosen[-1]], axis=1)
+    while len(chosen_numbers) < count:
+        distance_from_last = np.linalg.norm(
+            scaled_states - scaled_states[chosen_numbers[-1]], axis=1
+        )
         distance = np.minimum(distance, distance_from_last)
         score = np.where(bounds > least, bounds * distance, 0.0)
         if not score.any():
             break
-        chosen.append(int(score.argmax()))
-    return [tuple(states[number].tolist()) for number in chosen]
+        chosen_numbers.append(int(score.argmax()))
+    return [tuple(states[number].tolist()) for number in chosen_numbers]

@@ -128,13 +128,13 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
     """Return the fields of the reduced model that no basis changes."""
     structure = terms.structure
     design = structure.design
-    chosen = (
+    variable_names = (
         *structure.parameters,
         *structure.regions,
         *structure.masses,
         *structure.controls,
     )
-    nominal = structure.parameters | structure.masses | structure.controls
+    nominal_values = structure.parameters | structure.masses | structure.controls
     return {
         "design_hash": structure.design_hash,
         "name": design.name,
@@ -146,9 +146,13 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
         "gauges": structure.gauges,
         "displacements": structure.displacements,
         "accelerations": structure.accelerations,
-        "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
+        "nominal": np.array(
+            [nominal_values.get(name, 0.0) for name in variable_names], dtype=np.float64
+        ),
         "damping": np.array((design.damping.alpha, design.damping.beta)),
-        "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
+        "validity_box": np.array(
+            [structure.ranges[name] for name in variable_names], dtype=np.float64
+        ),
         "stiffness_factors": terms.stiffness_factors,
         "load_factors": terms.load_factors,
         "dual_split": terms.splits,
@@ -245,15 +249,15 @@ class _RelativeErrors(NamedTuple):
 
 
 def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _RelativeErrors:
-    """Return the errors of a reduced model's response against the exact one."""
+    """Return errors and bounds of a reduced response, for strains and for other outputs."""
     errors = np.full(2, np.nan)
     bounds = np.full(2, np.nan)
-    for kind, outputs in enumerate((exact.strain, exact.output)):
-        if outputs.size:
-            approximation, bound = reduced.outputs_with_bounds[kind]
-            largest = np.abs(outputs).max()
-            errors[kind] = np.abs(approximation - outputs).max() / largest
-            bounds[kind] = bound / largest
+    for kind, exact_outputs in enumerate((exact.strain, exact.output)):
+        if exact_outputs.size:
+            reduced_outputs, error_bound = reduced.outputs_with_bounds[kind]
+            largest = np.abs(exact_outputs).max()
+            errors[kind] = np.abs(reduced_outputs - exact_outputs).max() / largest
+            bounds[kind] = error_bound / largest
     return _RelativeErrors(errors, bounds)
 
 

@@ -115,9 +115,9 @@ def arrays_from_bytes(
             f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it "
             "anew."
         ) from cause
-    missing = [name for name in required if name not in arrays]
-    if missing:
-        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
+    missing_names = [name for name in required if name not in arrays]
+    if missing_names:
+        raise ReducedModelFileError(f"{where} lacks {', '.join(missing_names)}; build it anew.")
     return arrays
 
 

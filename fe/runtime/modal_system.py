@@ -172,10 +172,14 @@ class ModalSystem:
         scale = np.concatenate((np.ones_like(speed_unit), speed_unit))
         # The two of a conjugate pair add to twice the real part of one: only that with a positive
         # imaginary part is kept, and counted twice.
-        chosen = rates.imag >= 0.0
+        is_upper_half = rates.imag >= 0.0
         multiplicity = np.where(rates.imag > 0.0, 2.0, 1.0)
         amplitudes = np.linalg.inv(vectors) / scale * multiplicity[:, None]
-        return _FreeModes(rates[chosen], scale[:, None] * vectors[:, chosen], amplitudes[chosen])
+        return _FreeModes(
+            rates[is_upper_half],
+            scale[:, None] * vectors[:, is_upper_half],
+            amplitudes[is_upper_half],
+        )
 
     def free_motion(
         self, q: FloatArray, v: FloatArray, time: FloatArray
@@ -305,17 +309,17 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
         )
         return ExactSteps(steps.transition[:, 0], steps.begin[:, 0], steps.end[:, 0])
     # each coordinate by itself, as a system of one
-    single = _linear_force_exponentials(
+    single_steps = _linear_force_exponentials(
         stiffness_values[:, None, None], np.diag(damping_matrix)[:, None, None], duration
     )
     mode = np.arange(count)
     steps_count = len(duration)
     transition = np.zeros((steps_count, 2, count, 2, count))
-    transition[:, :, mode, :, mode] = single.transition.transpose(1, 0, 2, 3)
+    transition[:, :, mode, :, mode] = single_steps.transition.transpose(1, 0, 2, 3)
     begin = np.zeros((steps_count, 2, count, count))
-    begin[:, :, mode, mode] = single.begin[..., 0].transpose(0, 2, 1)
+    begin[:, :, mode, mode] = single_steps.begin[..., 0].transpose(0, 2, 1)
     end = np.zeros((steps_count, 2, count, count))
-    end[:, :, mode, mode] = single.end[..., 0].transpose(0, 2, 1)
+    end[:, :, mode, mode] = single_steps.end[..., 0].transpose(0, 2, 1)
     return ExactSteps(
         transition=transition.reshape(steps_count, 2 * count, 2 * count),
         begin=begin.reshape(steps_count, 2 * count, count),
@@ -360,9 +364,9 @@ def _linear_force_exponentials(
     matrix[:, v, q] = -stiffness / speed_unit
     matrix[:, v, v] = -damping
     matrix[:, v, f] = unity / speed_unit
-    scaled = matrix * lengths[:, None, None, None]
-    scaled[:, :, f, s] = unity  # the force changes by one over the step
-    result = exponential(scaled)
+    step_matrix = matrix * lengths[:, None, None, None]
+    step_matrix[:, :, f, s] = unity  # the force changes by one over the step
+    result = exponential(step_matrix)
     # back to the units of the state
     scale = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1).repeat(count, axis=1)
     by_change = result[:, :, state, s] * scale
@@ -380,11 +384,11 @@ def exponential(matrix: FloatArray) -> FloatArray:
     norm = float(np.max(np.sum(np.abs(matrix), axis=-1), initial=0.0))
     # few squarings, because each doubles the rounding
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
-    scaled = matrix / 2.0**squarings
+    scaled_matrix = matrix / 2.0**squarings
     unity = np.eye(matrix.shape[-1])
     result = np.broadcast_to(unity, matrix.shape)
     for order in range(_TAYLOR_ORDER, 0, -1):
-        result = unity + scaled @ result / order
+        result = unity + scaled_matrix @ result / order
     for _ in range(squarings):
         result = result @ result
     return np.asarray(result)

@@ -214,9 +214,11 @@ class PatchedWing(WingRows):
         if skin is None:
             return
         changes = (skin.by_strip[arrays.strip_of] - 1.0) * theta[arrays.term_of]
-        changed = np.flatnonzero(changes)
+        changed_strips = np.flatnonzero(changes)
         lower = np.zeros_like(stiffness)
-        lower[np.tril_indices(self.size)] = changes[changed] @ arrays.strip_stiffness[changed]
+        lower[np.tril_indices(self.size)] = (
+            changes[changed_strips] @ arrays.strip_stiffness[changed_strips]
+        )
         stiffness += lower + np.tril(lower, -1).T
 
     def structure_at(

@@ -15,7 +15,7 @@ from .motion_arrays import FloatArray, PortArrays, RecordFields
 
 
 def static_path(
-    linear: FloatArray,
+    linear_positions: FloatArray,
     compliance: FloatArray,
     port_fields: RecordFields,
     memory: FloatArray,
@@ -29,7 +29,7 @@ def static_path(
 
     Parameters
     ----------
-    linear : (L, J) array
+    linear_positions : (L, J) array
         x_linear, positions of the laws' ports without internal forces, at each level.
     compliance : (J, J) array
         C, positions of the ports (rows) under unit forces at them (columns).
@@ -52,23 +52,23 @@ def static_path(
     previous = start.copy()
     x = memory[:, POSITION].copy()
     x_forces = np.zeros(count)
-    for level in range(len(linear)):
+    for level in range(len(linear_positions)):
         # approach the level in parts; a part is halved if Newton's method fails, else doubled
-        done = 0.0
+        fraction_done = 0.0
         part = 1.0
-        while done < 1.0:
-            goal = previous + (linear[level] - previous) * min(done + part, 1.0)
+        while fraction_done < 1.0:
+            goal = previous + (linear_positions[level] - previous) * min(fraction_done + part, 1.0)
             solved, solution, x_forces = solve_static_position(goal, x, ports, memory, compliance)
             if solved:
                 x = solution
                 update_memory(ports, memory, x, x_forces)
-                done = min(done + part, 1.0)
+                fraction_done = min(fraction_done + part, 1.0)
                 part *= 2.0
             else:
                 part *= 0.5
                 if part < 1.0 / 256.0:
                     return level
-        previous = linear[level]
+        previous = linear_positions[level]
         for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
             positions[level, j] = x[j]
             forces[level, j] = x_forces[j]

@@ -225,8 +225,8 @@ class WingRows:
             If the exponent of a washout is negative, or a point mass lies off the wing.
         """
         arrays = self.arrays
-        linear = arrays.load_lift.copy()
-        quadratic = np.zeros(self.size)
+        linear_loads = arrays.load_lift.copy()
+        quadratic_loads = np.zeros(self.size)
         for primitive in patch:
             if isinstance(primitive, Washout):
                 if primitive.exponent < 0.0:
@@ -235,13 +235,15 @@ class WingRows:
                         f"{primitive.exponent:g}."
                     )
                 eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0)
-                quadratic -= primitive.coefficient * (eta**primitive.exponent @ arrays.lift_rows)
+                quadratic_loads -= primitive.coefficient * (
+                    eta**primitive.exponent @ arrays.lift_rows
+                )
             elif isinstance(primitive, InertiaRelief):
-                linear += primitive.fraction * arrays.weight
+                linear_loads += primitive.fraction * arrays.weight
             elif isinstance(primitive, PointMass):
                 row = self._station_weights(primitive.station) @ self._upward_rows
-                linear -= STANDARD_GRAVITY * primitive.mass * row
-        return np.stack((linear, quadratic))
+                linear_loads -= STANDARD_GRAVITY * primitive.mass * row
+        return np.stack((linear_loads, quadratic_loads))
 
     @cached_property
     def planform_stations(self) -> PlanformStations:

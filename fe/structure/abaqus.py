@@ -251,16 +251,16 @@ def _plain_type(name: str, where: str) -> str:
     where : str
         Its file and line.
     """
-    same = _SAME_STIFFNESS.fullmatch(name)
+    same_stiffness = _SAME_STIFFNESS.fullmatch(name)
     if name in _TYPES_OF_MESHIO:
-        plain = _TYPES_OF_MESHIO[name]
-    elif same:
-        plain = same[1]
+        built_type = _TYPES_OF_MESHIO[name]
+    elif same_stiffness:
+        built_type = same_stiffness[1]
     else:
-        plain = name
-    if plain not in _ELEMENT_TYPES:
+        built_type = name
+    if built_type not in _ELEMENT_TYPES:
         _refuse_type(name, where)
-    return plain
+    return built_type
 
 
 def _refuse_type(name: str, where: str) -> NoReturn:

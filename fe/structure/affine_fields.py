@@ -134,11 +134,11 @@ def _masses_by_name(
     design: StructureDesign, mass: sparse.csr_array, point_masses: Iterable[sparse.csr_array]
 ) -> dict[str | None, sparse.csr_array]:
     """Return the mass with fixed point masses under None, and 1 kg of each free mass by name."""
-    fixed = mass
-    free: dict[str | None, sparse.csr_array] = {}
+    fixed_mass = mass
+    free_masses: dict[str | None, sparse.csr_array] = {}
     for part, matrix in zip(design.mass, point_masses, strict=True):
         if part.free:
-            free[part.name] = matrix
+            free_masses[part.name] = matrix
         else:
-            fixed = fixed + part.mass * matrix
-    return {None: fixed} | free
+            fixed_mass = fixed_mass + part.mass * matrix
+    return {None: fixed_mass} | free_masses

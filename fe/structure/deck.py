@@ -300,11 +300,12 @@ class Deck:
             is_known = solid_type in DECK_KINDS
             name = DECK_KINDS[solid_type].name if is_known else solid_type
             found_kinds.append(f"{count} {name}")
-        found = ", ".join(found_kinds) or "none that is solid"
+        found_list = ", ".join(found_kinds) or "none that is solid"
         line_of_last_type = [str(self.path), *self._first_of_solid_type.values()][-1]
         fail(
             line_of_last_type,
-            f"a whole mesh of one kind of elements is expected ({known_names}), but {found} came; "
+            f"a whole mesh of one kind of elements is expected ({known_names}), but "
+            f"{found_list} came; "
             "mesh it with tetrahedra alone.",
         )
 

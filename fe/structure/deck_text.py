@@ -59,14 +59,14 @@ class DeckWords(NamedTuple):
 def words_of(dialect: str) -> DeckWords:
     """Return the words of "abaqus" or "nastran"."""
     table = _WORDS_FILE[dialect]
-    refused = {}
+    remedies = {}
     for group in table["refused"]:
         for word in group["words"]:
-            refused[word] = group["remedy"]
+            remedies[word] = group["remedy"]
     return DeckWords(
         mark=table["mark"],
         harmless=frozenset(table["harmless"]),
-        refused=refused,
+        refused=remedies,
         read=table.get("read", {}),
         flat=table["flat"],
     )

@@ -85,11 +85,11 @@ class MatrixFiles:
             return self.rows[place]
         node, component = place
         components = [str(other) for number, other in sorted(self.rows) if number == node]
-        known = f"its components {', '.join(components)}" if components else "no such node"
+        known_rows = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
             f"{where}: node {node} has no component {component} in the matrices, which know "
-            f"{known}; what is held or tied when they are written is not among them: name another "
-            "node."
+            f"{known_rows}; what is held or tied when they are written is not among them: "
+            "name another node."
         )
 
     def unit_vector_at(

@@ -220,15 +220,15 @@ class StructureMesh(CellMesh):
         nodes : (m,) array of int
             The nodes that are used if there is no set of faces.
         """
-        outer = self.outer_faces
+        outer_faces = self.outer_faces
         face_set = _set_named(self.face_sets, name)
         if face_set is None:
             no_corner = -1  # stands before the corners of a triangle
-            is_inside = np.isin(outer.corners, [no_corner, *nodes]).all(axis=1)
+            is_inside = np.isin(outer_faces.corners, [no_corner, *nodes]).all(axis=1)
         else:
-            faces = (tuple(row[row >= 0].tolist()) for row in outer.corners)
+            faces = (tuple(row[row >= 0].tolist()) for row in outer_faces.corners)
             is_inside = np.array([face in face_set for face in faces])
-        return Surface(outer.cell[is_inside], outer.number[is_inside])
+        return Surface(outer_faces.cell[is_inside], outer_faces.number[is_inside])
 
 
 def _set_named(sets: dict[str, _Content], name: str) -> _Content | None:

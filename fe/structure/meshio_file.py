@@ -283,18 +283,18 @@ def _check_element_lines(path: Path) -> None:
 
 def _mesh_of_meshio(path: Path) -> Mesh:
     """Return the mesh that meshio reads from a file, or say in one sentence why it does not."""
-    printed = io.StringIO()
+    printed_text = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program if it fails.
         with (
             contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(printed),
+            contextlib.redirect_stderr(printed_text),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
             return meshio_with_wedges().read(path)
     except SystemExit:
-        reason = printed.getvalue().removeprefix("Error: ")
+        reason = printed_text.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         reason = getattr(error, "strerror", None) or str(error) or "its format is not known"
         # version 4 of Gmsh's format, where some blocks of elements have groups and others do not

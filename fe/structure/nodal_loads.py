@@ -46,8 +46,8 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
         cells = surface.cell[surface.face == number]
         rule = kind.face_rule(number)
         tangents = frames.tangents[number]
-        local = frames.corner[number] + rule.points @ tangents
-        values, gradients = kind.shape_functions(local)
+        local_positions = frames.corner[number] + rule.points @ tangents
+        values, gradients = kind.shape_functions(local_positions)
         edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], gradients, tangents, optimize=True)
         along_first, along_second = np.moveaxis(edges, 2, 0)
         normals = np.cross(along_first, along_second) * rule.weights[:, None]
@@ -148,8 +148,8 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
         If the point lies outside.
     """
     position = mesh.unit * np.asarray(point)
-    cell, local = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
-    (values,), _ = mesh.kind.shape_functions(local[None])
+    cell, local_position = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
+    (values,), _ = mesh.kind.shape_functions(local_position[None])
     weights = np.zeros(len(mesh.points))
     weights[mesh.cells[cell]] = values
     return weights

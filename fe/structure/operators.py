@@ -116,12 +116,13 @@ def _part_of_cells(
     part_of_cell = np.full(len(mesh.cells), -1, dtype=np.int64)
     for number, (label, part) in enumerate(labelled):
         cells = mesh.cells_of(part.set, label)
-        shared = cells[part_of_cell[cells] >= 0]
-        if len(shared):
-            _, other = labelled[part_of_cell[shared[0]]]
+        shared_cells = cells[part_of_cell[cells] >= 0]
+        if len(shared_cells):
+            _, other_part = labelled[part_of_cell[shared_cells[0]]]
             raise MeshError(
-                f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} "
-                f"elements, such as {mesh.cell(shared[0])}; their sets must not overlap."
+                f"{label}: the {kind}s {part.name!r} and {other_part.name!r} share "
+                f"{len(shared_cells)} elements, such as {mesh.cell(shared_cells[0])}; their sets "
+                "must not overlap."
             )
         part_of_cell[cells] = number
     return part_of_cell
@@ -220,11 +221,11 @@ def load_and_assemble(
 
 def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
     """Raise `MeshError` if a cell has no material."""
-    bare = np.flatnonzero(material_of < 0)
-    if len(bare):
+    cells_without_material = np.flatnonzero(material_of < 0)
+    if len(cells_without_material):
         raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among "
-            f"them {mesh.cell(bare[0])}."
+            f"{mesh.source}: {len(cells_without_material)} of {len(mesh.cells)} elements have no "
+            f"material, among them {mesh.cell(cells_without_material[0])}."
         )
 
 
@@ -331,10 +332,10 @@ def write_structure_vtu(
         If the file cannot be written.
     """
     mesh = structure.mesh
-    chosen = dict(values or {})
-    response = static_response(structure, chosen)
+    chosen_values = dict(values or {})
+    response = static_response(structure, chosen_values)
     displacement = structure.full_displacement(response.displacement)
-    losses = [chosen.get(name, 0.0) for name in structure.regions]
+    losses = [chosen_values.get(name, 0.0) for name in structure.regions]
     losses.append(0.0)  # of no region, whose number is -1
     write_vtu(
         path,

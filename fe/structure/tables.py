@@ -70,8 +70,8 @@ class AlternativeKeys(DesignSection):
         for way in self.alternatives:
             keys_present.update(key for key in way if getattr(self, key) is not None)
         is_one_way = any(keys_present == set(way) for way in self.alternatives)
-        expected = ", or ".join(" and ".join(way) for way in self.alternatives)
-        yield not is_one_way, f"either {expected} is expected"
+        expected_keys = ", or ".join(" and ".join(way) for way in self.alternatives)
+        yield not is_one_way, f"either {expected_keys} is expected"
 
 
 class Ranged(Named):

@@ -169,13 +169,13 @@ class CalculixDeck:
     @property
     def _materials(self) -> Iterator[Material]:
         """The materials of the deck in this state: equal cells share one."""
-        chosen = self.structure.split_values(self.values)
-        theta = self.structure.theta(chosen.parameters, chosen.losses)
+        values_by_kind = self.structure.split_values(self.values)
+        theta = self.structure.theta(values_by_kind.parameters, values_by_kind.losses)
         constants = self.body.elasticity[:, _ANISOTROPIC_ROWS, _ANISOTROPIC_COLUMNS]
-        scaled = theta[self.body.part][:, None] * constants
-        no_cells = np.zeros(len(scaled))
+        scaled_constants = theta[self.body.part][:, None] * constants
+        no_cells = np.zeros(len(scaled_constants))
         graded = no_cells if self.grading is None else self.grading.cells
-        properties = np.column_stack((scaled, self.body.density, graded))
+        properties = np.column_stack((scaled_constants, self.body.density, graded))
         rows, material_of_cell = np.unique(properties, axis=0, return_inverse=True)
         for number, (*material_constants, density, is_graded) in enumerate(rows):
             course = [(0.0, 1.0)]
@@ -266,9 +266,9 @@ class CalculixDeck:
         """Yield the equations of displacements that follow the motions of a rigid set."""
         supports = self.body.supports
         moving = np.flatnonzero(np.diff(supports.expansion.indptr))
-        for unknown in np.setdiff1d(moving, supports.free_displacements).tolist():
-            (row,) = supports.expansion[[unknown]].toarray()
-            node, direction = _node_and_direction(unknown)
+        for displacement_number in np.setdiff1d(moving, supports.free_displacements).tolist():
+            (row,) = supports.expansion[[displacement_number]].toarray()
+            node, direction = _node_and_direction(displacement_number)
             yield [Term(node, direction, -1.0), *self.terms(row)]
 
     @cached_property
@@ -277,13 +277,13 @@ class CalculixDeck:
         first_motion = self.body.mesh.unknowns
         motions = range(first_motion, first_motion + self._motion_count)
         unknowns = (*self.body.supports.free_displacements.tolist(), *motions)
-        return [_node_and_direction(unknown) for unknown in unknowns]
+        return [_node_and_direction(unknown_number) for unknown_number in unknowns]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield a term for each nonzero entry of a row (n,) on the free unknowns."""
-        for unknown in np.flatnonzero(values).tolist():
-            node, direction = self.places[unknown]
-            yield Term(node, direction, float(values[unknown]))
+        for unknown_number in np.flatnonzero(values).tolist():
+            node, direction = self.places[unknown_number]
+            yield Term(node, direction, float(values[unknown_number]))
 
 
 def _template() -> Template:
@@ -311,9 +311,9 @@ def _groups_of_three(count: int) -> int:
     return -(-count // 3)
 
 
-def _node_and_direction(unknown: int) -> tuple[int, int]:
+def _node_and_direction(unknown_number: int) -> tuple[int, int]:
     """Return node and direction, both from 1, of an unknown."""
-    return unknown // 3 + 1, unknown % 3 + 1
+    return unknown_number // 3 + 1, unknown_number % 3 + 1
 
 
 def number_line(values: ArrayLike) -> str:

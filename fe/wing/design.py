@@ -261,11 +261,13 @@ def _region_faults(design: WingDesign) -> Iterator[Fault]:
         )
 
 
-def _overlap(defect: parts.Defect, other: parts.Defect) -> bool:
+def _overlap(defect: parts.Defect, other_defect: parts.Defect) -> bool:
     """Return whether two damage regions overlap, along the span and along the chord."""
-    along_span = min(defect.span_end, other.span_end) > max(defect.span_start, other.span_start)
-    along_chord = min(defect.chord_end, other.chord_end) > max(
-        defect.chord_start, other.chord_start
+    along_span = min(defect.span_end, other_defect.span_end) > max(
+        defect.span_start, other_defect.span_start
+    )
+    along_chord = min(defect.chord_end, other_defect.chord_end) > max(
+        defect.chord_start, other_defect.chord_start
     )
     return along_span and along_chord
 

@@ -283,14 +283,14 @@ def _grid_points(
     thickness_ratio = design.airfoil.thickness_ratio
     chord = planform.chord(across / planform.semi_span)
     behind = np.array([line.at(chord) for line in along])
-    outer = straight_edged(behind, chord, thickness_ratio)
+    outer_surface = straight_edged(behind, chord, thickness_ratio)
     # The skin's thickness is measured normal to it, and the grid line is vertical: a slope makes
     # the vertical thickness larger by sqrt(1 + slope^2).
     slope = four_digit_slope(behind / chord, thickness_ratio)
-    inner = outer - design.skin.thickness * np.sqrt(1.0 + slope**2)
+    inner_surface = outer_surface - design.skin.thickness * np.sqrt(1.0 + slope**2)
     levels = np.linspace(-1.0, 1.0, height_cells + 1)
-    upper_surface = outer[..., np.newaxis]
-    inner_levels = inner[..., np.newaxis] * levels
+    upper_surface = outer_surface[..., np.newaxis]
+    inner_levels = inner_surface[..., np.newaxis] * levels
     z = np.concatenate([-upper_surface, inner_levels, upper_surface], axis=2)
     x = (behind - planform.straight_chord_line * chord)[..., np.newaxis]
     y = across[np.newaxis, :, np.newaxis]

@@ -109,7 +109,7 @@ def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatA
     It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
     the chords.
     """
-    gaps = line.at(chords) - np.array([other.at(chords) for other in lines])
+    gaps = line.at(chords) - np.array([other_line.at(chords) for other_line in lines])
     is_behind = (gaps > 0.0).all(axis=1)
     is_ahead = (gaps < 0.0).all(axis=1)
     lies_between = bool(is_behind.any() and is_ahead.any())
