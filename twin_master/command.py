@@ -200,9 +200,9 @@ def _new_mission(
 
     if scenario_name is None:
         raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
-    loaded = load_scenario(scenario_name)
-    folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-    return folder, partial(fly, loaded, folder, overrides, **vars(parts), replace=replace)
+    loaded_scenario = load_scenario(scenario_name)
+    folder = out if out is not None else Path("runs") / loaded_scenario.scenario.mission.name
+    return folder, partial(fly, loaded_scenario, folder, overrides, **vars(parts), replace=replace)
 
 
 def _resumed_mission(
@@ -212,7 +212,7 @@ def _resumed_mission(
     from twin_master.scenario.reading import load_scenario
     from twin_master.workflow import resume
 
-    loaded = None if scenario_name is None else load_scenario(scenario_name)
+    loaded_scenario = None if scenario_name is None else load_scenario(scenario_name)
     if has_changes:
         raise typer.BadParameter(
             "a run is continued with what its folder holds: give nothing beside it that would "
@@ -222,7 +222,7 @@ def _resumed_mission(
     return partial(
         resume,
         folder,
-        loaded,
+        loaded_scenario,
         sensor_model=parts.sensor_model,
         estimator=parts.estimator,
     )
@@ -303,13 +303,15 @@ def print_outcome(outcome: "RunOutcome") -> None:
 
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    for figure, printed in zip(outcome.figures, printed_figures(outcome.figures), strict=True):
-        reference = printed.reference
+    for figure, printed_figure in zip(
+        outcome.figures, printed_figures(outcome.figures), strict=True
+    ):
+        reference = printed_figure.reference
         if reference and not isinstance(figure.reference, str):  # a text has its unit in it
             reference = f"{reference} {figure.unit}".strip()
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
-        value = "none" if figure.value is None else f"{printed.value} {figure.unit}".strip()
+        value = "none" if figure.value is None else f"{printed_figure.value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
     terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
     terminal.say(f"The twin {outcome.control}.")
@@ -343,17 +345,17 @@ def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")
         if seconds:
-            median = 1e3 * seconds["median"]
+            median_milliseconds = 1e3 * seconds["median"]
             largest = 1e3 * seconds["largest"]
-            time_of_step = f"{median:.3g} ms (largest {largest:.3g} ms)"
+            time_of_step = f"{median_milliseconds:.3g} ms (largest {largest:.3g} ms)"
             rows.append([f"{part}, per {outcome.step_name}", time_of_step, ""])
     rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
     return rows
 
 
-def printed_value(value: float | int | str | None, unit: str, missing: str = "") -> str:
-    """Return a value with its unit; the text `missing` for None."""
-    return missing if value is None else f"{number(value)} {unit}".strip()
+def printed_value(value: float | int | str | None, unit: str, text_for_none: str = "") -> str:
+    """Return a value with its unit; the text `text_for_none` for None."""
+    return text_for_none if value is None else f"{number(value)} {unit}".strip()
 
 
 def run_command_line(application: Callable[[], None], *further_errors: type[Exception]) -> None:

@@ -106,10 +106,10 @@ def check_names(
         If a name is not known; the sentence lists the known ones.
     """
     for kind, names, known_names in rows:
-        unknown = sorted({*names} - {*known_names})
-        if unknown:
+        unknown_names = sorted({*names} - {*known_names})
+        if unknown_names:
             what_to_do = f": {advice}" if advice else ""
             raise MissionInputError(
-                f"{owner} {kind} {', '.join(unknown)}, which {reference} does not know; it knows "
-                f"{', '.join(known_names) or 'none'}{what_to_do}."
+                f"{owner} {kind} {', '.join(unknown_names)}, which {reference} does not know; it "
+                f"knows {', '.join(known_names) or 'none'}{what_to_do}."
             )

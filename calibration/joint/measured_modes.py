@@ -212,7 +212,7 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
     frequency, ratio : float
         The mean frequency [Hz] and damping ratio [1] of the second mode in these fits.
     """
-    delays = _LATER_STARTS if trials[0].free else (0.0, *_LATER_STARTS)
+    delays = _LATER_STARTS if trials[0].frequencies_fitted else (0.0, *_LATER_STARTS)
     changes = []
     for delay in delays:
         refitted = [_refit_second_mode(fit, delay) for fit in trials]

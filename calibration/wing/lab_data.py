@@ -211,7 +211,9 @@ def published_data() -> LabData:
     )
 
 
-def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = False) -> LabData:
+def read_lab_folder(
+    path: Path, targets: Targets | None = None, *, frequencies_fitted: bool = False
+) -> LabData:
     """Return the measurements in a lab folder; those of a missing step are the published ones.
 
     Parameters
@@ -221,7 +223,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         in the authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
         Whether step 3 uses the ring-down records; by default it does where there are any.
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies of a record are fitted; otherwise they are those of its spectrum, as
         in the authors' procedure.
 
@@ -263,7 +265,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
     if 2 in steps:
         lab = _with_load_test(lab, path)
     if record_files and targets != "published":
-        lab = _with_ring_downs(lab, path, record_files, free=free)
+        lab = _with_ring_downs(lab, path, record_files, frequencies_fitted=frequencies_fitted)
     elif record_files:
         lab = _with_origin(lab, 3, f"records left aside as asked; {_PUBLISHED[3]}", read=False)
     mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
@@ -303,7 +305,7 @@ def _with_load_test(lab: LabData, path: Path) -> LabData:
 
 
 def _with_ring_downs(
-    lab: LabData, path: Path, record_files: Sequence[Path], *, free: bool
+    lab: LabData, path: Path, record_files: Sequence[Path], *, frequencies_fitted: bool
 ) -> LabData:
     """Return lab data with the ring-downs of step 3, and the frequencies and damping from them.
 
@@ -315,10 +317,10 @@ def _with_ring_downs(
         The lab folder.
     record_files : sequence of Path
         The files of the ring-downs.
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies of each record are fitted, too.
     """
-    trials = fit_trials(read_records(path), free=free)
+    trials = fit_trials(read_records(path), frequencies_fitted=frequencies_fitted)
     if all(fit.record.lowest is not None for fit in trials):
         # These records were read off plots. The lowest and the highest ink in a column of pixels
         # are extremes of the signal in its interval, while the middle between them is not quite

@@ -199,17 +199,18 @@ class RunChecks:
             _outputs_of_steps(asset, _STEPS_BEFORE_SAVING)
             state = asset.save_state()
             method = asset.state_method
-            expected = _outputs_of_steps(asset, steps_after)
+            expected_outputs = _outputs_of_steps(asset, steps_after)
         with closing(self._asset()) as resumed_asset:
             resumed_asset.restore_state(state)
-            resumed = _outputs_of_steps(resumed_asset, steps_after)
-        if resumed.tobytes() != expected.tobytes():
+            resumed_outputs = _outputs_of_steps(resumed_asset, steps_after)
+        if resumed_outputs.tobytes() != expected_outputs.tobytes():
             cause = "its outputs are not a function of its inputs"
             if method == "serialised":
                 cause = partial_state_sentence("keeps part of its state elsewhere")
             text = (
                 "A flight that goes on from a saved state in a new process differs from the one "
-                f"that was not interrupted ({_first_difference(expected, resumed)}): {cause}."
+                "that was not interrupted "
+                f"({_first_difference(expected_outputs, resumed_outputs)}): {cause}."
             )
             return CheckResult("problem", text)
         if method == "serialised":

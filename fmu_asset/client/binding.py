@@ -221,9 +221,9 @@ class Binding(Section):
         InvalidChoiceError
             If a word is none of those that the table may hold.
         """
-        for name, allowed in _HEADER_WORDS.items():
+        for name, allowed_words in _HEADER_WORDS.items():
             if name in changes:
-                require_one_of(changes[name], allowed, name)
+                require_one_of(changes[name], allowed_words, name)
         header = self.binding.model_copy(update=changes)
         return self.model_copy(update={"binding": header})
 
@@ -263,16 +263,16 @@ class Binding(Section):
             for number, name in enumerate(names, 1):
                 label = key if len(names) == 1 else f"{key}[{number}]"
                 monitor[label] = scalar.model_copy(update={"variable": name})
-        recorded: list[str] = []
+        recorded_names: list[str] = []
         for name in self.record.variables:
-            recorded += elements(name)
+            recorded_names += elements(name)
         observation = {key: vector.by_element(elements) for key, vector in self.observation.items()}
         return self.model_copy(
             update={
                 "observation": observation,
                 "monitor": monitor,
                 "port": {key: port.by_element(elements) for key, port in self.port.items()},
-                "record": self.record.model_copy(update={"variables": tuple(recorded)}),
+                "record": self.record.model_copy(update={"variables": tuple(recorded_names)}),
             }
         )
 

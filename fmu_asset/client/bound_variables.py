@@ -199,7 +199,7 @@ class PortBinding(Section):
                 continue
             units = PORT_QUANTITIES[name]
             # a unit that is not understood (None) is accepted
-            is_wrong = all(same_dimension(unit, allowed) is False for allowed in units)
+            is_wrong = all(same_dimension(unit, allowed_unit) is False for allowed_unit in units)
             yield is_wrong, f"{name} is in {unit!r}, but must be in {' or '.join(units)}"
 
     @property
@@ -214,10 +214,10 @@ class PortBinding(Section):
 
     def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
         """Return the port with each array replaced by its elements; see `VectorBinding`."""
-        changed = {}
+        changed_vectors = {}
         for name, vector in self.quantities.items():
-            changed[name] = vector.by_element(elements)
-        return self.model_copy(update=changed)
+            changed_vectors[name] = vector.by_element(elements)
+        return self.model_copy(update=changed_vectors)
 
 
 class RecordBinding(Section):

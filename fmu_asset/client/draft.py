@@ -55,15 +55,15 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         If the FMU has no number to observe.
     """
     bindable_variables = [variable for variable in description.variables if bindable(variable)]
-    observed = _variables_to_observe(description, bindable_variables)
+    observed_variables = _variables_to_observe(description, bindable_variables)
     ports = _ports([v for v in bindable_variables if v.causality in ("input", "output")])
     port_names = {variable.name for port in ports.values() for variable in port.values()}
     inputs = [v for v in bindable_variables if v.causality == "input" and v.name not in port_names]
     parameters = [
         v for v in bindable_variables if v.causality == "parameter" and v.variability != "constant"
     ]
-    observed_names = {variable.name for variable in observed}
-    recorded = [
+    observed_names = {variable.name for variable in observed_variables}
+    recorded_variables = [
         v for v in bindable_variables if v.causality == "output" and v.name not in observed_names
     ]
     usable_names = {variable.name for variable in bindable_variables}
@@ -74,10 +74,12 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         name=keys.key("binding", description.model_name),
         step_size=description.step_of(step_size),
         inputs=[(_role(v), keys.key(_role(v), v.name), v) for v in inputs],
-        observed=[(keys.key("observation", _stem(group)), group) for group in _groups(observed)],
+        observed=[
+            (keys.key("observation", _stem(group)), group) for group in _groups(observed_variables)
+        ],
         parameters=[(keys.key("parameter", v.name), v) for v in parameters],
         ports=[(keys.key("port", stem or "port"), port) for stem, port in ports.items()],
-        recorded=_groups(recorded),
+        recorded=_groups(recorded_variables),
         others=[v.name for v in bindable_variables if v.causality in _INTERNAL],
         left_out=[
             v.name
@@ -234,14 +236,14 @@ def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
     """Return variables in groups: those with successive numbers and equal units form one."""
     groups: list[list[VariableInfo]] = []
-    expected: _NumberedName | None = None
+    expected_name: _NumberedName | None = None
     for variable in variables:
         name = _numbered_name(variable)
-        if name is not None and name == expected:
+        if name is not None and name == expected_name:
             groups[-1].append(variable)
         else:
             groups.append([variable])
-        expected = None if name is None else name.next()
+        expected_name = None if name is None else name.next()
     return groups
 
 

@@ -165,8 +165,10 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
         try:
             numbers.append(float(variable.items.get(number_text, number_text)))
         except ValueError:
-            wanted = f"one of {variable.item_list}" if variable.items else "a number"
-            raise FmuInputError(f"{variable.name} must be {wanted}, but is {text!r}.") from None
+            expected_value = f"one of {variable.item_list}" if variable.items else "a number"
+            raise FmuInputError(
+                f"{variable.name} must be {expected_value}, but is {text!r}."
+            ) from None
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -210,11 +212,11 @@ def _bound_variables(
     variables: Sequence[VariableInfo], causality: str, kind: type[_Bound]
 ) -> dict[str, _Bound]:
     """Return the variables of a causality, bound under their own names and units."""
-    bound = {}
+    bound_variables = {}
     for variable in variables:
         if variable.causality == causality:
-            bound[variable.name] = kind(variable=variable.name, unit=variable.unit or "1")
-    return bound
+            bound_variables[variable.name] = kind(variable=variable.name, unit=variable.unit or "1")
+    return bound_variables
 
 
 def _steps_until(start: float, end: float, size: float | None) -> tuple[int, float]:
@@ -330,16 +332,16 @@ def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) ->
     FmuError
         As `FmiAsset.simulate`.
     """
-    present = asset.observe()
-    later = asset.simulate(**histories, steps=steps, progress=None)
+    present_outputs = asset.observe()
+    later_outputs = asset.simulate(**histories, steps=steps, progress=None)
     extra_histories = {}
-    for name, values in later.extra.items():
-        extra_histories[name] = np.concatenate(([present.extra[name]], values))
+    for name, values in later_outputs.extra.items():
+        extra_histories[name] = np.concatenate(([present_outputs.extra[name]], values))
     return ObservationHistory(
-        time=np.concatenate(([present.time], later.time)),
-        values=np.vstack((present.values, later.values)),
+        time=np.concatenate(([present_outputs.time], later_outputs.time)),
+        values=np.vstack((present_outputs.values, later_outputs.values)),
         extra=extra_histories,
-        ended=later.ended,
+        ended=later_outputs.ended,
     )
 
 

@@ -64,15 +64,17 @@ class InitialValueTable:
 
         Returns
         -------
-        sent : dict of str to mapping or None
+        sent_health : dict of str to mapping or None
             The same without health that is set at a start.
         health : mapping of str to float
             That health.
         """
         health = inputs.get("health") or {}
         at_start = {name: value for name, value in health.items() if name in self.health_slots}
-        sent = {name: value for name, value in health.items() if name not in self.health_slots}
-        return {**inputs, "health": sent}, at_start
+        sent_health = {
+            name: value for name, value in health.items() if name not in self.health_slots
+        }
+        return {**inputs, "health": sent_health}, at_start
 
     def initial_values(
         self,
@@ -163,5 +165,5 @@ class InitialValueTable:
         variable = self._resolver.description.variable(name)
         if variable is None or not variable.is_text_parameter:
             return None
-        bound_variables = {bound.name for bound in self._text_parameters.values()}
+        bound_variables = {parameter.name for parameter in self._text_parameters.values()}
         return None if name in bound_variables else variable

@@ -301,11 +301,11 @@ def _release(instance: Instance, extracted: ExtractedFmu) -> None:
 
 def _check_grants(grants: Grants, folder: str) -> None:
     """Refuse grants of the sandbox that name a missing file or folder."""
-    missing = missing_path(grants, folder)
-    if missing:
+    missing_file = missing_path(grants, folder)
+    if missing_file:
         raise FmuInputError(
-            f"The table [limits] of the binding grants {missing!r}, which does not exist; correct "
-            "it."
+            f"The table [limits] of the binding grants {missing_file!r}, which does not exist; "
+            "correct it."
         )
 
 

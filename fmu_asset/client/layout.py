@@ -181,8 +181,8 @@ class BlockLayout:
             moves = linear and variable.continuous and variable.causality == "input"
             return _GroupKey(not moves, number, kind)
 
-        unique = {variable.name: variable for variable in variables if variable.size}
-        self.variables = tuple(sorted(unique.values(), key=group_key))
+        variable_of_name = {variable.name: variable for variable in variables if variable.size}
+        self.variables = tuple(sorted(variable_of_name.values(), key=group_key))
         begins = accumulate((variable.size for variable in self.variables), initial=begin)
         names = (variable.name for variable in self.variables)
         self._begins = dict(zip(names, begins, strict=False))

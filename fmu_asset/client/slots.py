@@ -73,10 +73,10 @@ class InputSlot(NamedTuple):
         with np.errstate(all="ignore"):
             converted = self._converted(rows_of_steps)
             clipped = np.clip(converted, self.low, self.high)
-            refused = np.argwhere(~self._acceptable(converted, clipped))
-        if len(refused):
+            refused_positions = np.argwhere(~self._acceptable(converted, clipped))
+        if len(refused_positions):
             # name the first value that is refused, as the caller gave it
-            step, element = refused[0].tolist()
+            step, element = refused_positions[0].tolist()
             value = (
                 values if isinstance(values, int | float) else rows_of_steps[step, element].item()
             )
@@ -119,8 +119,10 @@ class InputSlot(NamedTuple):
         try:
             return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            wanted = "numbers" if history else "a number"
-            raise FmuInputError(f"{self.label} must be {wanted}, but is {values!r}.") from error
+            expected_value = "numbers" if history else "a number"
+            raise FmuInputError(
+                f"{self.label} must be {expected_value}, but is {values!r}."
+            ) from error
 
     def _varies(self, history: Float) -> bool:
         """Return whether a history (N, n), or (N,) for one value, has values for each step.
@@ -132,9 +134,10 @@ class InputSlot(NamedTuple):
         if history.shape == shape_of_one_step:
             return False
         if history.shape[1:] not in (shape_of_one_step, (count,)):
-            wanted = "a number, or one" if count == 1 else f"{count} values, or as many"
+            expected_values = "a number, or one" if count == 1 else f"{count} values, or as many"
             raise FmuInputError(
-                f"{self.label} must be {wanted} for each step, but has the shape {history.shape}."
+                f"{self.label} must be {expected_values} for each step, but has the shape "
+                f"{history.shape}."
             )
         return True
 

@@ -373,9 +373,9 @@ def _sufficient_triplets(matrix: FloatArray) -> SingularTriplets:
 
     A few are computed first, since that is fast and suffices for systems of few states.
     """
-    few = _largest_triplets(matrix, MOST_STATES // 4 + 16)
-    if few.values[-1] <= 1e-13 * few.values[0]:
-        return few
+    first_triplets = _largest_triplets(matrix, MOST_STATES // 4 + 16)
+    if first_triplets.values[-1] <= 1e-13 * first_triplets.values[0]:
+        return first_triplets
     return _largest_triplets(matrix, MOST_STATES + 16)
 
 

@@ -199,18 +199,18 @@ class SteppedFmu(OpenedFmu):
             self._set_begins_of_lines(requests)
         replies = np.full((count, len(self._reply)), np.nan)
         first_index = self.step_index
-        ended = self._run_in_blocks(requests, replies, progress)
-        if ended is None:
+        early_end = self._run_in_blocks(requests, replies, progress)
+        if early_end is None:
             return self._exchange.outputs.history(times[1:], replies)
         steps_made = self.step_index - first_index
-        if ended.time is not None and ended.time > times[steps_made]:
+        if early_end.time is not None and early_end.time > times[steps_made]:
             # The FMU ended within the next step: its last outputs, at the time at which it ended,
             # are added.
             steps_made += 1
-            times[steps_made] = ended.time
+            times[steps_made] = early_end.time
             replies[steps_made - 1] = np.frombuffer(self._present_outputs())
         return self._exchange.outputs.history(
-            times[1 : steps_made + 1], replies[:steps_made], ended.sentence
+            times[1 : steps_made + 1], replies[:steps_made], early_end.sentence
         )
 
     def _set_begins_of_lines(self, requests: Float) -> None:
@@ -249,9 +249,9 @@ class SteppedFmu(OpenedFmu):
         with reporter(progress).stage("Simulating", total=total, unit="steps") as stage:
             for first in range(0, total, length):
                 block = slice(first, first + length)
-                ended = self._run_block(requests[block], replies[block], stage)
-                if ended is not None:
-                    return ended
+                early_end = self._run_block(requests[block], replies[block], stage)
+                if early_end is not None:
+                    return early_end
         return None
 
     def _run_block(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
@@ -354,7 +354,7 @@ class _StepCounter:
         self._stage = stage
         self.made = 0
 
-    def report(self, made: int) -> None:
+    def report(self, steps_made: int) -> None:
         """Set the number of steps made so far, and show the progress since the last call."""
-        self._stage.advance(made - self.made)
-        self.made = made
+        self._stage.advance(steps_made - self.made)
+        self.made = steps_made

@@ -61,5 +61,5 @@ def _plain_value(value: npt.ArrayLike) -> PlainValue:
     array = np.asarray(value)
     if array.dtype.kind != "U":
         array = np.asarray(value, dtype=np.float64)
-    plain: PlainValue = array.item() if array.ndim == 0 else array.ravel().tolist()
-    return plain
+    plain_value: PlainValue = array.item() if array.ndim == 0 else array.ravel().tolist()
+    return plain_value

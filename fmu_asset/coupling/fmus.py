@@ -269,9 +269,11 @@ class CoupledFmus(InstanceHost):
     def save(self) -> bytes:
         """Return the states of the components and the values that they had exchanged."""
         states = [asset.save_state() for asset in self.assets.values()]
-        held = {name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()}
+        held_inputs = {
+            name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()
+        }
         state = CoupledState(
-            held=held,
+            held=held_inputs,
             outputs=self._outputs.tolist(),
             before=self._outputs_before.tolist(),
             sizes=[len(state) for state in states],
@@ -281,15 +283,15 @@ class CoupledFmus(InstanceHost):
 
     def restore(self, content: bytes) -> None:
         """Bring the components to a state that `save` returned."""
-        saved = CoupledState.from_bytes(content)
-        component_states = saved.components
+        saved_state = CoupledState.from_bytes(content)
+        component_states = saved_state.components
         self._at_different_times = True
         for (name, asset), state in zip(self.assets.items(), component_states, strict=True):
             with errors_of_component(name):
                 asset.restore_state(state)
-        self._held_inputs = saved.held
-        self._outputs = np.array(saved.outputs)
-        self._outputs_before = np.array(saved.before)
+        self._held_inputs = saved_state.held
+        self._outputs = np.array(saved_state.outputs)
+        self._outputs_before = np.array(saved_state.before)
         self._at_different_times = False
 
     def take_log(self) -> list[tuple[int, str]]:

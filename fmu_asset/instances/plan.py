@@ -412,22 +412,22 @@ class Instance(Protocol):
         step = self.step
         sum_of_squares = reply.dot
         now = time.monotonic
-        done = 0
+        steps_done = 0
         next_report = now() + REPORT_PERIOD
         try:
             for request_row, reply_row in zip(requests, replies, strict=True):
                 request[:] = request_row
                 step()
                 reply_row[:] = reply
-                done += 1
+                steps_done += 1
                 # a fast test first: the sum of squares can be infinite for large values, too
                 if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
                     return
                 if now() > next_report:
-                    report(done)
+                    report(steps_done)
                     next_report = now() + REPORT_PERIOD
         finally:
-            report(done)
+            report(steps_done)
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""

@@ -375,8 +375,8 @@ class _SystemReader:
             connector = connection.source
             if connector.component in self.components or connector not in self.settings:
                 continue
-            for later in chain[index:]:
-                if later.scale != IDENTITY or not later.convert_units:
+            for later_connection in chain[index:]:
+                if later_connection.scale != IDENTITY or not later_connection.convert_units:
                     raise package_error(
                         self.package,
                         f"{str(connector)!r} is set and transformed on its way to {str(target)!r}; "
@@ -389,7 +389,9 @@ class _SystemReader:
         """Return one connection for those that follow one another through nested systems."""
         source, target = chain[0].source, chain[-1].target
         scale = reduce(Conversion.then, (connection.scale for connection in chain))
-        has_units_on_the_way = any(self.connectors[later.source].unit for later in chain[1:])
+        has_units_on_the_way = any(
+            self.connectors[later_connection.source].unit for later_connection in chain[1:]
+        )
         all_convert = all(connection.convert_units for connection in chain)
         some_convert = any(connection.convert_units for connection in chain)
         if all_convert != some_convert or (scale != IDENTITY and has_units_on_the_way):

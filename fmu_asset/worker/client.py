@@ -461,11 +461,11 @@ class WorkerInstance(Instance):
             If it does.
         """
         self._next_memory_check = time.monotonic() + 5.0 * _MEMORY_CHECK_PERIOD
-        used = self.memory
-        if used > self._limits.memory * _MEBIBYTE:
+        used_memory = self.memory
+        if used_memory > self._limits.memory * _MEBIBYTE:
             self._process.kill()
             raise FmuMemoryError(
-                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during "
+                f"The FMU took {used_memory / _MEBIBYTE:.0f} MiB of memory during "
                 f"{self._call_kind.action}, more than the limit of {self._limits.memory:g} MiB; "
                 "its worker was stopped. If it needs that much, give it more `memory` in the table "
                 "[limits] of its binding; otherwise it leaks."

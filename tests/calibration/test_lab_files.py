@@ -303,7 +303,7 @@ def written_lab(request, tmp_path_factory):
         load_test=load_test,
         records=records,
         sampling_rate=sampling_rate,
-        lab=read_lab_folder(root, free=True),
+        lab=read_lab_folder(root, frequencies_fitted=True),
     )
 
 

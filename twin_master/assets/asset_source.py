@@ -417,9 +417,9 @@ class AssetBelief(BeliefSection):
 
     kind: Literal["asset"] = "asset"
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> AssetSource:
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> AssetSource:
         """Return the source of what flies."""
-        return flown
+        return flown_source
 
 
 class PairedSource(AssetSource):

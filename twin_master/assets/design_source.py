@@ -93,7 +93,7 @@ class DesignBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "DesignSource":
         """Return the source of the model."""
         return DesignSource(scenario, section=self)
 
@@ -501,7 +501,7 @@ def strain_predictor(
         effect_values[variable.name] = float(variable.start or 0.0)
     behaviour.tune(effect_values, 0.0)
     # A value that a prediction does not set stays at its start value.
-    nominal = {variable.name: variable.start or 0.0 for variable in variables}
+    start_values = {variable.name: variable.start or 0.0 for variable in variables}
     input_names = [variable.name for variable in variables if variable.causality == "input"]
 
     def predict(
@@ -510,10 +510,10 @@ def strain_predictor(
         control: Mapping[str, float],
         health: Mapping[str, float],
     ) -> Float:
-        values = {**nominal, "tip_force": tip_force, **control}
+        values = {**start_values, "tip_force": tip_force, **control}
         values |= {f"health.{region}": loss for region, loss in health.items()}
         inputs = [values[name] for name in input_names]
-        parameters = {**nominal, "young_modulus_factor": young_modulus_factor}
+        parameters = {**start_values, "young_modulus_factor": young_modulus_factor}
         outputs = behaviour.start(parameters, 0.0, inputs)
         return np.array(outputs[:gauge_count])  # the strains are the first outputs
 

@@ -407,13 +407,13 @@ class FmuSource(AssetSource):
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
         """Return the positions of a role; refuse another number of values than in the scenario."""
-        expected = self._scenario.observation.count
+        expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
-        if count != expected:
+        if count != expected_count:
             raise MissionInputError(
                 f"the binding {binding.name} observes {count} values of `{role}`, and the scenario "
-                f"expects {expected}."
+                f"expects {expected_count}."
             )
         return positions
 
@@ -436,11 +436,11 @@ class FmuSource(AssetSource):
             )
         names_by_sort = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", names_by_sort)
-        received = None
+        received_positions = None
         if truth.received is not None:
-            received = self._slice_of_role(binding, truth.received)
+            received_positions = self._slice_of_role(binding, truth.received)
         observation = self._observation_slice(binding, truth.observation or "")
-        return TruthOutputs(truth.state, observation, received)
+        return TruthOutputs(truth.state, observation, received_positions)
 
     def parameters(self) -> dict[str, float]:
         """Return the parameters of the FMU.

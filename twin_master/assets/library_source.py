@@ -343,7 +343,7 @@ class LibraryBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> LibrarySource:
         """Return the source of the library.
 
         Raises
@@ -351,12 +351,12 @@ class LibraryBelief(BeliefSection):
         MissionInputError
             If what flies is not an FMU.
         """
-        if not isinstance(flown, FmuSource):
+        if not isinstance(flown_source, FmuSource):
             raise MissionInputError(
                 "an observation library was sampled from an FMU, and the kind of the asset is "
                 f"`{scenario.asset.kind}`: set `belief.kind` to `asset` or `design`."
             )
-        return LibrarySource(scenario, self, flown)
+        return LibrarySource(scenario, self, flown_source)
 
 
 class LibrarySource(AssetSource):
@@ -373,9 +373,9 @@ class LibrarySource(AssetSource):
         the section names a design.
     """
 
-    def __init__(self, scenario: Scenario, section: LibraryBelief, flown: FmuSource) -> None:
+    def __init__(self, scenario: Scenario, section: LibraryBelief, flown_source: FmuSource) -> None:
         super().__init__(scenario, section)
-        self._flown = flown
+        self._flown = flown_source
         self._design_source: DesignSource | None = None
         if section.design is not None:
             belief = DesignBelief(design=section.design)

@@ -230,7 +230,7 @@ class StrainLibraryBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "StrainLibrarySource":
         """Read the library and return its source.
 
         Raises

@@ -86,7 +86,7 @@ class StructureBelief(StructureFiles, BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "ReducedModelSource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "ReducedModelSource":
         """Return the source of the model."""
         return ReducedModelSource(scenario, section=self)
 

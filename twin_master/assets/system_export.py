@@ -34,7 +34,7 @@ from twin_master.scenario.reading import LoadedScenario
 
 
 def export_scenario(
-    loaded: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool
+    loaded_scenario: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool
 ) -> Path:
     """Write the asset of a scenario as an SSP file.
 
@@ -43,7 +43,7 @@ def export_scenario(
 
     Parameters
     ----------
-    loaded : LoadedScenario
+    loaded_scenario : LoadedScenario
         The scenario.
     out : Path
         The file to write.
@@ -65,7 +65,7 @@ def export_scenario(
     FmuError
         If the FMUs do not fit.
     """
-    scenario = resolve_scenario(loaded, {"seed": seed})
+    scenario = resolve_scenario(loaded_scenario, {"seed": seed})
     source = scenario.asset.source(scenario)
     if not isinstance(source, FmuSource):
         raise MissionInputError(

@@ -127,8 +127,8 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         return futures
 
     cores = max(1, sum(client.nthreads().values()))
-    running = as_completed(submit(islice(pieces, cores * (1 + WAITING_PER_CORE))))
-    for future in running:
+    running_flights = as_completed(submit(islice(pieces, cores * (1 + WAITING_PER_CORE))))
+    for future in running_flights:
         piece = piece_of_key.pop(future.key)
         try:
             # The scheduler flies a piece again, on another worker, if its worker died.
@@ -136,7 +136,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         except KilledWorker:
             if len(piece.members) > 1:
                 single_twins = [piece._replace(members=(member,)) for member in piece.members]
-                running.update(submit(single_twins))
+                running_flights.update(submit(single_twins))
                 continue
             reason = "its flight ended the worker process: fly an FMU that crashes isolated."
             result = result_of_unflown(piece.members[0], reason)
@@ -147,7 +147,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
             ) from None
         yield FlownPiece(piece, result)
         del future  # lets the workers forget the result
-        running.update(submit(islice(pieces, 1)))
+        running_flights.update(submit(islice(pieces, 1)))
 
 
 @cache

@@ -215,8 +215,8 @@ class TransitionFamily:
 
 def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists:
     """Return the predecessor lists of a scenario with this value of all probabilities to worsen."""
-    equal = {"probability": dict.fromkeys(scenario.control_names, probability)}
-    transition = scenario.transition.model_copy(update=equal)
+    equal_probabilities = {"probability": dict.fromkeys(scenario.control_names, probability)}
+    transition = scenario.transition.model_copy(update=equal_probabilities)
     return _predecessors(scenario.model_copy(update={"transition": transition}))
 
 
@@ -253,7 +253,7 @@ class ScaledLikelihood(NamedTuple):
 
 
 def scaled_likelihood(
-    model: GaussianSensorModel, observed: Float, control: Index
+    model: GaussianSensorModel, observations: Float, control: Index
 ) -> ScaledLikelihood:
     """Return the likelihood of each state in each step, given the observations of B twins.
 
@@ -261,13 +261,13 @@ def scaled_likelihood(
     ----------
     model : GaussianSensorModel
         The model of the G sensors.
-    observed : (B, T, G) array
+    observations : (B, T, G) array
         The observations in SI units; NaN where one was lost.
     control : (B, T) array
         The control in force in each step.
     """
     twin_count, step_count = control.shape
-    all_steps = observed.reshape(-1, observed.shape[-1])
+    all_steps = observations.reshape(-1, observations.shape[-1])
     log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
     return _scaled(log_likelihood.reshape(twin_count, step_count, -1))
 
@@ -311,7 +311,7 @@ def parameter_evidence(
     family: TransitionFamily,
     probability: Float,
     model: GaussianSensorModel,
-    observed: Float,
+    observations: Float,
     control: Index,
 ) -> Float:
     """Return the log evidence of B twins for E values of a parameter that is constant in time.
@@ -326,7 +326,7 @@ def parameter_evidence(
         The probabilities to worsen.
     model : GaussianSensorModel
         The model of the G sensors; its E draws are the values of the parameter.
-    observed : (B, T, G) array
+    observations : (B, T, G) array
         The observations in SI units; NaN where one was lost.
     control : (B, T) array
         The control in force in each step.
@@ -338,7 +338,7 @@ def parameter_evidence(
     """
     result = np.empty((len(control), model.draw_count))
     for twin in range(len(control)):
-        log_density = model.log_density_of_draws(observed[twin], control[twin])  # (T, S, E)
+        log_density = model.log_density_of_draws(observations[twin], control[twin])  # (T, S, E)
         log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
         # The E values take the place of twins: all have the same controls.
         likelihood = _scaled(log_density_by_draw)

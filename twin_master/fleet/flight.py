@@ -177,15 +177,15 @@ def fly_fleet(
         _note_fixed_transitions(fleet, progress)
         with JournalFile(folder, hash_record(config)) as journal:
             counts = _FleetFlight(fleet, folder, journal).fly(engine, progress)
-        failures, ended = endings_of(folder)
+        failures, early_ends = endings_of(folder)
         result = fleet.head.model_dump(exclude={"shard"})
-        result |= {"twins": fleet.size, "failures": failures, "ended": ended}
+        result |= {"twins": fleet.size, "failures": failures, "ended": early_ends}
         atomic_write_text(folder / RESULT_NAME, run_folder.to_json(result))
     return FleetOutcome(
         folder=folder,
         twins=fleet.size,
         failures=failures,
-        ended=ended,
+        ended=early_ends,
         seconds=time.perf_counter() - start,
         shards_flown=counts.flown,
         shards_kept=counts.kept,
@@ -229,11 +229,11 @@ def endings_of(folder: Path) -> Endings:
     else:
         content = [record for record, *_ in records(journal)]
     failures: dict[str, str] = {}
-    ended: dict[str, str] = {}
+    early_ends: dict[str, str] = {}
     for record in content:
         failures |= record["failures"]
-        ended |= record["ended"]
-    return Endings(dict(sorted(failures.items())), dict(sorted(ended.items())))
+        early_ends |= record["ended"]
+    return Endings(dict(sorted(failures.items())), dict(sorted(early_ends.items())))
 
 
 def prepare_kit(
@@ -363,14 +363,14 @@ class _FleetFlight:
         The rows of single twins are compared, because the twins of a shard are stored one by one if
         workers died over it.
         """
-        stored = set()
+        stored_rows = set()
         for record, *_ in records(self._journal.path):
             first, end = record["rows"]
-            stored |= {(record["group"], row) for row in range(first, end)}
+            stored_rows |= {(record["group"], row) for row in range(first, end)}
         remaining = []
         for shard in shards:
             rows = {(shard.group_number, member.row) for member in shard.members}
-            if not rows <= stored:
+            if not rows <= stored_rows:
                 remaining.append(shard)
         return remaining
 
@@ -384,13 +384,15 @@ class _FleetFlight:
             group = self._fleet.groups[number]
             try:
                 kit = self._packed_kit(number, members[0].scenario_number)
-                recorded = tuple(_with_recording(group, member) for member in members)
+                members_with_recordings = tuple(
+                    _with_recording(group, member) for member in members
+                )
             except FLIGHT_ERRORS as error:
                 if len(group.scenarios) == 1:
                     raise
                 self._store(number, members, result_of_unflown(members[0], str(error)))
             else:
-                yield Piece(number, kit, recorded)
+                yield Piece(number, kit, members_with_recordings)
 
     def _pack_kit(self, group_number: int, scenario_number: int) -> bytes:
         """Prepare a scenario of a group and return its packed kit."""

@@ -275,7 +275,9 @@ def marginal_distributions(
     """
     marginals = []
     for number, (axis, transform) in enumerate(zip(axes, transforms, strict=True)):
-        other_axes = tuple(other for other in range(weight.ndim) if other != number)
+        other_axes = tuple(
+            other_number for other_number in range(weight.ndim) if other_number != number
+        )
         marginals.append(Distribution(axis, weight.sum(axis=other_axes), transform))
     return tuple(marginals)
 
@@ -553,9 +555,9 @@ def _member_likelihood(nodes: Float, log_evidence: Float, values: Float) -> Floa
     """
     from scipy.interpolate import CubicSpline
 
-    possible = log_evidence[np.isfinite(log_evidence).all(axis=1)]
-    relative = possible - possible.max(axis=1, keepdims=True)
-    relative = np.maximum(relative, LEAST_LOG_EVIDENCE)
-    likelihood = np.exp(CubicSpline(nodes, relative, axis=1)(values))
+    finite_log_evidence = log_evidence[np.isfinite(log_evidence).all(axis=1)]
+    relative_log_evidence = finite_log_evidence - finite_log_evidence.max(axis=1, keepdims=True)
+    relative_log_evidence = np.maximum(relative_log_evidence, LEAST_LOG_EVIDENCE)
+    likelihood = np.exp(CubicSpline(nodes, relative_log_evidence, axis=1)(values))
     likelihood /= likelihood.sum(axis=1, keepdims=True)
     return np.asarray(likelihood)

@@ -292,10 +292,12 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
     """Add the figure of the assets' states over time, if any step has an estimated state."""
-    flown = flown_rows(stored_values(group, "status"))
-    mean = believed_means(group)[flown]
+    rows_flown = flown_rows(stored_values(group, "status"))
+    mean = believed_means(group)[rows_flown]
     if standing.names and not np.isnan(mean).all():
-        figure = course_figure(standing.scenario, mean, stored_values(group, "truth/state")[flown])
+        figure = course_figure(
+            standing.scenario, mean, stored_values(group, "truth/state")[rows_flown]
+        )
         page.add_report_figure(WORDS.figure("course", figure))
 
 

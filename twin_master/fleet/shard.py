@@ -139,8 +139,8 @@ class Kit:
         model and estimator that a user has given.
     """
 
-    def __init__(self, packed: bytes) -> None:
-        scenario, files, self.wing, parts = pickle.loads(packed)
+    def __init__(self, packed_kit: bytes) -> None:
+        scenario, files, self.wing, parts = pickle.loads(packed_kit)
         folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)

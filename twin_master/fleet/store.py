@@ -284,9 +284,11 @@ def check_installed(*packages: str) -> None:
     FleetError
         If one of the packages is not installed.
     """
-    missing = [name for name in packages if util.find_spec(name) is None]
-    if missing:
-        raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
+    missing_packages = [name for name in packages if util.find_spec(name) is None]
+    if missing_packages:
+        raise FleetError(
+            f"a fleet needs {' and '.join(missing_packages)}: pip install 'uav-twin[fleet]'."
+        )
 
 
 def open_group(folder: Path, group: str) -> "xr.DataTree":
@@ -326,11 +328,11 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
         tree = in_present_layout(stored_group, scenario, names)
     # A path with braces is a template, such as "{input}", whose arrays differ between groups.
     required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
-    missing = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
-    if missing:
+    missing_paths = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
+    if missing_paths:
         raise FleetError(
             f"{folder} was flown by another version of this program and lacks "
-            f"{', '.join(missing)}: fly the fleet again with --replace, "
+            f"{', '.join(missing_paths)}: fly the fleet again with --replace, "
             "or read it with that version."
         )
     return tree

@@ -280,12 +280,18 @@ def in_present_layout(
     import xarray as xr
 
     dimensions = {
-        former: present for former, present in FORMER_DIMENSIONS.items() if former in dataset.dims
+        former_name: present_name
+        for former_name, present_name in FORMER_DIMENSIONS.items()
+        if former_name in dataset.dims
     }
     variables = {}
-    for name, stored in dataset.data_vars.items():
-        variable = stored.rename(
-            {former: present for former, present in dimensions.items() if former in stored.dims}
+    for name, stored_variable in dataset.data_vars.items():
+        variable = stored_variable.rename(
+            {
+                former_name: present_name
+                for former_name, present_name in dimensions.items()
+                if former_name in stored_variable.dims
+            }
         )
         if name == _FORMER_OBSERVED:
             for path, columns in observed_columns(scenario).items():
@@ -321,7 +327,9 @@ def former_names_used(dataset: "xr.Dataset") -> Mapping[str, str]:
     Names of dimensions come first, then those of variables, which become paths.
     """
     dimensions = {
-        name: present for name, present in FORMER_DIMENSIONS.items() if name in dataset.dims
+        name: present_name
+        for name, present_name in FORMER_DIMENSIONS.items()
+        if name in dataset.dims
     }
     paths = {name: path for name, path in FORMER_PATHS.items() if name in dataset.data_vars}
     return dimensions | paths

@@ -68,22 +68,22 @@ class FaultFilter:
         self._model = model
         self._sensor_model = sensor_model
         self._settings = settings
-        chosen, self._draw_weight = _choose_even_draws(
+        chosen_draws, self._draw_weight = _choose_even_draws(
             np.asarray(draws, np.float64), sensor_model.draw_weight
         )
         sensors = sensor_model.sensor_count
         states = model.states.size
-        self._gauge_belief_shape = (sensors, len(_GAINS), len(chosen), states)
+        self._gauge_belief_shape = (sensors, len(_GAINS), len(chosen_draws), states)
         if np.prod(self._gauge_belief_shape, dtype=float) > _MOST_BELIEF_NUMBERS:
             raise InvalidModelError(
-                f"noticing keeps a belief over {states} states and {len(chosen)} draws for each of "
-                f"{sensors * len(_GAINS)} faults of gauges, which are more than "
+                f"noticing keeps a belief over {states} states and {len(chosen_draws)} draws for "
+                f"each of {sensors * len(_GAINS)} faults of gauges, which are more than "
                 f"{_MOST_BELIEF_NUMBERS} numbers: take fewer levels or state factors, or leave out "
                 "`notice`"
             )
 
         # Predictions of the chosen draws (E', S, G) and inverse noise (S, G) for each control.
-        values = sensor_model.value_per_draw[chosen]
+        values = sensor_model.value_per_draw[chosen_draws]
         noise = sensor_model.independent_standard_deviation
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(values[:, :, u]) for u in controls]
@@ -436,18 +436,18 @@ class FaultFilter:
         best_fit = self._sensor_model.fit_within_interval(
             readings, control_index, self._value[control_index], precision
         )
-        present = ~np.isnan(readings)
-        inverse_deviation = np.where(present, self._inverse_deviation[control_index], 0.0)
+        is_present = ~np.isnan(readings)
+        inverse_deviation = np.where(is_present, self._inverse_deviation[control_index], 0.0)
         prediction = (best_fit.value * inverse_deviation).reshape(-1, len(readings))
-        difference = np.where(present, readings - best_fit.value, 0.0)
+        difference = np.where(is_present, readings - best_fit.value, 0.0)
         observation = StandardizedObservation(
-            present=present,
+            present=is_present,
             residual=(difference * inverse_deviation).reshape(prediction.shape),
             prediction=prediction,
             power=0.5 * (degrees + count + 1.0),
             degrees=degrees,
         )
-        log_scale = np.log(inverse_deviation[:, present]).sum(axis=1)
+        log_scale = np.log(inverse_deviation[:, is_present]).sum(axis=1)
         log_prior_density = best_fit.log_density + log_density_beside + log_scale
         return observation, log_prior_density.ravel()
 
@@ -465,7 +465,7 @@ def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], 
 
     Returns
     -------
-    chosen : (E',) array
+    chosen_draws : (E',) array
         The indices of the chosen draws.
     chosen_weight : (E',) array
         For each chosen draw, the total probability of the draws that are nearest to it.
@@ -473,7 +473,7 @@ def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], 
     order = np.argsort(draws, kind="stable")
     grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)
     nearest_to_grid = [order[np.argmin(np.abs(draws[order] - value))] for value in grid]
-    chosen = np.unique(nearest_to_grid)
-    nearest_chosen = np.argmin(np.abs(draws[:, None] - draws[chosen]), axis=1)
-    chosen_weight = np.bincount(nearest_chosen, weight, minlength=len(chosen))
-    return chosen, np.asarray(chosen_weight / chosen_weight.sum(), dtype=np.float64)
+    chosen_draws = np.unique(nearest_to_grid)
+    nearest_chosen = np.argmin(np.abs(draws[:, None] - draws[chosen_draws]), axis=1)
+    chosen_weight = np.bincount(nearest_chosen, weight, minlength=len(chosen_draws))
+    return chosen_draws, np.asarray(chosen_weight / chosen_weight.sum(), dtype=np.float64)

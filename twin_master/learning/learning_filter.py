@@ -176,9 +176,9 @@ class LearningFilter:
         if largest == -np.inf:
             worst_residuals = self.sensor_model.worst_residuals(sensor_values, control_index)
             raise ImpossibleObservation(self._name, step, worst_residuals)
-        filtered = np.exp(log_belief - largest)
-        log_evidence = largest + float(np.log(filtered.sum()))
-        filtered /= filtered.sum()
+        joint_belief = np.exp(log_belief - largest)
+        log_evidence = largest + float(np.log(joint_belief.sum()))
+        joint_belief /= joint_belief.sum()
         log_belief -= log_evidence
 
         # Update the regressions. Each gauge is compared with the fit by all other gauges: a fit
@@ -193,10 +193,10 @@ class LearningFilter:
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
-            filtered=filtered.sum(axis=0),
+            filtered=joint_belief.sum(axis=0),
             log_evidence=log_evidence,
             carried=Carried(control_index, arrays),
-            learnt=self._learnt_quantities(filtered.sum(axis=1), statistics, count),
+            learnt=self._learnt_quantities(joint_belief.sum(axis=1), statistics, count),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -284,10 +284,12 @@ class LearningFilter:
         step_controls = np.array([step.control_index for step in carried])
         control = self._first_control[possible_hypotheses, None] + step_controls
         log_given_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
-        smoothed = smooth_many(
+        smoothed_beliefs = smooth_many(
             self._transition, control, np.exp(log_given_hypothesis), log_given_hypothesis
         )
-        result[:, possible_hypotheses] = weight[possible_hypotheses, None] * smoothed.swapaxes(0, 1)
+        result[:, possible_hypotheses] = weight[
+            possible_hypotheses, None
+        ] * smoothed_beliefs.swapaxes(0, 1)
         return result
 
     def _restore_draw_weights(self, log_belief: Float) -> Float:

@@ -270,7 +270,7 @@ def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
 
 
 def grid_of_scenario(
-    loaded: LoadedScenario,
+    loaded_scenario: LoadedScenario,
     folder: Path,
     texts: Sequence[str] = (),
     *,
@@ -284,7 +284,7 @@ def grid_of_scenario(
 
     Parameters
     ----------
-    loaded : LoadedScenario
+    loaded_scenario : LoadedScenario
         The scenario.
     folder : Path
         The folder into which the FMU and its binding are copied.
@@ -305,15 +305,19 @@ def grid_of_scenario(
         If the asset of the scenario cannot be prepared.
     """
     # the FMU that flies
-    scenario = resolve_scenario(_without_library(loaded), overrides)
-    flown = scenario.asset.source(scenario)
-    if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
+    scenario = resolve_scenario(_without_library(loaded_scenario), overrides)
+    flown_source = scenario.asset.source(scenario)
+    if not isinstance(flown_source, FmuSource) or isinstance(flown_source, SeveralSource):
         raise MissionInputError(
             f"the scenario {scenario.mission.name} flies an asset of the kind "
             f"`{scenario.asset.kind}`, and one FMU can be sampled."
         )
-    believed = scenario.belief.source(scenario, flown)
-    source = flown if believed is flown else PairedSource(flown, believed)
+    believed_source = scenario.belief.source(scenario, flown_source)
+    source = (
+        flown_source
+        if believed_source is flown_source
+        else PairedSource(flown_source, believed_source)
+    )
     source.check()
     source.prepare(folder, reporter())
 
@@ -341,7 +345,7 @@ def grid_of_scenario(
             for name in expectations
             if name in binding.parameter
         }
-    fixed_parameters = flown.parameters()
+    fixed_parameters = flown_source.parameters()
     fixed_parameters.pop(draws.name, None)
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),
@@ -355,22 +359,22 @@ def grid_of_scenario(
         parameters=fixed_parameters,
         others=dependent_parameters,
         settling_steps=settling_steps,
-        step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
+        step_timeout=flown_source.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
-def _without_library(loaded: LoadedScenario) -> LoadedScenario:
+def _without_library(loaded_scenario: LoadedScenario) -> LoadedScenario:
     """Return the scenario without the observation library that its twin believes.
 
     The library is yet to be sampled. In its place the twin believes the wing design that the table
     `belief` names, or else the asset itself.
     """
-    belief = loaded.scenario.belief
+    belief = loaded_scenario.scenario.belief
     if not isinstance(belief, LibraryBelief):
-        return loaded
+        return loaded_scenario
     if belief.design is None:
         model: AssetBelief | DesignBelief = AssetBelief()
     else:
         model = DesignBelief(design=belief.design)
-    scenario = loaded.scenario.model_copy(update={"belief": model})
-    return replace(loaded, scenario=scenario)
+    scenario = loaded_scenario.scenario.model_copy(update={"belief": model})
+    return replace(loaded_scenario, scenario=scenario)

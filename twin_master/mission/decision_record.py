@@ -63,9 +63,9 @@ def _health_record(
     line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel, *, is_believed: bool
 ) -> JsonObject:
     """Return mean, standard deviation and unit of each state factor, by its name."""
-    filtered = array_from_json(line["filtered"])
-    mean = model.states.mean(filtered)
-    deviation = model.states.standard_deviation(filtered)
+    filtered_belief = array_from_json(line["filtered"])
+    mean = model.states.mean(filtered_belief)
+    deviation = model.states.standard_deviation(filtered_belief)
     health: JsonObject = {}
     for index, factor in enumerate(scenario.state):
         health[factor.name] = {

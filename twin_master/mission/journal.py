@@ -137,8 +137,8 @@ def reading_from_line(record: JsonObject) -> Reading:
             observation=array_from_json(record["observation"]),
             monitors=dict(zip(record["monitors"], values, strict=True)),
         )
-    observed = array_from_json(record["observed"])
-    return Reading(observed, int(record["control_index"]), ground_truth=ground_truth)
+    observed_values = array_from_json(record["observed"])
+    return Reading(observed_values, int(record["control_index"]), ground_truth=ground_truth)
 
 
 class JournalFile:

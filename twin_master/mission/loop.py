@@ -62,18 +62,25 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
         reading = source.read(twin)
         if reading is None:
             return
-        received = time.perf_counter()
+        time_received = time.perf_counter()
         try:
             twin_step = _assimilate(twin, reading)
         except (ImpossibleObservation, InvalidObservationError) as error:
             reading = source.replace_impossible(reading, error)
             twin_step = _assimilate(twin, reading)
-        decided = time.perf_counter()
+        time_decided = time.perf_counter()
         step = MissionStep(reading, twin_step)
         for sink in sinks:
             sink(step)
-        stored = time.perf_counter()
-        yield replace(step, seconds=(received - begin, decided - received, stored - decided))
+        time_stored = time.perf_counter()
+        yield replace(
+            step,
+            seconds=(
+                time_received - begin,
+                time_decided - time_received,
+                time_stored - time_decided,
+            ),
+        )
 
 
 def _assimilate(twin: Twin, reading: Reading) -> TwinStep:

@@ -414,15 +414,15 @@ def prepare_knowledge(
     """
     model = build_graphical_model(scenario)
     draws = source.draws(seed)
-    predicted = source.observation_table(draws, model)
+    predicted_readings = source.observation_table(draws, model)
     true_values = source.structural_table(draws, model)
     noise_settings = {
         "observation.standard_deviation": scenario.observation.standard_deviation,
         "truth.noise.standard_deviation": scenario.truth.noise.standard_deviation,
     }
     for key, deviation in noise_settings.items():
-        check_noise(key, deviation, predicted, scenario.observation.sensor_units)
-    knowledge = Knowledge(scenario, model, draws, predicted, policy, true_values, parts)
+        check_noise(key, deviation, predicted_readings, scenario.observation.sensor_units)
+    knowledge = Knowledge(scenario, model, draws, predicted_readings, policy, true_values, parts)
     if parts.replace_filter:
         _ = knowledge.estimator  # made now, so that a part that does not fit is refused here
     return knowledge
@@ -456,8 +456,8 @@ def prepare_twin(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         If the scenario cannot be modelled; the error is one clear sentence.
     """
-    resolved = resolve_scenario(load_scenario(scenario), overrides)
-    return prepare_without_folder(resolved, asset_source(resolved), progress)
+    resolved_scenario = resolve_scenario(load_scenario(scenario), overrides)
+    return prepare_without_folder(resolved_scenario, asset_source(resolved_scenario), progress)
 
 
 def prepare_without_folder(
@@ -559,15 +559,15 @@ def load_knowledge(
     if not path.is_file():
         path = folder / KNOWLEDGE_NAME
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            predicted = np.asarray(stored["predicted"], dtype=np.float64)
-            draws = np.asarray(stored["draws"], dtype=np.float64)
-            policy: Float | BeliefPolicy = np.asarray(stored["policy"], dtype=np.float64)
+        with np.load(path, allow_pickle=False) as stored_arrays:
+            predicted_readings = np.asarray(stored_arrays["predicted"], dtype=np.float64)
+            draws = np.asarray(stored_arrays["draws"], dtype=np.float64)
+            policy: Float | BeliefPolicy = np.asarray(stored_arrays["policy"], dtype=np.float64)
             true_values = None
-            if "true" in stored:
-                true_values = np.asarray(stored["true"], dtype=np.float64)
-            if "belief_control" in stored:
-                policy = BeliefPolicy.from_arrays(stored, "belief_")
+            if "true" in stored_arrays:
+                true_values = np.asarray(stored_arrays["true"], dtype=np.float64)
+            if "belief_control" in stored_arrays:
+                policy = BeliefPolicy.from_arrays(stored_arrays, "belief_")
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter,
@@ -577,7 +577,9 @@ def load_knowledge(
             calibration.source,
         )
         model = build_graphical_model(scenario)
-        knowledge = Knowledge(scenario, model, parameter, predicted, policy, true_values, parts)
+        knowledge = Knowledge(
+            scenario, model, parameter, predicted_readings, policy, true_values, parts
+        )
         _ = knowledge.plan  # planned now, so that arrays of another shape are refused here
         return knowledge
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:

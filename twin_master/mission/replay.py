@@ -222,7 +222,7 @@ def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
     in_force = []
     for index, model in enumerate(models):
         later_models = models[index + 1 :]
-        if all(later.from_step > model.from_step for later in later_models):
+        if all(later_model.from_step > model.from_step for later_model in later_models):
             in_force.append(model)
     return in_force
 

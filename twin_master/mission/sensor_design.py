@@ -220,14 +220,14 @@ def choose_sensors(
         raise MissionInputError(
             f"--sensors is from 1 to {len(candidates)}, the candidates, and {count} came."
         )
-    chosen = _add_greedily(readings, candidates, count)
-    chosen = _exchange(readings, candidates, chosen)
-    ordered = _add_greedily(readings, chosen, count)
+    chosen_sensors = _add_greedily(readings, candidates, count)
+    chosen_sensors = _exchange(readings, candidates, chosen_sensors)
+    ordered_sensors = _add_greedily(readings, chosen_sensors, count)
     information = []
     for number in range(1, count + 1):
-        information.append(_mean_information(readings, ordered[:number]))
+        information.append(_mean_information(readings, ordered_sensors[:number]))
     return SensorDesign(
-        tuple(ordered), tuple(information), _mean_information(readings, list(candidates))
+        tuple(ordered_sensors), tuple(information), _mean_information(readings, list(candidates))
     )
 
 
@@ -255,33 +255,37 @@ def _add_greedily(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
 ) -> list[int]:
     """Return `count` sensors, each of which adds the most information to those before it."""
-    chosen: list[int] = []
-    while len(chosen) < count:
-        extended = [[*chosen, sensor] for sensor in candidates if sensor not in chosen]
-        chosen = _best_set(readings, extended).sensors
-    return chosen
+    chosen_sensors: list[int] = []
+    while len(chosen_sensors) < count:
+        extended_sets = [
+            [*chosen_sensors, sensor] for sensor in candidates if sensor not in chosen_sensors
+        ]
+        chosen_sensors = _best_set(readings, extended_sets).sensors
+    return chosen_sensors
 
 
 def _exchange(
-    readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen: list[int]
+    readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen_sensors: list[int]
 ) -> list[int]:
     """Return the chosen sensors, improved by exchanging one at a time for another candidate.
 
     It ends if no exchange gains information.
     """
-    information = _mean_information(readings, chosen)
-    while len(candidates) > len(chosen):
-        other_sensors = [sensor for sensor in candidates if sensor not in chosen]
+    information = _mean_information(readings, chosen_sensors)
+    while len(candidates) > len(chosen_sensors):
+        other_sensors = [sensor for sensor in candidates if sensor not in chosen_sensors]
         exchanged_sets = []
-        for position in range(len(chosen)):
+        for position in range(len(chosen_sensors)):
             for sensor in other_sensors:
-                exchanged_sets.append([*chosen[:position], sensor, *chosen[position + 1 :]])
+                exchanged_sets.append(
+                    [*chosen_sensors[:position], sensor, *chosen_sensors[position + 1 :]]
+                )
         best_set = _best_set(readings, exchanged_sets)
         if best_set.information <= information + _LEAST_GAIN:
             break
         information = best_set.information
-        chosen = best_set.sensors
-    return chosen
+        chosen_sensors = best_set.sensors
+    return chosen_sensors
 
 
 def level_separations(

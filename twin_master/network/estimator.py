@@ -290,12 +290,14 @@ class ExactFilter:
         if before is not None:
             previous = (before.arrays["log_filtered"], before.control_index)
         try:
-            filtered = filter_sequence(self.model, [control_index], log_likelihood[None], previous)
+            filtered_steps = filter_sequence(
+                self.model, [control_index], log_likelihood[None], previous
+            )
         except ImpossibleObservation:
             worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
             residuals = worst_residuals(observation, control_index) if worst_residuals else None
             raise ImpossibleObservation(self._name, step, residuals) from None
-        this_step = filtered[0]
+        this_step = filtered_steps[0]
         return Estimate(
             forecast=this_step.forecast,
             filtered=this_step.filtered,

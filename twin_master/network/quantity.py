@@ -162,8 +162,8 @@ class QuantityModel:
         """Return a joint belief (..., S, U) as an array, or refuse its shape."""
         joint = np.asarray(joint, dtype=np.float64)
         what = "a joint belief, see `known_control`,"
-        leading = joint.shape[:-2]
-        check_shape(what, joint.shape, *leading, self.state_count, self.control_count)
+        leading_axes = joint.shape[:-2]
+        check_shape(what, joint.shape, *leading_axes, self.state_count, self.control_count)
         return joint
 
     def moments(self, joint: ArrayLike) -> tuple[Float, Float]:

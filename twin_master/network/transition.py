@@ -115,7 +115,10 @@ def check_shape(
         The error that is raised.
     """
     pairs = zip(expected, shape, strict=False)
-    differs = any(isinstance(wanted, int) and wanted != length for wanted, length in pairs)
+    differs = any(
+        isinstance(expected_length, int) and expected_length != length
+        for expected_length, length in pairs
+    )
     if len(shape) != len(expected) or differs:
         lengths = ", ".join(map(str, expected))
         if len(expected) == 1:
@@ -148,12 +151,12 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     InvalidModelError
         If the arrays do not fit in memory; the message lists their sizes.
     """
-    needed = sum(parts.values())
+    needed_memory = sum(parts.values())
     available = available_memory()
-    if needed > available:
+    if needed_memory > available:
         listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
         raise InvalidModelError(
-            f"this does not fit in memory: {listed}, together {needed / 1e9:.3g} GB, and "
+            f"this does not fit in memory: {listed}, together {needed_memory / 1e9:.3g} GB, and "
             f"{available / 1e9:.3g} GB are left: {advice}."
         )
 

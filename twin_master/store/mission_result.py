@@ -80,8 +80,8 @@ def quantity_titles(name: str) -> QuantityTitles:
     parameter.
     """
     if name in SCHEMA["quantities"]:
-        stored, heading, short = SCHEMA["quantities"][name]
-        return QuantityTitles(stored, heading, short)
+        stored_title, heading, short_title = SCHEMA["quantities"][name]
+        return QuantityTitles(stored_title, heading, short_title)
     title = parameter_title(name)
     return QuantityTitles(title, capital(title), title)
 

@@ -210,12 +210,12 @@ def find_policy_switch(
     return None
 
 
-def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
+def filtered_rms_error(model: GraphicalModel, filtered_belief: Float, true_state: Float) -> Float:
     """Return the root mean square, over the steps, of the error of each filtered state factor.
 
     The error is the filtered mean minus the true value, SI.
     """
-    error = model.states.mean(filtered) - true_state
+    error = model.states.mean(filtered_belief) - true_state
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
@@ -323,9 +323,9 @@ def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
 
 def _error_bound_figures(result: MissionResult) -> Iterator[FigureGroup]:
     """Yield the largest certified strain error, if the asset reports it."""
-    bound = result.flight.monitors.get("strain_error_bound")
-    if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
-        yield FigureGroup("bound", {}, [1e6 * float(bound.max())])
+    error_bounds = result.flight.monitors.get("strain_error_bound")
+    if error_bounds is not None and {*result.scenario.observation.sensor_units} == {"1"}:
+        yield FigureGroup("bound", {}, [1e6 * float(error_bounds.max())])
 
 
 def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:

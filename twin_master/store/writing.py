@@ -230,8 +230,8 @@ class RunOutcome:
     def _repr_html_(self) -> str:
         """Return the figures of the run beside their references, for a notebook."""
         rows = []
-        for figure, printed in zip(self.figures, printed_figures(self.figures), strict=True):
-            rows.append([figure.title, printed.value, figure.unit, printed.reference])
+        for figure, printed_figure in zip(self.figures, printed_figures(self.figures), strict=True):
+            rows.append([figure.title, printed_figure.value, figure.unit, printed_figure.reference])
         headings = ("result", "this run", "unit", "reference")
         return html_table(f"Run in {self.folder}", headings, rows, self.notices)
 

@@ -166,20 +166,20 @@ def _log_evidence(history: History, compared: ComparedSteps) -> float:
     return sum(step.twin_step.log_evidence for step in steps)
 
 
-def merge_patches(believed: Path | None, new: Path) -> bytes:
+def merge_patches(believed: Path | None, new_patch: Path) -> bytes:
     """Return the content of a patch file with the effects of two patches.
 
     Parameters
     ----------
     believed : Path or None
         The file of the patch that is believed already, if any.
-    new : Path
+    new_patch : Path
         The file of the patch that is added.
     """
     if believed is None:
-        return new.read_bytes()
+        return new_patch.read_bytes()
     believed_record = json.loads(believed.read_text(encoding="utf-8"))
-    new_record = json.loads(new.read_text(encoding="utf-8"))
+    new_record = json.loads(new_patch.read_text(encoding="utf-8"))
     merged_record = {
         "schema": new_record["schema"],
         "effects": believed_record["effects"] + new_record["effects"],

@@ -243,7 +243,7 @@ class FolderFeed(RecordedFeed):
 
         A journal of an asset with other sensors or controls is refused.
         """
-        observed = array_from_json(line["observed"])
+        observed_values = array_from_json(line["observed"])
         control = int(line["control_index"])
         line_step = int(line["step"])
         step = int(line.get("observation_step", line_step))
@@ -257,9 +257,11 @@ class FolderFeed(RecordedFeed):
             return None
         count = self.scenario.observation.count
         width = self.scenario.row_width
-        if len(observed) not in (count, width) or control >= len(self.scenario.control):
+        if len(observed_values) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         row = np.full(width, np.nan)
-        row[: len(observed)] = observed  # a journal without covariances has only the sensors
+        row[: len(observed_values)] = (
+            observed_values  # a journal without covariances has only the sensors
+        )
         has_assumed_control = status is not StepStatus.WITH_CONTROL
         return Message(row, control, step=step, assumed=has_assumed_control)
