@@ -169,7 +169,7 @@ def _c_text(text: str) -> str:
 
 
 def _c_number(value: float | None, absent: str) -> str:
-    """Return a float as a constant of C with the same bits.
+    """Return a number as a constant of C that has exactly the same bits.
 
     Parameters
     ----------

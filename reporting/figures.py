@@ -246,7 +246,7 @@ def plain_powers(axis: Axis, multiples: tuple[float, ...]) -> None:
     Parameters
     ----------
     axis : Axis
-        The axis.
+        The horizontal or vertical axis of a panel.
     multiples : tuple of float
         The multiples of powers of ten that are labelled, such as (1, 2, 5).
     """
@@ -276,7 +276,7 @@ def interval(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     x : float
         The horizontal coordinate.
     mean, low, high : float
@@ -318,7 +318,7 @@ def shared_legend(
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     rows : int
         The number of rows of the legend.
     bbox_to_anchor : (float, float)
@@ -352,7 +352,7 @@ def color_bar(
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     artist : ScalarMappable or ColorizingArtist
         The map or the points whose colours stand for values.
     label : str
@@ -378,7 +378,7 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     label : str
         Its letter, such as ``a``.
     title : str
@@ -417,7 +417,7 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     resolution : float
         The resolution in dots per inch.
     """
@@ -434,7 +434,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     folder : Path
         The folder of the files.
     name : str

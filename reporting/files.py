@@ -203,7 +203,7 @@ def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, byte
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     suffixes : collection of str
         The suffixes of the files to read, such as ".py"; all files by default.
     """
@@ -219,7 +219,7 @@ def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     members : mapping of str to bytes
         The contents by relative path.
     """

@@ -57,7 +57,7 @@ def parse_json(
     Parameters
     ----------
     content : bytes or str
-        The text.
+        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception

@@ -82,7 +82,7 @@ def write_groups(
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     groups : mapping of str to NetcdfGroup
         The groups by name.
     attrs : mapping of str to object
@@ -213,7 +213,7 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
 
     Returns
     -------
@@ -246,7 +246,7 @@ def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     writing_end : int
         The file descriptor of the pipe to the parent process.
     """

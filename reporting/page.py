@@ -141,7 +141,7 @@ class Words:
         Parameters
         ----------
         page : Page
-            The page.
+            The page to which content is added.
         name : str
             The name of the table in the file.
         rows : sequence of sequence of str

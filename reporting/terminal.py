@@ -172,7 +172,7 @@ def break_words(text: str, longest: int) -> str:
     Parameters
     ----------
     text : str
-        The text.
+        The text, in one or more lines.
     longest : int
         The longest part of a word on one line, in characters.
     """

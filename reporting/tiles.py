@@ -70,7 +70,7 @@ def tiles_of_figure(figure: Figure) -> list[Tile]:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     """
     figure.draw_without_rendering()  # places the entries of legends
     renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]

@@ -66,7 +66,7 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> Tom
     Parameters
     ----------
     content : bytes or str
-        The text.
+        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception

@@ -47,7 +47,7 @@ def brief(record: object, **facts: object) -> str:
     Parameters
     ----------
     record : object
-        The record.
+        The object to describe.
     **facts : object
         The values to show, by name.
     """

@@ -244,7 +244,7 @@ def _fly_and_print_mission(
         `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and
         `begun`.
     folder : Path
-        The run folder.
+        The path of the run folder.
     report : bool
         Whether to write the report.
     view : bool
@@ -298,7 +298,7 @@ def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
 
 
 def print_outcome(outcome: "RunOutcome") -> None:
-    """Print the figures of a run beside their references, and where the report is."""
+    """Print the figures of a run next to their reference values, and where the report is."""
     from twin_master.store.printed_figures import printed_figures
 
     numbers_of_sources = _numbers_of_sources(outcome)
@@ -340,7 +340,7 @@ def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
 
 
 def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
-    """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
+    """Return the rows of the table of times: for asset, twin and checkpoints, and in total."""
     rows = []
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")

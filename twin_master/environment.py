@@ -219,7 +219,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Close the asset, and remove the files that were made for it."""
+        """Close the asset, and remove its temporary files."""
         self._resources.close()
         self._plant = None
 

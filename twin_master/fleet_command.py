@@ -349,7 +349,7 @@ def fly_and_print_fleet(
     Parameters
     ----------
     fleet : Fleet
-        The fleet.
+        The plan of the fleet.
     out : Path or None
         Its folder; ``runs/NAME`` if None.
     engine : Engine
@@ -447,7 +447,7 @@ Figures = dict[str, dict[str, "Estimated | int"]]
 
 
 def _figures_by_group(folders: list[Path]) -> Figures:
-    """Return the figures of each group; if there are several folders, its name has the folder."""
+    """Return the figures of each group by name; with several folders, the name has the folder."""
     from twin_master.fleet.reading import group_figures, open_fleet
 
     figures = {}

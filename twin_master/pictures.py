@@ -130,7 +130,7 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
     Parameters
     ----------
     fleet : DataTree
-        What `open_fleet` returns.
+        The store of the fleet, from `open_fleet`.
     axes : Axes or sequence of Axes, optional
         A panel for each factor of each group; new ones of pyplot by default.
 

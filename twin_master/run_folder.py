@@ -173,7 +173,7 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     config : dict
         The content of its `config.json`.
     seed : int
@@ -209,7 +209,7 @@ def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     config : dict
         The content of its `config.json`.
     hashes : mapping of str to str
@@ -319,7 +319,7 @@ def hold_run_folder(folder: Path, loaded_scenario: LoadedScenario | None) -> Ite
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     loaded_scenario : LoadedScenario or None
         The scenario that the user expects there; it is compared with that of the folder.
 

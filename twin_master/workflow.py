@@ -98,7 +98,7 @@ def fly(
     report : bool
         Whether to write the report.
     progress : Progress, optional
-        Shows the stages.
+        The display of the progress in stages.
     begun : callable, optional
         Called with the run folder before the first stage.
 
@@ -158,7 +158,7 @@ def resume(
     Parameters
     ----------
     folder : Path or str
-        The run folder.
+        The path of the run folder.
     loaded_scenario : LoadedScenario, optional
         The scenario that the user expects to be flown; it is compared with that of the folder.
     sensor_model, estimator : optional
@@ -166,7 +166,7 @@ def resume(
     report : bool
         Whether to write the report.
     progress : Progress, optional
-        Shows the stages.
+        The display of the progress in stages.
     begun : callable, optional
         Called with the run folder before the first stage.
 
@@ -388,7 +388,7 @@ def check_scenario(
     Parameters
     ----------
     loaded_scenario : LoadedScenario
-        The scenario.
+        The scenario, as read from its file.
     overrides : Overrides or mapping, optional
         What differs from the file, as for `fly`.
 

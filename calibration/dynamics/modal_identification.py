@@ -215,7 +215,7 @@ def _modes_in_bands(
     identification : _Identification
         The poles of the record.
     limits : (M, 2) array
-        The bands [Hz].
+        The lowest and the highest frequency of each band [Hz].
     values_per_mode : int
         The number of modal values, 1 + A.
     """
@@ -423,7 +423,7 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
     Parameters
     ----------
     fit : DampedCosineFit
-        The fit.
+        The fitted waves of the record.
     number : int
         The number of the damped cosine.
 

@@ -124,7 +124,7 @@ def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     signal : (N,) array
         The signal, or its lowest or highest values.
     extreme : float

@@ -78,7 +78,7 @@ def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     start : float
         The instant after which the record begins [s].
 
@@ -203,7 +203,7 @@ def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     decay : float
         The decay rate lambda of the factor exp(-lambda t) on the record [1/s].
     """
@@ -342,7 +342,7 @@ def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
     Parameters
     ----------
     trials : Fits
-        The fitted trials.
+        The ring-down trials with their fitted modes.
     name : {"frequency", "damping_ratio"}
         The natural frequency [Hz] or the damping ratio [1].
     mode : {0, 1}

@@ -208,7 +208,7 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
     Parameters
     ----------
     trials : Fits
-        The fitted trials.
+        The ring-down trials with their fitted modes.
     frequency, ratio : float
         The mean frequency [Hz] and damping ratio [1] of the second mode in these fits.
     """
@@ -249,7 +249,7 @@ def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
     Parameters
     ----------
     fit : RingDownFit
-        A fitted record.
+        The record with its two fitted modes.
     delay : float
         The time by which the start is later [s].
 

@@ -336,7 +336,7 @@ def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -
     Parameters
     ----------
     model : ReducedModel
-        The wing.
+        The reduced model of the wing.
     limits : (3, 2) array
         The ranges of e [1], servo mass and pitot mass [kg].
     unit_points : (N, 3) array

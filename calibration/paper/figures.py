@@ -324,7 +324,7 @@ def _draw_densities(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     prior, exact, particle : ScalarPosterior
         The densities [SI].
     scale : float

@@ -210,7 +210,7 @@ def _tree(path: Path, content: bytes) -> xr.DataTree:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     content : bytes
         The hash of its content; a changed file is read again.
     """

@@ -465,7 +465,7 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     count : int
         The number of samples.
     seed : int
-        The seed.
+        The seed of the random numbers.
 
     Returns
     -------

@@ -83,9 +83,9 @@ def pair_log_likelihoods(
     Parameters
     ----------
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}
@@ -277,7 +277,7 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     Parameters
     ----------
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     stiffness : float
         The tip stiffness [N/m].
     """

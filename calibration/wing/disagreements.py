@@ -40,9 +40,9 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The calibration with its samples and readings.
     lab : LabData
-        The measurements.
+        The measurements of the laboratory.
     quality : FitQuality
         The residuals of the load test.
     """

@@ -50,7 +50,7 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
     Parameters
     ----------
     calibration : WingCalibration
-        The calibration.
+        The calibration of the wing, with its samples.
     folder : Path
         The folder of the files.
     report : bool
@@ -94,7 +94,7 @@ def _add_sections(
     page : Page
         The page, with the sections that every calibration has.
     calibration : WingCalibration
-        The calibration.
+        The calibration of the wing, with its samples.
     fields : WingFields
         The displacement fields of the wing on its mesh.
     folder : Path
@@ -258,7 +258,7 @@ def _draw_surface(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     points : (N, 3) array
         The nodes.
     triangles : (T, 3) array

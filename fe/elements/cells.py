@@ -151,7 +151,7 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
     density : (n,) array
         Density of each cell [kg/m^3].
     rule : Rule
-        Integration rule.
+        The points and weights of the integration in the reference cell.
 
     Returns
     -------
@@ -334,7 +334,7 @@ class CellMesh:
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         elasticity : (6, 6) or (n, 6, 6) array
             Elasticity in space [Pa].
         factor : (n, q) array, optional
@@ -363,7 +363,7 @@ class CellMesh:
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         density : (n,) array or float
             Their density [kg/m^3].
         rule : Rule, optional
@@ -391,7 +391,7 @@ class CellMesh:
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         blocks : callable
             Returns the element matrices of a slice of the cells.
         components : int

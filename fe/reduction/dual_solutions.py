@@ -118,7 +118,7 @@ def _project_duals(
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
+        The terms of the full model, and its loads and outputs.
     outputs : (n, O) array
         The outputs, whitened.
     directions : (O, n, M) array
@@ -142,7 +142,7 @@ def _project_batch(
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
+        The terms of the full model, and its loads and outputs.
     outputs : (n, b) array
         The outputs, whitened.
     displacements : (n, b, M) array

@@ -93,9 +93,9 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
     Parameters
     ----------
     operators : AffineOperators
-        The full model.
+        The finite element operators of the full wing.
     progress : Progress, optional
-        Where to report.
+        The display of the progress.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
     Parameters
     ----------
     full_model : PatchOperators
-        The full model.
+        The full model of the wing, with the rows that patches act on.
     loss : float
         The stiffness loss.
     """
@@ -155,7 +155,7 @@ def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray
     Parameters
     ----------
     full_model : PatchOperators
-        The full model.
+        The full model of the wing, with the rows that patches act on.
     modes : (n, m) array
         Its modes.
     """
@@ -194,7 +194,7 @@ def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[Floa
     Parameters
     ----------
     full_model : PatchOperators
-        The full model.
+        The full model of the wing, with the rows that patches act on.
     solutions : (n, S) array
         Solutions under the loads of `_snapshot_loads`, then the modes.
     """

@@ -59,11 +59,11 @@ def reduce_structure(
     Parameters
     ----------
     structure : AffineStructure
-        The full model.
+        The full finite element model.
     settings : StructureSettings, optional
         The accuracy that is asked for; by default that of the structure's design.
     progress : Progress, optional
-        Where to report.
+        The display of the progress.
 
     Returns
     -------
@@ -196,7 +196,7 @@ def measured_errors(
     Parameters
     ----------
     structure : AffineStructure
-        The full model.
+        The full finite element model.
     model : ReducedModel
         Its reduced model.
     states : int

@@ -146,7 +146,7 @@ def integrate_motion(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     laws : PortLaws
         The laws at its ports.
     steps : StepArrays

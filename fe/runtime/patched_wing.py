@@ -235,7 +235,7 @@ class PatchedWing(WingRows):
             Values of all inputs, in the order of `fe.runtime.state.wing_input_names`; those of the
             controls do not matter.
         patch : ModelPatch
-            The patch.
+            The primitive changes of the model.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
@@ -263,11 +263,11 @@ class PatchedStructure:
     Parameters
     ----------
     wing : PatchedWing
-        The wing.
+        The wing in its basis for patches.
     stiffness, mass : (n, n) array
         Its matrices in this state and under this patch.
     patch : ModelPatch
-        The patch.
+        The primitive changes of the model.
 
     Attributes
     ----------

@@ -89,7 +89,7 @@ def solve_static_position(
     goal, start : (J,) array
         Linear positions of the ports, and the positions from which to begin.
     ports : PortArrays
-        The laws.
+        The laws of forces at the ports.
     memory : (J, 5 + E) array
         Their memory; not changed.
     compliance : (J, J) array
@@ -180,7 +180,7 @@ def solve_port_position(
     port : int
         Leader of the laws that act there.
     ports : PortArrays
-        The laws.
+        The laws of forces at the ports.
     memory : (J, 5 + E) array
         Their memory, with the forces at the last position for laws of position. The new forces of
         the port's laws are written to it, and nothing else.

@@ -77,7 +77,7 @@ def step_boundaries(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     laws : PortLaws
         The laws at its ports.
     time : (N,) array
@@ -141,7 +141,7 @@ def loaded_steps(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     boundaries : Boundaries
         Boundaries of the K steps.
     begin_force, end_force : (K, M) array

@@ -75,7 +75,7 @@ class ModalIntegrator:
     Attributes
     ----------
     structure : StructureInMotion
-        The structure.
+        The structure whose motion is integrated.
     modes : ModeSet
         Its modes.
     damping_ratio : (M,) array

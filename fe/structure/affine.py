@@ -84,7 +84,7 @@ class AffineStructure:
     Attributes
     ----------
     design : StructureDesign
-        The design.
+        The design, as read from its file.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
     control_units : dict of str to str
@@ -340,7 +340,7 @@ def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
 
     Returns
     -------
@@ -371,7 +371,7 @@ def static_response(structure: AffineStructure, values: Mapping[str, float]) -> 
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
     values : mapping of str to float
         Parameters, losses, free masses and controls; the others are nominal, and healthy.
 
@@ -421,7 +421,7 @@ def natural_frequencies(
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
     count : int
         The number of modes.
     values : mapping of str to float, optional

@@ -67,7 +67,7 @@ def affine_fields(
     Parameters
     ----------
     design : StructureDesign
-        The design.
+        The design, as read from its file.
     expansion : csr (full, n)
         Free unknowns to all unknowns.
     mass : csr (full, full)

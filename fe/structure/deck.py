@@ -57,7 +57,7 @@ class Deck:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     words : DeckWords, optional
         The words of the dialect of a deck, in which the case of a name does not count.
 

@@ -59,7 +59,7 @@ def gauge_rows(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     gauges : tuple of Gauge
         The gauges.
 
@@ -117,7 +117,7 @@ def _averaging_points(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     gauge : Gauge
         The gauge.
     point, direction, normal : (3,) array
@@ -188,7 +188,7 @@ def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     count : int
         The largest number of rosettes; there are fewer if several would lie on one face.
 

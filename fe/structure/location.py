@@ -52,7 +52,7 @@ class _Parametrisation(NamedTuple):
     Attributes
     ----------
     cells : (n,) array of int
-        The cells.
+        The numbers of the cells.
     origin : (n, 3) array
         Local positions where the coordinates are zero.
     tangents : (n, t, 3) array
@@ -92,9 +92,9 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     where : str
         Begins the sentence on a point that lies outside.
 
@@ -148,9 +148,9 @@ def _nearest_points(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     parametrisation : _Parametrisation
         The allowed positions in n cells, by t coordinates.
     start : (n, t) array
@@ -188,9 +188,9 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     where : str
         Begins the sentence on a point that lies too far off.
 
@@ -237,9 +237,9 @@ def _nearest_on_faces(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     cells, face_numbers : (n,) array of int
         The cell of each face, and its number in the cell.
     """

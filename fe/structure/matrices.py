@@ -47,7 +47,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     Parameters
     ----------
     design : MatrixDesign
-        The design.
+        The design, as read from its file.
     folder : Path
         The folder of its files.
     design_hash : str
@@ -110,7 +110,7 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
     Parameters
     ----------
     design : MatrixDesign
-        The design.
+        The design, as read from its file.
     files : MatrixFiles
         The matrix files of the design, with R rows.
     can_move : (R,) array of bool
@@ -214,7 +214,7 @@ def _stiffness_terms(
     Parameters
     ----------
     design : MatrixDesign
-        The design.
+        The design, as read from its file.
     files : MatrixFiles
         The matrix files of the design, with R rows.
     whole_stiffness : sparse (R, R) array

@@ -204,7 +204,7 @@ def _read(path: Path, array_name: str) -> _FileContent:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     array_name : str
         The array or matrix in it; empty if it has one only.
     """

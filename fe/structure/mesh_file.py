@@ -140,7 +140,7 @@ def memory_estimate(mesh: StructureMesh) -> float:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     limit : float, optional
         The allowed memory [bytes]; by default what the machine has left.
 

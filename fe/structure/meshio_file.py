@@ -38,7 +38,7 @@ def read_by_meshio(path: Path) -> Deck:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _add_sets(
     deck : Deck
         The deck that they are added to.
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     kind : {"NSET", "ELSET"}
         Sets of nodes, or of elements.
     numbers : (n,) array
@@ -175,7 +175,7 @@ def _sets_of_values(
     Parameters
     ----------
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     label : str
         The name of the array, such as "gmsh:physical" or "cell_tags".
     arrays : sequence of (n,) array
@@ -213,7 +213,7 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
     Parameters
     ----------
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     label : str
         The name of the array.
     value : int

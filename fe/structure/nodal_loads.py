@@ -34,7 +34,7 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
     Parameters
     ----------
     mesh : CellMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     surface : Surface
         The faces.
     """
@@ -65,7 +65,7 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     load : MeshLoad
         The load.
     where : str
@@ -99,7 +99,7 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     port : MeshPort
         The port.
     where : str
@@ -136,7 +136,7 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (float, float, float)
         The point, in the unit of length of the mesh.
     where : str

@@ -43,7 +43,7 @@ class Structure(AffineStructure):
     Attributes
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     body : Body
         Its mesh with materials and supports.
     material_of : (nc,) array of int
@@ -72,7 +72,7 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     Parameters
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     file : Path
         Its file; the design may name the mesh relative to it.
 
@@ -102,7 +102,7 @@ def _part_of_cells(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     labelled : list of (str, Material or Damage)
         The parts, each with its key in the file.
     kind : str
@@ -169,7 +169,7 @@ def load_and_assemble(
     Parameters
     ----------
     file : Path or str
-        The structure file.
+        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
     mass_as_stiffness : bool
@@ -262,7 +262,7 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
     Parameters
     ----------
     file : Path or str
-        The structure file.
+        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
 
@@ -320,7 +320,7 @@ def write_structure_vtu(
     path : Path or str
         The file to write.
     structure : Structure
-        The structure.
+        The mesh, matrices and loads of the structure.
     values : mapping of str to float, optional
         Parameters, losses, free masses and controls by name; the others are nominal, and healthy.
 
@@ -367,7 +367,7 @@ def write_vtu(
     Parameters
     ----------
     path : Path or str
-        The file.
+        The path of the file.
     points : (nn, 3) array
         Positions of the nodes [m].
     cells : (str, (nc, k) array of int)

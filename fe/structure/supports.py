@@ -129,9 +129,9 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
     Parameters
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     mesh : StructureMesh
-        Its mesh.
+        The mesh of the structure, with its nodes in metres.
 
     Raises
     ------

@@ -75,7 +75,7 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
     folder : Path
         The folder in which CalculiX writes its files.
     modes : int
-        Number of modes.
+        The number of lowest modes to compare.
 
     Raises
     ------

@@ -327,7 +327,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
     Parameters
     ----------
     structure : Structure
-        The structure.
+        The mesh, matrices and loads of the structure.
 
     Raises
     ------
@@ -367,7 +367,7 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     state : DigitalState
         Its state.
     """

@@ -87,7 +87,7 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     load_factor : float
         The load factor of the turn.
 
@@ -153,7 +153,7 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     refinements : sequence of float
         The refinements of the meshes.
 
@@ -243,7 +243,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     jobs : Path
         Where CalculiX works.
     quick : bool
@@ -279,7 +279,7 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()
@@ -311,7 +311,7 @@ def convergence_checks(
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
     limited : bool
@@ -351,7 +351,7 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     jobs : Path
         Where CalculiX works.
     """

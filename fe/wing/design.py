@@ -348,7 +348,7 @@ def load_design(path: Path | str | None = None) -> WingDesign:
     Parameters
     ----------
     path : Path or str, optional
-        The file.
+        The path of the file.
 
     Raises
     ------

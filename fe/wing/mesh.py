@@ -266,7 +266,7 @@ def _grid_points(
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
     across : (ny + 1,) array
         Mesh lines across the span [m].
     along : tuple of MeshLine
@@ -355,7 +355,7 @@ def build_mesh(design: WingDesign) -> WingMesh:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------

@@ -164,7 +164,7 @@ def span_lines(design: WingDesign) -> FloatArray:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Returns
     -------
@@ -238,7 +238,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------

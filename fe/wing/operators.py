@@ -147,7 +147,7 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
     Parameters
     ----------
     mesh : WingMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     distance : float
         Distance from the root [m].
     chord_fraction : float
@@ -300,7 +300,7 @@ def _assemble_wing(design: WingDesign) -> AffineOperators:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------
@@ -338,7 +338,7 @@ def wing_values(
     Parameters
     ----------
     wing : AffineWing
-        The wing.
+        The affine operators of the wing.
     young_modulus_factor, stiffness_loss
         As in `fe.runtime.state.DigitalState`.
     **others : float
@@ -357,7 +357,7 @@ def flapwise_bending_modes(wing: AffineWing, modes: NaturalModes) -> IntArray:
     Parameters
     ----------
     wing : AffineWing
-        The wing.
+        The affine operators of the wing.
     modes : NaturalModes
         At least three modes, from `natural_frequencies`.
 

@@ -358,7 +358,7 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
     Parameters
     ----------
     planform : Planform
-        The half-wing.
+        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
 
@@ -385,7 +385,7 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
     Parameters
     ----------
     planform : Planform
-        The half-wing.
+        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
     terms : int

@@ -90,7 +90,7 @@ class PatchOperators:
     Attributes
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     layout : WingLayout
         What has no unknowns.
     line_rows : LineRows
@@ -182,7 +182,7 @@ def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     """
     mesh = operators.wing_mesh
     design = mesh.design

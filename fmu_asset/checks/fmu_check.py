@@ -23,7 +23,7 @@ class FmuCheck:
     Attributes
     ----------
     path : Path
-        The FMU.
+        The path of the FMU file.
     findings : tuple of Finding
         Findings in the order in which they were made.
     """
@@ -57,7 +57,7 @@ def check_fmu(
     Parameters
     ----------
     path : path-like
-        Any FMU.
+        The path of any FMU file.
     binding : Binding or path-like, optional
         The binding with which the FMU is run; by default it is drafted from the model description.
     cycles : int

@@ -53,9 +53,9 @@ class RunChecks:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     binding : Binding
-        The binding.
+        The binding of the FMU.
     step_timeout, memory_limit : float or None
         Limits of the workers, as in `FmiAsset`.
 

@@ -283,7 +283,7 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
     Parameters
     ----------
     path : path-like
-        The file.
+        The path of the file.
 
     Raises
     ------
@@ -296,14 +296,14 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
 
 
 def parse_binding(content: Mapping[str, object], *, where: str = "the binding") -> Binding:
-    """Return the binding in the content of a TOML file, checked.
+    """Return the checked binding that the content of a TOML file describes.
 
     Parameters
     ----------
     content : mapping of str to object
-        The content.
+        The tables and keys of the file.
     where : str
-        Where it comes from, for messages.
+        The origin of the content, which begins messages: the path of the file.
 
     Raises
     ------

@@ -45,7 +45,7 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     step_size : float, optional
         Communication step size [s]; that of the FMU's default experiment, or 1.
 
@@ -112,7 +112,7 @@ def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> l
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     usable : sequence of VariableInfo
         Variables that a binding can name.
 
@@ -192,7 +192,7 @@ def _ports(variables: Sequence[VariableInfo]) -> dict[str, PortVariables]:
 
 
 def _is_port(variables: PortVariables) -> bool:
-    """Return whether variables form a port: the force is the only one of its causality."""
+    """Return whether variables form a port: one force, and motions of the other causality."""
     if len(variables) < 2 or "force" not in variables:
         return False
     causalities = [variable.causality for variable in variables.values()]
@@ -224,7 +224,7 @@ class _NumberedName(NamedTuple):
 
 
 def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
-    """Return the parts of the name of a scalar with a number in its name; None for another."""
+    """Return the name of a scalar, split at the number in it; None for any other variable."""
     if variable.shape:
         return None
     match = _NUMBERED.fullmatch(variable.name)
@@ -234,7 +234,7 @@ def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
-    """Return variables in groups: those with successive numbers and equal units form one."""
+    """Return variables in groups; a group has successive numbers and equal units."""
     groups: list[list[VariableInfo]] = []
     expected_name: _NumberedName | None = None
     for variable in variables:

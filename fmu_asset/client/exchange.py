@@ -24,9 +24,9 @@ class Exchange:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     binding : Binding
-        The binding.
+        The binding of the FMU.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class Exchange:
 
 
 def _check_version(description: FmuDescription, binding: Binding) -> None:
-    """Refuse an FMU of another version of FMI than the binding states."""
+    """Refuse an FMU whose version of FMI is not the one that the binding states."""
     version = binding.binding.fmi_version
     if version is not None and version[0] != description.fmi_version[0]:
         raise BindingError(

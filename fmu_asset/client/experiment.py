@@ -58,7 +58,7 @@ def default_experiment(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     stop_time : float, optional
         The end [s]. By default it is the FMU's own, or one second after the start.
     step_size : float, optional
@@ -110,7 +110,7 @@ def _values_of_variables(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     values : mapping of str to float, str or list
         The values or their texts, by variable name.
     settable : sequence of str
@@ -141,7 +141,7 @@ def _selected(values: Mapping[str, PlainValue], names: Collection[str]) -> dict[
 
 
 def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
-    """Return the value that a text, such as one typed by a user, means for a variable.
+    """Convert a text, such as a user's input, to a value of a variable.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def ending_with_histories(binding: Binding, steps: int) -> Binding:
     Parameters
     ----------
     binding : Binding
-        The binding.
+        The binding of the FMU.
     steps : int
         The number of rows of the file.
     """
@@ -282,7 +282,7 @@ def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> Obs
     Parameters
     ----------
     asset : FmiAsset
-        The asset.
+        The asset, which steps the FMU.
     steps : int
         The number of rows, N.
     histories : dict of str to dict of str to (N,) or (N, n) ndarray
@@ -346,12 +346,12 @@ def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) ->
 
 
 def run_experiment(asset: FmiAsset, experiment: FmuExperiment) -> ObservationHistory:
-    """Return the outputs of an asset at the start of an experiment and after each of its steps.
+    """Return the outputs of an asset at the start of an experiment, and after each step.
 
     Parameters
     ----------
     asset : FmiAsset or CoupledAsset
-        The asset.
+        The asset, which steps the FMU.
     experiment : FmuExperiment
         Steps, parameters and inputs; the inputs hold already during the initialisation.
 

@@ -52,7 +52,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     binding : Binding
         The binding, with the names and units of the inputs.
 
@@ -147,7 +147,7 @@ def _column_meaning(
 
 
 def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: Path) -> Float:
-    """Return the history of an input, from one column or from those of its elements.
+    """Return the history of an input from its own column, or from the columns of its elements.
 
     Returns
     -------
@@ -174,13 +174,13 @@ def write_history(
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     asset : FmiAsset
         The asset that was simulated.
     source : (str, str)
         Name and SHA-256 of its FMU file.
     history : ObservationHistory
-        The outputs.
+        The outputs of the FMU in each step.
 
     Raises
     ------

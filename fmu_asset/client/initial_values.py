@@ -144,7 +144,7 @@ class InitialValueTable:
     # ------------------------------------------------------------------ names
 
     def _parameter_slot(self, name: str) -> InputSlot:
-        """Return the slot of a numeric parameter by its name in the binding, or else in the FMU."""
+        """Return the slot of a numeric parameter, named as in the binding or as in the FMU."""
         if name in self._parameter_slots:
             return self._parameter_slots[name]
         resolver = self._resolver
@@ -159,7 +159,7 @@ class InitialValueTable:
         return resolver.start_slot(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
-        """Return the text parameter of a name in the binding, or else in the FMU, if it is one."""
+        """Return the text parameter that the binding or the FMU has under a name; None if neither has."""
         if name in self._text_parameters or name in self._parameter_slots:
             return self._text_parameters.get(name)
         variable = self._resolver.description.variable(name)

@@ -35,12 +35,12 @@ class ExtractedFmu:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
 
     Attributes
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     users : int
         The number of instances that run from it.
 
@@ -62,7 +62,7 @@ class InstanceHost:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     plan : Plan
         What is exchanged; its folder is still empty.
     limits : WorkerLimits
@@ -224,7 +224,7 @@ class InstanceHost:
         return method >= trial.method and not cannot_be_verified
 
     def _instance_restarted_by(self, restart: Callable[[], Instance]) -> Instance | None:
-        """Return the instance after a restart, or None if its first step shows that this failed.
+        """Return the instance after a restart, or None if the first step shows a failed restart.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class InstanceHost:
         return None
 
     def _reset_instance(self) -> Instance:
-        """Reset the instance by the FMU's own function; record it if the FMU refuses."""
+        """Reset the instance by the FMU's own function; record the refusal if the FMU refuses."""
         assert self.instance is not None
         try:
             self.instance.reset()

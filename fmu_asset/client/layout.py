@@ -43,7 +43,7 @@ def find_variable(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     name : str
         A variable, or an element of an array such as `p[3]`.
     label : str
@@ -150,7 +150,7 @@ class BlockLayout:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     variables : sequence of VariableInfo
         Variables that are exchanged. A variable that is named twice is in the block once.
     begin : int

@@ -53,7 +53,7 @@ class ObservationHistory:
 
 
 def joined_histories(parts: Sequence[ObservationHistory]) -> ObservationHistory:
-    """Return the history of steps that were made in several parts, one after the other."""
+    """Return one history from histories of consecutive steps."""
     extra_histories = {}
     for name in parts[0].extra:
         extra_histories[name] = np.concatenate([part.extra[name] for part in parts])

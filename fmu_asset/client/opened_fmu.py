@@ -365,13 +365,13 @@ class OpenedFmu:
         self._phase = "ready"
 
     def _use_instance(self, instance: Instance) -> None:
-        """Use an instance, through views of its two blocks that are fast to write and read."""
+        """Take an instance into use, with fast views of the blocks of its request and its reply."""
         self._instance = instance
         self._request = memoryview(instance.request).cast("B").cast("d")
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
 
     def _replaced_instance(self, request: bytes, reply: Float) -> Instance | None:
-        """Return another instance if the first step shows that the reset of this one did not work.
+        """Return a new instance if the first step shows that the reset of the present one failed.
 
         Parameters
         ----------
@@ -455,7 +455,7 @@ class OpenedFmu:
         Parameters
         ----------
         error : FmuError
-            The error.
+            The error that the FMU or its worker raised.
         action : str
             What was done, such as "the start".
         """

@@ -44,7 +44,7 @@ class BindingResolver:
     description : FmuDescription
         The FMU, with the array sizes of the binding.
     binding : Binding
-        The binding.
+        The binding of the FMU.
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:

@@ -209,7 +209,7 @@ class FmiAsset(SteppedFmu):
         return 8 * self._exchange.plan.input_count
 
     def _refuse_foreign(self, saved_state: SavedState) -> None:
-        """Refuse a saved state that belongs to another FMU or binding, or is damaged."""
+        """Refuse a saved state that another FMU or binding has made, or that is damaged."""
         if saved_state.fmu != self.description.sha256:
             raise FmuStateError(
                 f"The state was saved with another FMU than {self.description.label} (its hash "

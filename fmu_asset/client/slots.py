@@ -142,7 +142,7 @@ class InputSlot(NamedTuple):
         return True
 
     def _check_count(self, array: Float, values: npt.ArrayLike) -> None:
-        """Refuse an array of another number of values than the input has."""
+        """Refuse an array whose number of values is not that of the input."""
         count = len(self.positions)
         if array.size == count:
             return

@@ -482,7 +482,7 @@ def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> 
 def _in_continuous_time(
     system: DiscreteSystem, first_outputs: FloatArray, step: float
 ) -> FmuStateSpace:
-    """Return the continuous-time system whose samples are those of a discrete-time system.
+    """Return the continuous-time system that has the samples of a discrete-time system.
 
     Forces are constant during a step (zero-order hold).
 

@@ -80,7 +80,7 @@ class SteppedFmu(OpenedFmu):
         return self._observation()
 
     def _repeat_first_step_if_contradicted(self) -> None:
-        """Repeat the first step in a new instance, if it shows that the reset has not worked.
+        """Repeat the first step in a new instance, if the step shows that the reset has failed.
 
         The host replaces the instance until it has one that was properly at its start.
         """
@@ -283,7 +283,7 @@ class SteppedFmu(OpenedFmu):
     def _run_and_check_start(
         self, requests: Float, replies: Float, counter: "_StepCounter"
     ) -> FmuError | None:
-        """Make a block of steps; repeat it in a new instance if a reset proves not to have worked.
+        """Make a block of steps; repeat it in a new instance if a reset proves to have failed.
 
         Parameters
         ----------

@@ -87,7 +87,7 @@ def conversion(
 def _conversion_from_display_unit(
     display_unit: str, unit: str, definitions: Sequence[UnitInfo]
 ) -> Conversion | None:
-    """Return the conversion from a display unit of a unit to that unit; None if it is none."""
+    """Return the conversion from a display unit to its unit; None if the unit does not have it."""
     definition = next(
         (unit_definition for unit_definition in definitions if unit_definition.name == unit), None
     )
@@ -158,7 +158,7 @@ def between(
 
 
 def meaning(unit: str, definitions: Sequence[UnitInfo]) -> Meaning | None:
-    """Return the meaning of a unit in SI: by its definition if there is one, else as is common.
+    """Return the meaning of a unit in SI: that of the FMU's definition, or else the common one.
 
     None if the unit is unknown.
     """

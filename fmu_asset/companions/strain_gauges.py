@@ -86,7 +86,7 @@ class StrainGaugesBehaviour:
         return outputs
 
     def _outputs(self, time: float, strains: Sequence[float], reading_number: int) -> list[float]:
-        """Return the readings, then for each gauge 1 if it is received and 0 if it is lost."""
+        """Return the readings, followed by one number for each gauge: 1 if received, 0 if lost."""
         # systematic errors
         readings = []
         for gain, strain, offset in zip(self._gains, strains, self._offsets, strict=True):

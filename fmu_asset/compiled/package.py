@@ -169,7 +169,7 @@ def compiled_members(
     Parameters
     ----------
     model : ReducedArrays
-        The reduced structure.
+        The reduced model of the structure.
     declaration : Declaration
         What the FMU declares for co-simulation.
     roles : StructureRoles

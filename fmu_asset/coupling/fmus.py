@@ -203,7 +203,7 @@ class CoupledFmus(InstanceHost):
     # instance
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
-        """Initialise the components in order; each takes the initial outputs of those before it.
+        """Initialise the components in order, each with the initial outputs of its predecessors.
 
         An input whose source comes later starts at the FMU's own start value.
 
@@ -344,7 +344,7 @@ class CoupledFmus(InstanceHost):
         Parameters
         ----------
         component : SteppedComponent
-            The component.
+            The component of the coupled system.
         outputs, outputs_before : (O,) array
             All outputs, now and at the beginning of the step.
         """
@@ -362,7 +362,7 @@ class CoupledFmus(InstanceHost):
         Parameters
         ----------
         component : SteppedComponent
-            The component.
+            The component of the coupled system.
         fed_values : dict of str to float
             The ends of the lines by input; changed by this call.
         source_outputs : (O,) array
@@ -389,7 +389,7 @@ class CoupledFmus(InstanceHost):
         return begins
 
     def _iterate(self, group: Sequence[str]) -> None:
-        """Repeat the step of a circle of components until what they exchange has settled.
+        """Repeat the step of a circle of components until the exchanged values have converged.
 
         Raises
         ------

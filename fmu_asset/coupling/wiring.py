@@ -147,7 +147,7 @@ class Wiring:
         self.schedule: Schedule = schedule(names, immediate, self._used_feedthrough())
 
     def _used_feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the direct inputs of outputs, and of other variables that a connection reads."""
+        """Return the inputs that act at once on each output and on other variables that are read."""
         sources = {connection.source for connection in self.structure.connections}
         used_inputs: dict[str, dict[str, frozenset[str]]] = {}
         for component, description in self.declared.items():
@@ -243,7 +243,7 @@ class Wiring:
             self.units[connector] = unit
 
     def _source(self, connection: Connection) -> VariableInfo:
-        """Return the variable or connector at the source of a connection, if it can be one."""
+        """Return the variable or connector at the source of a connection; refuse any other end."""
         source = connection.source
         if source.component:
             requirement = "an output of a single number is needed"
@@ -339,7 +339,7 @@ class Wiring:
         Parameters
         ----------
         component : Component
-            The component.
+            The component of the coupled system.
         leave_out_unknown : bool
             Whether those of unknown variables are added to `left_out` instead of refused.
         """

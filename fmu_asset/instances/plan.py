@@ -193,7 +193,7 @@ class GroupArguments(NamedTuple):
 
 
 def values_of(block: DoubleBlock) -> Float:
-    """Return a C array of doubles as an array that shares its memory."""
+    """Return an array that shares the memory of a C array of doubles."""
     return np.frombuffer(memoryview(block).cast("B"))
 
 

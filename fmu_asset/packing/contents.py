@@ -51,7 +51,7 @@ class FmuInfo:
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     guid : str
         The GUID, which follows from the content.
     design_hash : str
@@ -296,7 +296,7 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Replace the placeholder in the files of an FMU by their hash, and pack them into an archive.
+    """Put the hash of an FMU's files in the place of the placeholder, and pack the files.
 
     The hash is taken over the names and contents of the files with the placeholder, so that equal
     files give equal bytes.

@@ -213,7 +213,7 @@ class Slave:
         return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
-        """Return whether a step is possible now; if not, refuse it with a message."""
+        """Return whether a step is possible now; if it is not, log a message that says why."""
         if self._phase != READY:
             phase = _PHASE_NAMES[self._phase]
             return self._refuse(Status.BAD_CALL, f"a step was asked for {phase}")

@@ -42,7 +42,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
     Parameters
     ----------
     path : path-like
-        The file.
+        The path of the file.
     folder : path-like
         The folder for its FMUs; made if it is missing.
 
@@ -367,7 +367,7 @@ class _SystemReader:
         return chain
 
     def _set_from_chain(self, target: Endpoint, chain: list[Connection]) -> None:
-        """Give an end the value that is set at a connector on the way to it.
+        """Set the value at the end of a chain of connections that is set at a connector on its way.
 
         Of several such connectors the outermost one counts.
         """
@@ -386,7 +386,7 @@ class _SystemReader:
             return
 
     def _joined(self, chain: list[Connection]) -> Connection:
-        """Return one connection for those that follow one another through nested systems."""
+        """Return one connection in the place of a chain of connections through nested systems."""
         source, target = chain[0].source, chain[-1].target
         scale = reduce(Conversion.then, (connection.scale for connection in chain))
         has_units_on_the_way = any(

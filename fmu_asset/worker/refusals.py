@@ -54,7 +54,7 @@ class RefusalReport:
 
     @property
     def counts(self) -> dict[RefusalKind, tuple[int, str]]:
-        """Number of refused calls of each kind, and the first of each."""
+        """How many calls of each kind were refused, and a description of the first one."""
         refused_calls: dict[RefusalKind, tuple[int, str]] = self._record.get("refused", {})
         return refused_calls
 

@@ -271,7 +271,7 @@ def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
 def _wait_for_end(
     worker: _Worker, twin: _Twin, tracer: "RefusalTracer | None", statuses: dict[int, int]
 ) -> bool:
-    """Wait for the end of the worker; return whether the twin had left it before.
+    """Wait for the end of the worker; return whether the twin had ended before the worker.
 
     The twin has left it if it has ended or closed its pipe. The worker is then killed unless it
     ends soon. A traced worker stops at each of its system calls until it is resumed here. The
@@ -282,7 +282,7 @@ def _wait_for_end(
     worker : _Worker
         The worker.
     twin : _Twin
-        The twin.
+        The process of the twin, which started this one.
     tracer : RefusalTracer or None
         Counts the refusals of the worker.
     statuses : dict of int to int

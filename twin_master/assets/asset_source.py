@@ -208,7 +208,7 @@ class FlownAndBelieved:
 def calibration_sentence(
     record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence on the model that was calibrated, and whether it is the believed one.
+    """Return a sentence that says which model was calibrated, and whether the twin believes it.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class AssetSource:
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : FileSection, optional
         The table of the scenario that names the files.
     """
@@ -316,7 +316,7 @@ class AssetSource:
         Parameters
         ----------
         folder : Path
-            The run folder.
+            The path of the run folder.
         progress : Progress
             Receives reports on the progress.
 

@@ -275,7 +275,7 @@ class _SpanLocation(NamedTuple):
 
 
 def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation | None:
-    """Return the location of a change of the model along the span; None if it has none."""
+    """Return where along the span a change of the model acts; None if it acts at no one place."""
     span = wing.planform.semi_span
     # Masses and forces may lie beyond the tip, by the fraction OVERHANG of the span.
     farthest = (1.0 + OVERHANG) * span
@@ -358,7 +358,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
     def _pack(self, progress: Progress) -> None:
-        """Pack the wing as the FMU in the run folder, at its calibrated values if it has any."""
+        """Pack the wing, with its calibrated values if it has any, as the FMU in the run folder."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
         options: Tailoring = {}
@@ -477,9 +477,9 @@ def strain_predictor(
     Parameters
     ----------
     wing : ReducedModel
-        The wing.
+        The reduced model of the wing.
     patch : PatchFile
-        The effects.
+        The primitive changes by which the effects act on the model.
     patch_arrays : PatchArrays, optional
         The wing in the basis for patches; None if the effects do not need it.
     """

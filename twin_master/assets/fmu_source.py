@@ -219,7 +219,7 @@ class FmuAsset(Asset):
 
 
 def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[str, str]:
-    """Return for each FMU variable a name under which the run's NetCDF file can store it.
+    """Return the name of each FMU variable in the run's NetCDF file, which allows fewer characters.
 
     `/` would make a group in that file; it and unprintable characters become `_`. A name that is
     reserved or used already gets `_` at its end until it is unique.
@@ -242,7 +242,7 @@ class FmuSource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : FmuSection
         The table `asset` of the scenario.
     """
@@ -406,7 +406,7 @@ class FmuSource(AssetSource):
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of a role; refuse another number of values than in the scenario."""
+        """Return the positions of the values of a role, if they are as many as in the scenario."""
         expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
@@ -547,7 +547,7 @@ class ScriptSource(FmuSource):
         return {**read_files(other_files), FMU_COPY: script_fmu(script).content}
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Pack the FMU in the scratch folder; return the binding with its lengths of arrays."""
+        """Pack the FMU in the scratch folder; return the binding with the lengths of its arrays."""
         packed_fmu = scratch / "asset.fmu"
         packed_fmu.write_bytes(self.files()[FMU_COPY])
         return FmiAsset(packed_fmu, binding, parameters=self.parameters()).binding

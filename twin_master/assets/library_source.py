@@ -205,7 +205,7 @@ class ObservationLibrary:
             raise self._other_parameter_error(name)
 
     def _other_parameter_error(self, name: str) -> MissionInputError:
-        """Return the error that the library has another parameter than the scenario."""
+        """Return the error for a library whose parameter is not that of the scenario."""
         return MissionInputError(
             f"the observation library was sampled over the parameter {self.parameter or 'none'}, "
             f"and the scenario calibrates {name}: {_ADVICE}"
@@ -276,7 +276,7 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     Parameters
     ----------
     path : Path
-        The NetCDF file.
+        The path of the NetCDF file.
     library : ObservationLibrary
         The library.
 
@@ -299,7 +299,7 @@ def load_observation_library(path: Path) -> ObservationLibrary:
     Parameters
     ----------
     path : Path
-        The NetCDF file.
+        The path of the NetCDF file.
 
     Raises
     ------
@@ -365,7 +365,7 @@ class LibrarySource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : LibraryBelief
         The table `belief` of the scenario.
     flown : FmuSource

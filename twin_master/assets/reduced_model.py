@@ -312,7 +312,7 @@ class ReducedModelSource(NamedStructure):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     model : ReducedModel, optional
         The reduced model of a wing, if it exists already.
     section : FileSection, optional

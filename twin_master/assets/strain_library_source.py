@@ -253,7 +253,7 @@ class StrainLibrarySource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     library : StrainLibrary
         The library.
     path : Path, optional
@@ -288,7 +288,7 @@ class StrainLibrarySource(AssetSource):
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return the library's own samples of its parameter."""
+        """Return the values of the parameter at which the library was sampled."""
         values = self._library.young_modulus_factor
         return ParameterDraws(
             name=self._scenario.calibration.parameter,

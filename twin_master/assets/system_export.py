@@ -44,7 +44,7 @@ def export_scenario(
     Parameters
     ----------
     loaded_scenario : LoadedScenario
-        The scenario.
+        The scenario, as read from its file.
     out : Path
         The file to write.
     seed : int, optional
@@ -184,7 +184,7 @@ def _with_values(
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     binding : Binding
         The binding of the system.
     parameters, load : mapping of str to float

@@ -152,7 +152,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
 
 @cache
 def program_version() -> str:
-    """Return a hash of this program, of Python and of the packages on which results depend."""
+    """Return a hash of this program, Python and all packages that can change results."""
     provenance = collect_provenance().as_dict()
     python = list(sys.version_info[:2])
     return hash_record([provenance["versions"], provenance["source_hashes"], python])
@@ -177,7 +177,7 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
 
 @contextmanager
 def _connected_client(engine: Engine) -> "Iterator[Client]":
-    """Return a context with a client of the cluster, or of local workers that end with it."""
+    """Return a context with a client of the cluster, or of local workers that the context ends."""
     import dask
 
     # Importing `distributed` adds its defaults to the configuration. That must happen before the

@@ -86,7 +86,7 @@ def _evidence_at_points(
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
-    """Return the reason why transitions of a scenario cannot be learnt; empty if they can."""
+    """Return why the transitions of a scenario cannot be learnt; an empty text if they can."""
     if scenario.transition.kind != _LEARNABLE_KIND:
         return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
     count = len(_assumed_probabilities(scenario))
@@ -112,7 +112,7 @@ class _Cause(NamedTuple):
 
 
 def _assumed_probabilities(scenario: Scenario) -> dict[_Cause, float]:
-    """Return the probabilities to worsen of a scenario, in the order of its controls."""
+    """Return the probability of worsening that a scenario assumes for each of its controls."""
     probabilities = {}
     for control in scenario.control_names:
         entry = scenario.transition.probability[control]
@@ -214,14 +214,14 @@ class TransitionFamily:
 
 
 def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists:
-    """Return the predecessor lists of a scenario with this value of all probabilities to worsen."""
+    """Return the predecessor lists of a scenario whose probabilities of worsening are all equal."""
     equal_probabilities = {"probability": dict.fromkeys(scenario.control_names, probability)}
     transition = scenario.transition.model_copy(update=equal_probabilities)
     return _predecessors(scenario.model_copy(update={"transition": transition}))
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return for each entry of the lists the index of its probability to worsen, (non-zeros,).
+    """Return for each entry of the lists, (non-zeros,), the index of its probability of worsening.
 
     Rows of the lists are ordered by factor, then by control, then by level.
     """
@@ -273,7 +273,7 @@ def scaled_likelihood(
 
 
 def _scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return the likelihood divided by its largest value in each step, from its log (B, T, S)."""
+    """Return likelihoods divided by the largest of each step, from their logarithms (B, T, S)."""
     largest = log_likelihood.max(axis=2, keepdims=True)
     return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
 

@@ -246,7 +246,7 @@ def prepare_kit(
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     folder : Path
         The folder of the prepared knowledge; files are written to it.
     is_real : bool
@@ -307,7 +307,7 @@ class Shard(NamedTuple):
 
 
 def _shards(fleet: Fleet) -> Iterator[Shard]:
-    """Yield the shards of a fleet in the order of its groups and of their members.
+    """Yield the shards of a fleet, group by group, each with its members in order.
 
     If the members have different scenarios, each is a shard of its own.
     """
@@ -330,7 +330,7 @@ class _FleetFlight:
     Parameters
     ----------
     fleet : Fleet
-        The fleet.
+        The plan of the fleet.
     folder : Path
         The folder of the fleet.
     journal : JournalFile
@@ -358,7 +358,7 @@ class _FleetFlight:
         return _ShardCounts(flown=len(remaining), kept=len(shards) - len(remaining))
 
     def _remaining(self, shards: Sequence[Shard]) -> list[Shard]:
-        """Return the shards of which not all twins are in the store.
+        """Return the shards with twins that are missing in the store.
 
         The rows of single twins are compared, because the twins of a shard are stored one by one if
         workers died over it.
@@ -375,7 +375,7 @@ class _FleetFlight:
         return remaining
 
     def _pieces(self, shards: Sequence[Shard]) -> Iterator[Piece]:
-        """Yield the shards with all that workers need to fly them.
+        """Yield the shards, each with the knowledge and the recordings that a worker needs.
 
         If the scenario of a single asset, with its own FMU or calibration, cannot be prepared, the
         asset is stored as failed and the other shards are flown.
@@ -433,12 +433,12 @@ class _FleetFlight:
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:
-    """Return sentences by GROUP/NAME of the twin, given sentences by its name alone."""
+    """Return sentences by GROUP/NAME of a twin, given sentences by the name of the twin alone."""
     return {f"{group.name}/{name}": sentence for name, sentence in sentences.items()}
 
 
 def _with_recording(group: Group, member: Member) -> Member:
-    """Return a member with the messages of its real asset, so that workers read no files."""
+    """Return a member with the recorded messages of its asset, so that workers read no files."""
     if not group.observations or member.file is None:
         return member
     messages = file_feed(member.file, group.scenarios[0]).messages(None)

@@ -213,7 +213,7 @@ def _lessons_of_groups(
 
 
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
-    """Return the records of all groups, and of the distribution of probabilities that they share.
+    """Return the records of all groups, and of the distribution of probabilities common to them.
 
     They share one if several groups have learnt the same one or two probabilities to worsen.
     """
@@ -349,7 +349,7 @@ def _observations(
 
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
-    """Return the controls under which a twin in the rows has flown a step that is not its last."""
+    """Return the controls under which a twin in the rows has flown a step before its last one."""
     control = stored_values(group, "observed/control_index").astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
@@ -358,7 +358,7 @@ def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequenc
 def _explained_steps(
     observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
 ) -> list[_WeighedSteps]:
-    """Return the likelihoods of the twins whose observations have a probability above 0.
+    """Return the likelihoods of the twins whose observations are possible under the model.
 
     The likelihoods are computed with a factor on the assumed noise.
     """
@@ -459,7 +459,7 @@ def with_noise_factor(
 def _noise_factor(
     observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
 ) -> Distribution:
-    """Return the posterior of the factor on the assumed noise; its logarithm has a uniform prior.
+    """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
 
     The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
     it in each step separately would attribute a part of the noise to the parameter. With nodes, the

@@ -14,7 +14,7 @@ _LETTERS = "abcdefgh"
 
 @style.publication_style()
 def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
-    """Draw the map of the assets of a group: a panel for each factor of the state.
+    """Draw a group's assets as a map, with a panel for each factor of the state.
 
     In each panel one cell for each asset has the colour of the factor's value. The cells are in
     descending order of severity of damage, row by row; assets that failed in flight, and assets

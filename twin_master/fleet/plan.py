@@ -279,7 +279,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
     Parameters
     ----------
     path : Path or str
-        The TOML file.
+        The path of the TOML file.
     seed : int, optional
         A seed that replaces the one of the file.
 

@@ -200,7 +200,7 @@ def _relevant_range(
 
 
 def _is_fine(axis: Float, marginal: Float) -> bool:
-    """Return whether the spacing of an axis suits the deviation of its marginal, an (N,) array."""
+    """Return whether the points of an axis lie close enough for its marginal distribution (N,)."""
     step = axis[1] - axis[0]
     mean = marginal @ axis
     deviation = np.sqrt(marginal @ (axis - mean) ** 2)

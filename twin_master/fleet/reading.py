@@ -129,7 +129,7 @@ def _mean(values: Float) -> Estimated:
 
 
 def _root(mean_square: Estimated) -> Estimated:
-    """Return the root r of a mean square, with its first-order error: d(r^2) / (2 r)."""
+    """Return the root r of a mean square, with the first-order standard error d(r^2) / (2 r)."""
     root = float(np.sqrt(mean_square.value))
     return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
@@ -163,7 +163,7 @@ def open_fleet(folder: Path | str) -> "xr.DataTree":
 
 
 def notice_counts(group: "xr.DataTree", kind: str) -> Index:
-    """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
+    """Return how many notices of a kind each of the B twins in a group gave: (B,)."""
     return np.asarray(
         stored_values(group, "notice/count")[:, NOTICE_KINDS.index(kind)], dtype=np.int64
     )
@@ -345,7 +345,7 @@ def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree"
 
 
 def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
-    """Return counts of the twins of a group, and figures of their outcomes, by title.
+    """Return counts of a group's twins, and the figures of their outcomes, by title.
 
     The figures are means over the twins with their standard errors; a group without a flown twin
     has counts alone. Figures that need the true state are left out for real assets.

@@ -155,7 +155,7 @@ def _add_flown_fleet(
 def _leaving_or_explanation(
     page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Float | None:
-    """Return the probability that each flown twin of a group changes its control.
+    """Return for each flown twin of a group the probability that its control changes soon.
 
     The probabilities are those of `leaving_probabilities`. If they cannot be computed, add a
     paragraph with the reason to the page, and return None.
@@ -207,7 +207,7 @@ def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
 
 
 def _damage_sentence(standings: Sequence[Standing]) -> str:
-    """Return the most severely damaged asset and its state; empty if no state is estimated."""
+    """Return a sentence on the most severely damaged asset; empty if no state is estimated."""
     standings_with_state = [standing for standing in standings if standing.most_damaged is not None]
     if not standings_with_state:
         return ""
@@ -256,7 +256,7 @@ def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which content is added.
     failures : mapping of str to str
         The error of each asset, by GROUP/NAME.
     caption : str

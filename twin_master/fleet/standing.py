@@ -132,7 +132,7 @@ def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
 
 
 def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
-    """Return a moment of each of F factors of the state of B assets, a (B, F) array.
+    """Return a moment of each state factor of each asset, a (B, F) array.
 
     It is NaN where the record has None.
 

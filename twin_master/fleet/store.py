@@ -59,7 +59,7 @@ _NOT_DEFINED = -1
 
 
 def flown_rows(status: NDArray[Any]) -> Index:
-    """Return the rows of the twins that flew to the end of the mission or of their assets."""
+    """Return the rows of the twins that have flown to the end of the mission or of the asset."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 

@@ -148,7 +148,7 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
 def _fields_of_entries(
     template: str, scenario: Scenario, parameters: Sequence[str]
 ) -> Iterator[dict[str, str]]:
-    """Yield the values of the own fields of each variable that a row of the schema describes."""
+    """Yield for each variable that one row of the schema describes the values of its fields."""
     if "{reading}" in template:
         for reading in scenario.readings:
             yield {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
@@ -197,7 +197,7 @@ def store_coordinates(scenario: Scenario, twins: Sequence[str]) -> dict[str, Coo
 def coordinates_of_groups(
     layout: Mapping[str, StoredVariable], coordinates: Mapping[str, Coordinate]
 ) -> dict[str, dict[str, Coordinate]]:
-    """Return the coordinates of each group of a store: those whose axes its variables have.
+    """Return for each group of a store the coordinates of all axes that its variables have.
 
     Parameters
     ----------

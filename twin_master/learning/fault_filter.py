@@ -213,7 +213,7 @@ class FaultFilter:
         )
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: float) -> None:
-        """Let free gains begin in this step, and fade what is learnt of them.
+        """Let the fault of free gains begin in this step, and let its sums about the gains fade.
 
         Free gains are the fault that several gauges have unknown gains.
 
@@ -246,7 +246,7 @@ class FaultFilter:
         statistics.sum_cx *= fading * earlier_weight
 
     def _fading_per_step(self) -> float:
-        """Return the factor of exponential forgetting of the sums of gains, as gains may change."""
+        """Return the factor by which the sums about gains fade in a step, as gains may change."""
         return float(np.exp(-1.0 / self._settings.memory_steps))
 
     def probability_to_begin_after(self, step: float) -> float:
@@ -284,7 +284,7 @@ class FaultFilter:
             self._move_to_recovered(state, ended_or_hidden)
 
     def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix beliefs and sums of squares of ended and hidden faults into those of "recovered".
+        """Mix the beliefs and sums of ended and hidden faults into the hypothesis "recovered".
 
         "Recovered" is the hypothesis that the gauges are right again after a fault.
 
@@ -422,11 +422,11 @@ class FaultFilter:
     def _standardize(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
     ) -> tuple[StandardizedObservation, Float]:
-        """Return an observation in units of noise, and its log density without the residuals.
+        """Return an observation in units of the noise, and the first part of its log density.
 
-        The log density (N,), for each pair of a draw and a state, lacks the densities of the
-        standardised residuals, which depend on the hypothesis. The parameters are those of
-        `assimilate`.
+        This part (N,), for each pair of a draw and a state, is the same under all hypotheses. It
+        lacks the densities of the standardised residuals, which depend on the hypothesis. The
+        parameters are those of `assimilate`.
         """
         degrees = self._settings.noise_degrees
         count = state.observation_count
@@ -453,7 +453,7 @@ class FaultFilter:
 
 
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
-    """Choose draws evenly over the range of all, and give each the probability of its neighbours.
+    """Choose draws evenly over the whole range, each with the probability of the draws around it.
 
     The chosen draws are evenly spaced: a true value in a wide gap between two of them would look
     like a fault.

@@ -157,7 +157,7 @@ def mix_in_beginning_faults(
 def update_model(
     observation: StandardizedObservation, squares: Float, belief: Float, log_likelihood: Float
 ) -> tuple[float, Float]:
-    """Correct the belief of the model, or of another hypothesis of sound gauges.
+    """Correct the belief of the model, or of another hypothesis under which all gauges are sound.
 
     Parameters
     ----------

@@ -399,7 +399,7 @@ class LearningFilter:
 def _learnt_coefficients(
     name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
 ) -> dict[str, Learnt]:
-    """Return the posterior of one coefficient of each gauge that learns it, as `name[g]` from 1.
+    """Return the posterior of a coefficient by name and number of the gauge: `name[g]`, g from 1.
 
     Parameters
     ----------

@@ -178,7 +178,7 @@ class WatchfulEstimator:
         )
 
     def _continues(self, before: Carried) -> bool:
-        """Return whether the state of the previous step belongs to the same predictions."""
+        """Return whether the state of the previous step holds for the predictions of this model."""
         return bool(before.arrays.get(MODEL_KEY) == self._faults.model_key)
 
     def _suspicion(self, state: WatchState) -> Suspicion:

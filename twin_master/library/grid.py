@@ -97,7 +97,7 @@ class SamplingGrid:
         return tuple((first, min(first + length, self.size)) for first in firsts)
 
     def point(self, index: int) -> tuple[int, dict[str, float], str]:
-        """Return the index of the draw, the state, and the name of the control of a point."""
+        """Return the index of the draw, the state and the name of the control of a grid point."""
         draw, *levels, control = np.unravel_index(index, self.shape)
         state = {}
         for (name, values), level in zip(self.states.items(), levels, strict=True):
@@ -119,7 +119,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
     Parameters
     ----------
     texts : sequence of str
-        The texts.
+        The texts that the user gave, one for each axis.
     binding : Binding
         The binding of the FMU.
 
@@ -160,7 +160,7 @@ def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
 
 
 def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
-    """Return the numbers of VALUES in `NAME=VALUES`; `text` is all of it, for the message."""
+    """Return the numbers of VALUES in the text `NAME=VALUES` that a user gave."""
     try:
         if ":" in values_text:
             first, last, count = values_text.split(":")
@@ -285,7 +285,7 @@ def grid_of_scenario(
     Parameters
     ----------
     loaded_scenario : LoadedScenario
-        The scenario.
+        The scenario, as read from its file.
     folder : Path
         The folder into which the FMU and its binding are copied.
     texts : sequence of str
@@ -364,7 +364,7 @@ def grid_of_scenario(
 
 
 def _without_library(loaded_scenario: LoadedScenario) -> LoadedScenario:
-    """Return the scenario without the observation library that its twin believes.
+    """Return the scenario with the FMU as belief, if its twin believes an observation library.
 
     The library is yet to be sampled. In its place the twin believes the wing design that the table
     `belief` names, or else the asset itself.

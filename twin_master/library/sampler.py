@@ -25,7 +25,7 @@ class GridSampler:
     Parameters
     ----------
     grid : SamplingGrid
-        The grid.
+        The points at which the FMU is sampled.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class GridSampler:
         return history.values[steps_per_point - 1 :: steps_per_point, self._observation_slice]
 
     def _error_at(self, error: FmuError, point: int) -> FmuError:
-        """Return an error whose message begins with the point at which it happened."""
+        """Return an error with the point at which it happened at the beginning of its message."""
         # A worker that ends abruptly has reported its progress some steps earlier.
         is_located = isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
         where = "at" if is_located else "at or soon after"

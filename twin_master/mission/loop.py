@@ -38,7 +38,7 @@ class Source(Protocol):
         """Return the next observation for the twin; None if there are no more."""
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return what the twin assimilates in place of a reading that it refused with an error."""
+        """Return the reading that the twin assimilates in place of one that it has refused."""
 
 
 StepSink = Callable[[MissionStep], None]
@@ -51,7 +51,7 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
     Parameters
     ----------
     twin : Twin
-        The twin.
+        The twin that assimilates and decides.
     source : Source
         The source. It is asked for an observation after the previous step was stored.
     *sinks : callable
@@ -105,9 +105,9 @@ def fly(
     Parameters
     ----------
     scenario : Scenario
-        The mission.
+        The scenario of the mission.
     twin : Twin
-        The twin.
+        The twin that assimilates and decides.
     plant : Plant
         The asset and its truth, at the same step as the twin.
     *sinks : callable
@@ -115,7 +115,7 @@ def fly(
     history : History, optional
         The steps flown so far; the new ones are added to it, also if an error ends the flight.
     progress : Progress, optional
-        Shows the steps.
+        The display of the progress in steps.
 
     Returns
     -------

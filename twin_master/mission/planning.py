@@ -69,7 +69,7 @@ def plan_within_limit(
     Parameters
     ----------
     scenario : Scenario
-        The mission.
+        The scenario of the mission.
     problem : DecisionProblem
         Its decision problem, without a price.
     rewards : RewardModel
@@ -216,7 +216,7 @@ class ComparedPolicy:
         return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
 
     def beyond(self, other_policy: "ComparedPolicy") -> "ComparedPolicy":
-        """Return the difference of the returns to those of another rule, mission by mission."""
+        """Return by how much the returns exceed those of another rule, mission by mission."""
         return ComparedPolicy(
             f"{self.name} beyond {other_policy.name}", self.returns - other_policy.returns
         )

@@ -359,7 +359,7 @@ class Knowledge:
 def _inspected_sensor_model(
     scenario: Scenario, model: GraphicalModel
 ) -> "partial[InspectedSensorModel]":
-    """Return the constructor of the sensor model, with its arguments of inspections filled in.
+    """Return the constructor of the sensor model, with the noise of the scenario's inspections.
 
     An inspection reads one factor of the state, with noise of a stated standard deviation.
     """
@@ -490,9 +490,9 @@ def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     knowledge : Knowledge
-        What to write.
+        The knowledge to write.
     number : int, optional
         The number of an earlier model of a watch, from 0; left out for the last or only one.
 
@@ -542,7 +542,7 @@ def load_knowledge(
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     scenario : Scenario
         The scenario in its `config.json`.
     number : int, optional

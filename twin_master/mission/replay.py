@@ -71,7 +71,7 @@ def replay(
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     models : sequence of BelievedModel
         The model at the beginning, and those that were adopted later.
     lag : int or None
@@ -163,7 +163,7 @@ class _BackwardScan:
         return True
 
     def _check_order(self, line: JournalLine, step: int) -> None:
-        """Refuse a line whose step is neither that of the following line nor one less."""
+        """Refuse a journal line whose step is neither that of the next line nor the one before."""
         later_step = self._later_step
         if later_step is None or later_step - step in (0, 1):
             return
@@ -171,13 +171,12 @@ class _BackwardScan:
         raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
 
     def _take_in_settled_state(self, record: JsonObject) -> None:
-        """Keep the settled state in a record, if it is the first one that is early enough."""
+        """Keep the settled state of a record, if it is the latest one before all required steps."""
         if self.settled is not None or "settled" not in record:
             return
         step = int(record["settled"]["step"])
         state = record["settled"]["state"]
-        # It must lie before each required step, and before the first step of each model that was
-        # adopted later.
+        # The required steps include the first step of each model that was adopted later.
         if all(step < required_step for required_step in self._required_steps):
             self.settled = SettledState(step, decode_state(state))
 
@@ -276,7 +275,7 @@ def spans_of_models(
     Parameters
     ----------
     history : History
-        The steps.
+        The steps of the flight so far.
     models : sequence of BelievedModel
         The models in the order of their adoption.
     """

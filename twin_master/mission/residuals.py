@@ -25,7 +25,7 @@ def expected_in_steps(
     Parameters
     ----------
     history : History
-        The T steps.
+        The T steps of the flight so far.
     knowledge : Knowledge
         The knowledge of the twin in these steps.
     belief : (T, S) array
@@ -53,7 +53,7 @@ def expected_ahead(
     Parameters
     ----------
     history : History
-        The T steps.
+        The T steps of the flight so far.
     knowledge : Knowledge
         The knowledge of the twin in these steps.
     predicted_beliefs : (T, H, S) array
@@ -90,7 +90,7 @@ def residual_summary(
     Parameters
     ----------
     history : History
-        The steps.
+        The steps of the flight so far.
     from_step : int
         The number of the first step that is evaluated.
     models : sequence of BelievedModel

@@ -86,7 +86,7 @@ class DrawnReadings:
 
     @cached_property
     def _terms(self) -> _LikelihoodTerms:
-        """The terms of the likelihood of each sensor, which add up over a set of sensors."""
+        """The terms of each sensor's likelihood; the terms of a set of sensors are their sum."""
         residual = self.residual.transpose(2, 0, 1)  # (G, N, S)
         loadings = self.loadings.transpose(1, 0, 2)  # (G, S, F)
         return _LikelihoodTerms(
@@ -254,7 +254,7 @@ def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> _
 def _add_greedily(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
 ) -> list[int]:
-    """Return `count` sensors, each of which adds the most information to those before it."""
+    """Return `count` sensors; each adds the most information to the sensors chosen before it."""
     chosen_sensors: list[int] = []
     while len(chosen_sensors) < count:
         extended_sets = [
@@ -342,7 +342,7 @@ def _squared_distance(
 
 
 def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
-    """Return the scenario with more gauges on its structure, which are sensors.
+    """Return the scenario with further gauges on its structure, all of which are sensors.
 
     The new gauges stand after the gauges of the structure file and before those of its rosettes.
 
@@ -420,7 +420,7 @@ def _append_gauges(structure_file: Path, gauges: Sequence[Gauge]) -> None:
 def _with_sensors(
     scenario: Scenario, declared_gauges: Sequence[str], all_gauges: Sequence[str]
 ) -> Scenario:
-    """Return the scenario with all gauges as sensors; the health reward counts the same as before.
+    """Return the scenario with all gauges as sensors; its reward for health keeps its weight.
 
     Learning and notices are left out, because they are set for the declared gauges.
     """

@@ -176,7 +176,7 @@ class _StatelessAssets:
         return np.hstack((sensed, inspected)), true_states.state
 
     def _advance(self, step: int, control: Index) -> _TrueStates:
-        """Return the true states of a step: scripted, or drawn given those of the step before."""
+        """Return the true states in a step: scripted, or drawn given the previous states."""
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
             return _TrueStates(

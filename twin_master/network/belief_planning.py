@@ -41,7 +41,7 @@ class _Bounds:
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     """
 
     def __init__(self, problem: DecisionProblem) -> None:
@@ -171,7 +171,7 @@ def plan_on_belief(
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     first : int, optional
         The control of the first step, if it is prescribed.
     gap : float

@@ -67,7 +67,7 @@ def _fill_quantiles(
     sorted_values : SortedValues
         The values of each sensor.
     levels : (P,) array
-        The levels, increasing.
+        The cumulative probabilities of the quantiles, increasing.
     result : (B, P, G) array
         The quantiles, in the unit of the values; filled here.
     """

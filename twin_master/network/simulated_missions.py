@@ -35,7 +35,7 @@ def simulated_returns(
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     decide : callable
         The policy, see `Decide`.
     missions : int

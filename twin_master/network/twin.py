@@ -59,7 +59,7 @@ def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[st
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     leaving : float
         The factor on the probabilities of each factor of the state to leave a level.
     """
@@ -97,7 +97,7 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     leaving : float
         The factor on the probabilities of each factor of the state to leave a level.
 

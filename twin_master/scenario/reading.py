@@ -123,9 +123,9 @@ class LoadedScenario:
     Attributes
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     path : Path
-        The file.
+        The path of the file.
     content_hash : str
         The SHA-256 of the file's content.
     remark : str

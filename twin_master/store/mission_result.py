@@ -143,7 +143,7 @@ def _learnt_quantities(
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     prior : mapping of str to Learnt
         The prior of each quantity, by the name that the estimator gives it.
     """

@@ -283,7 +283,7 @@ def _belief_variables(
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     belief : (..., states) array
         The probability of each state.
     expectation : Expectation

@@ -230,7 +230,7 @@ def summarise(
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     reward_mean : (steps, 3) array
         The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
     misfit : (states, controls, sensors) array, optional

@@ -45,7 +45,7 @@ class RecordedFeed(Feed):
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     scenario : Scenario
         The scenario of the asset.
     follow : bool
