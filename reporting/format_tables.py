@@ -223,7 +223,17 @@ def _default_text(schema: JsonSchema) -> str:
 
 
 def _type_text(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]) -> str:
-    """Return the type of a value in words, with a link if it is a table."""
+    """Return the type of a value in words, such as "list of: number".
+
+    Parameters
+    ----------
+    node : JsonSchema
+        The schema of the value.
+    root : JsonSchema
+        The schema of the whole format, with the definitions to which `node` may refer.
+    link : callable
+        Returns a link to the section of the page about a table.
+    """
     node = _resolved(node, root)
     if "const" in node:
         return f"`{json.dumps(node['const'])}`"

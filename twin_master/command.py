@@ -208,7 +208,19 @@ def _new_mission(
 def _resumed_mission(
     scenario_name: str | None, folder: Path, parts: "TwinParts", *, has_changes: bool
 ) -> "Callable[..., RunOutcome]":
-    """Return the function that continues an interrupted run."""
+    """Return a function that continues an interrupted run.
+
+    Parameters
+    ----------
+    scenario_name : str or None
+        The scenario that the user named in addition; None if the user named only the folder.
+    folder : Path
+        The folder of the run.
+    parts : TwinParts
+        The sensor model and the estimator that the user gave.
+    has_changes : bool
+        Whether the user gave an option that would change the run, which is refused.
+    """
     from twin_master.scenario.reading import load_scenario
     from twin_master.workflow import resume
 

@@ -180,9 +180,9 @@ class _Console:
 
 
 def _heading(standing: Standing) -> str:
-    """Return the heading of a table of watched assets, such as "3 assets, 120 steps, 1 alarm".
+    """Return the heading of the table of watched assets, such as "3 assets, 120 steps, 1 alarm".
 
-    Refused messages, and assets that could not be watched, are added if there are any.
+    If messages were refused, or assets could not be watched, the heading has their numbers, too.
 
     Parameters
     ----------

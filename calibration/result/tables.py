@@ -118,7 +118,7 @@ def _rms_text(rms: float) -> str:
 
 
 def origin_table(result: Calibration) -> TitledTable:
-    """Return the table of where a calibration comes from."""
+    """Return a table with the origin of a calibration: asset, model, data, seed and software."""
     versions = result.provenance["versions"].items()
     items = {
         "asset": result.asset,

@@ -249,13 +249,18 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return loads and stiffness images in the smallest basis that holds all residuals.
+        """Return the loads and the stiffness terms that form the residuals, with few coordinates.
+
+        A residual of the reduced model is the load minus the stiffness times the displacement. All
+        residuals lie in the span of the loads and of the images of the basis under the terms of the
+        stiffness; the factors are coordinates in an orthonormal basis of this span.
 
         Parameters
         ----------
         directions : (N, K) array
             Combinations of the N basis vectors that span the reduced model.
         """
+        # Images of the K basis vectors under each term of the stiffness
         images = self.residual_stiffness @ directions
         # A Galerkin residual is orthogonal to the basis. In whitened coordinates the reference
         # stiffness is the identity, so that the images of the basis under it are the basis itself:
@@ -280,12 +285,14 @@ class StaticReduction:
         residual_directions, factor = np.linalg.qr(
             images_and_loads - basis_directions @ (basis_directions.T @ images_and_loads)
         )
-        # read out loads and terms, these in their own order
-        loads = slice(first_load, first_load + self.loads.shape[1])
-        ordered_terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
+        # Separate the columns of the loads from those of the terms, and sort the terms again as in
+        # the stiffness.
+        load_columns = slice(first_load, first_load + self.loads.shape[1])
+        term_columns = np.delete(factor, load_columns, axis=1)
+        reordered_terms = term_columns.reshape(len(factor), len(order), -1)
         return _ResidualFactors(
-            load=factor[:, loads],
-            stiffness=ordered_terms[:, np.argsort(order)],
+            load=factor[:, load_columns],
+            stiffness=reordered_terms[:, np.argsort(order)],
             directions=residual_directions,
         )
 

@@ -31,6 +31,8 @@ LEAST_GAUGE_LENGTH = 1e-3
 """Length over which a gauge without a length averages [m]."""
 NO_PATCH = ModelPatch()
 
+_ARM_ROOT = 0.97
+"""Where an arm beyond the tip is attached: its direction follows from here to the tip [span]."""
 _STRAIN = re.compile(r"strain\[(?P<gauge>\d+)\](?P<component>\.transverse|\.shear)?")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
@@ -92,8 +94,9 @@ class WingRows:
     def _station_weights(self, y: float) -> FloatArray:
         """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
 
-        Within a cell of the mesh, a value is interpolated by the parabola through both ends and the
-        middle. Beyond the tip it is extrapolated linearly, as on a rigid arm.
+        The stations are the ends and the middles of the cells along the span. Within a cell, a
+        value is interpolated by the parabola through both ends and the middle. Beyond the tip, up
+        to `OVERHANG` of the span, it is extrapolated linearly, as on a rigid arm.
 
         Raises
         ------
@@ -106,7 +109,8 @@ class WingRows:
                 f"A place must lie on the wing, 0 to {self.span:g} m from the root, but is {y:g} m."
             )
         if y > self.span:
-            inboard = 0.97 * self.span
+            # The arm continues the straight line through the tip and a point close to it.
+            inboard = _ARM_ROOT * self.span
             arm = (y - inboard) / (self.span - inboard)
             at_tip = self._station_weights(self.span)
             return np.asarray(arm * at_tip + (1.0 - arm) * self._station_weights(inboard))
@@ -114,11 +118,13 @@ class WingRows:
         cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), last_cell)
         begin = stations[2 * cell]
         end = stations[2 * cell + 2]
+        # Shape functions: each is one at begin, middle or end of the cell, and zero at the others
         t = (y - begin) / (end - begin)
-        parabola = np.array((1.0 - t, 4.0 * t * (1.0 - t), t))
-        parabola[::2] *= (1.0 - 2.0 * t, 2.0 * t - 1.0)
+        at_begin = (1.0 - t) * (1.0 - 2.0 * t)
+        at_middle = 4.0 * t * (1.0 - t)
+        at_end = t * (2.0 * t - 1.0)
         weights = np.zeros(len(stations))
-        weights[2 * cell : 2 * cell + 3] = parabola
+        weights[2 * cell : 2 * cell + 3] = (at_begin, at_middle, at_end)
         return weights
 
     @property

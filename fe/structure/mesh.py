@@ -169,7 +169,7 @@ class StructureMesh(CellMesh):
     def _members(
         self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str
     ) -> _Content:
-        """Return the members of a set; raises `MeshError` if there is no such set, or it is empty.
+        """Return the members of a set that a design names.
 
         Parameters
         ----------
@@ -181,6 +181,11 @@ class StructureMesh(CellMesh):
             What the sets hold, and one member, for sentences.
         where : str
             The key in the design that names the set.
+
+        Raises
+        ------
+        MeshError
+            If there is no such set, or if it is empty.
         """
         members = _set_named(sets, name)
         if members is None:

@@ -108,10 +108,10 @@ def check_fmu(
 
 
 def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
-    """Return a binding of the whole FMU, drafted from its model description.
+    """Return the binding with which an FMU is checked, drafted from its model description.
 
-    It has the stop time of the FMU's default experiment, unless the steps of the checks would run
-    beyond that time.
+    The binding has all inputs and outputs, and the stop time of the FMU's default experiment. The
+    stop time is left out if the steps of the checks would run beyond it.
 
     Parameters
     ----------
@@ -126,8 +126,8 @@ def drafted_binding(description: FmuDescription, step_size: float | None) -> Bin
         If the FMU has no numeric output to observe, or the step size is not positive.
     """
     binding = whole_binding(description, step_size=step_size)
-    end = description.stop_time
+    stop_time = description.stop_time
     end_of_checks = binding.binding.start_time + RUN_STEPS * binding.interval
-    if end is None or end < end_of_checks:
+    if stop_time is None or stop_time < end_of_checks:
         return binding
-    return binding.with_header(stop_time=end)
+    return binding.with_header(stop_time=stop_time)

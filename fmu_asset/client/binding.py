@@ -185,7 +185,7 @@ class Binding(Section):
         return tuple(name for vector in self.observation.values() for name in vector.variables)
 
     def observation_slice(self, name: str) -> slice:
-        """Return the positions of an observation in `Observation.values`.
+        """Return the slice of the array `Observation.values` that holds an observation.
 
         Parameters
         ----------

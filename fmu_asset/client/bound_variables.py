@@ -189,7 +189,7 @@ class PortBinding(Section):
     """Velocity or angular velocity of the port."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of a port: a missing motion, or a unit that does not fit its quantity."""
+        """Yield the faults of a port: a missing motion, or a unit that does not fit a quantity."""
         has_motion = self.displacement is not None or self.velocity is not None
         yield not has_motion, "a port needs a displacement or a velocity beside its force"
         for name, vector in self.quantities.items():

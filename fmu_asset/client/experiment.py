@@ -154,7 +154,7 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
     Raises
     ------
     FmuInputError
-        If the text is no such value.
+        If the text is not a value of the variable's type.
     """
     if variable.is_text_parameter or text in variable.items:
         return text

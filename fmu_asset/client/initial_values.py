@@ -159,7 +159,7 @@ class InitialValueTable:
         return resolver.start_slot(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
-        """Return the text parameter that the binding or the FMU has under a name; None if neither has."""
+        """Return the text parameter that the binding or the FMU has by a name; None without one."""
         if name in self._text_parameters or name in self._parameter_slots:
             return self._text_parameters.get(name)
         variable = self._resolver.description.variable(name)

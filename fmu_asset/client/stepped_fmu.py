@@ -135,20 +135,20 @@ class SteppedFmu(OpenedFmu):
         steps: int | None = None,
         progress: Progress | None = None,
     ) -> ObservationHistory:
-        """Make many communication steps under prescribed inputs, from where the asset is.
+        """Make many communication steps under prescribed inputs, from the present state on.
 
-        The result is that of as many calls of `step`, to the bit. All inputs are checked before the
-        first step. If a step fails, the steps before it are made and the asset is where it was
-        before that one. If the FMU ends its simulation, the result ends there and says so in
-        `ended`.
+        The result equals, bit by bit, that of as many calls of `step`. All inputs are checked
+        before the first step. If a step fails, the asset stays in the state after the step before.
+        If the FMU ends its simulation, the result ends there, and its attribute `ended` says so.
 
         Parameters
         ----------
         control, health, load, port : mapping of str to (N,) array-like or float
-            Inputs by the binding's names and in its units: one for each step, or one for all; (N,
-            n) or (n,) for an array. One that is not given keeps its last value.
+            Inputs by the binding's names and in its units: a value for each step, or one for all
+            steps. An array of n values is (N, n) or (n,). An input that is not given keeps its last
+            value.
         steps : int, optional
-            Number of steps N; that of the histories if absent.
+            The number of steps N; if left out, the length of the histories.
         progress : Progress, optional
             Where progress is shown.
 
@@ -167,6 +167,7 @@ class SteppedFmu(OpenedFmu):
             "load": load,
             "port": port,
         }
+        # Health that an FMU takes only at its start can change only by a restart.
         if self._exchange.health_slots:
             return self._simulate_with_restarts(histories, steps, progress)
         return self._simulate(histories, steps, progress)

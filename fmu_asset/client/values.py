@@ -32,9 +32,9 @@ class Inputs(TypedDict, total=False):
 
 
 def inputs_by_role(inputs: Inputs) -> InputsByRole:
-    """Return the keyword arguments of a call as inputs by role.
+    """Return the keyword arguments of a call, after a check that each one is a role of inputs.
 
-    A misspelt keyword, which would otherwise be ignored, is refused.
+    Without the check, a misspelt keyword would be ignored.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def inputs_by_role(inputs: Inputs) -> InputsByRole:
     roles = Inputs.__annotations__
     for role in inputs:
         if role not in roles:
-            raise TypeError(f"Inputs are {', '.join(roles)}, and {role!r} came.")
+            raise TypeError(f"The inputs are {', '.join(roles)}, but {role!r} was given.")
     return cast("InputsByRole", inputs)
 
 

@@ -147,7 +147,7 @@ class Wiring:
         self.schedule: Schedule = schedule(names, immediate, self._used_feedthrough())
 
     def _used_feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the inputs that act at once on each output and on other variables that are read."""
+        """Return the inputs that act at once on each output, and on other variables in use."""
         sources = {connection.source for connection in self.structure.connections}
         used_inputs: dict[str, dict[str, frozenset[str]]] = {}
         for component, description in self.declared.items():

@@ -463,8 +463,8 @@ class FmuInstance(Instance):
     def _call_error(self, function: str, status: int, purpose: str) -> FmuCallError:
         """Return the error for a call that the FMU did not accept.
 
-        Unless the FMU only discarded the call, the instance is marked as lost. FMI would allow a few
-        further calls to a lost instance; none is made, and the asset replaces the instance.
+        Unless the FMU only discarded the call, the instance is marked as lost. FMI would allow some
+        further calls to a lost instance. None is made, and the asset replaces the instance.
 
         Parameters
         ----------

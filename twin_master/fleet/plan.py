@@ -504,13 +504,14 @@ def _members(
     seed : int
         The seed of the fleet.
     observations : str
-        The pattern of the recordings of real assets, or an address; empty if assets are flown.
+        The pattern of the recordings of real assets, or the address of the broker that sends their
+        messages; empty if the assets are simulated.
     files : list of Path
         The FMU or calibration of each asset; empty if the section gives the number of assets.
     """
     if observations:
         if is_broker(observations):
-            return ()
+            return ()  # an asset of a broker joins the group with its first message
         return tuple(
             Member(row, asset_name(path), seed, {}, file=path)
             for row, path in enumerate(recording_files(observations))

@@ -292,10 +292,11 @@ def check_installed(*packages: str) -> None:
 
 
 def open_group(folder: Path, group: str) -> "xr.DataTree":
-    """Open a group of assets in the store of a fleet; each array is read when it is first used.
+    """Open a group of assets in the store of a fleet.
 
-    If an earlier version of the program wrote the store, the group is converted to the present
-    names and shapes of its arrays.
+    The arrays of the group are read from the disk when they are first used. If an earlier version
+    of the program wrote the store, the names and shapes of the arrays are converted to the present
+    ones.
 
     Parameters
     ----------
@@ -365,7 +366,10 @@ def create_store(folder: Path, fleet: Fleet) -> None:
 
 
 def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
-    """Create the arrays of a group, in chunks of one shard."""
+    """Create the empty arrays and the coordinates of a group of assets in the store of a fleet.
+
+    The assets of one shard are one chunk of each array, so that a shard writes whole chunks.
+    """
     scenario = group.scenarios[0]
     twin_count = len(group.members)
     sizes = dimension_sizes(scenario)
@@ -382,9 +386,9 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
             attributes=variable.attributes,
             overwrite=True,
         )
-    coordinates = store_coordinates(scenario, [member.name for member in group.members])
-    for group_path, coordinates_of_group in coordinates_of_groups(layout, coordinates).items():
-        _create_coordinates(zarr_group, group_path, coordinates_of_group)
+    all_coordinates = store_coordinates(scenario, [member.name for member in group.members])
+    for inner_group, coordinates in coordinates_of_groups(layout, all_coordinates).items():
+        _create_coordinates(zarr_group, inner_group, coordinates)
     zarr_group.attrs.update(
         {
             "scenario": scenario.mission.name,

@@ -117,7 +117,11 @@ def dimension_sizes(scenario: Scenario) -> dict[str, int]:
 
 
 def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[str, StoredVariable]:
-    """Return the variables of the store of a group, by their paths.
+    """Return the variables that the store of a fleet has for a group of assets.
+
+    They are listed in the schema, a table that has a row with axes, unit, title and type for each
+    variable. Path and row are templates: a field in braces is filled in for the scenario, and a
+    path with the field of a reading or a parameter stands for a variable of each of them.
 
     Parameters
     ----------
@@ -125,20 +129,25 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
         The scenario of the group.
     parameters : sequence of str
         The names of the true parameters that differ from twin to twin.
+
+    Returns
+    -------
+    dict of str to StoredVariable
+        The variables by their paths in the group.
     """
     observation = scenario.observation
-    different_units = dict.fromkeys(observation.sensor_units)
+    distinct_units = set(observation.sensor_units)
     common_fields = {
         "role": observation.role,
-        "sensor_unit": SEVERAL_UNITS if len(different_units) > 1 else observation.sensor_units[0],
+        "sensor_unit": SEVERAL_UNITS if len(distinct_units) > 1 else observation.sensor_units[0],
         "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
     }
     layout = {}
-    for template, row in SCHEMA["fleet"].items():
-        for own_fields in _fields_of_entries(template, scenario, parameters):
+    for path_template, row_templates in SCHEMA["fleet"].items():
+        for own_fields in _fields_of_entries(path_template, scenario, parameters):
             fields = common_fields | own_fields
-            path = template.format(**fields)
-            axes, unit, title, dtype = (text.format(**fields) for text in row)
+            path = path_template.format(**fields)
+            axes, unit, title, dtype = (template.format(**fields) for template in row_templates)
             usual_fill_value = np.nan if dtype[0] == "f" else 0
             fill_value = _FILL_VALUES.get(path, usual_fill_value)
             layout[path] = StoredVariable(tuple(axes.split()), unit, title, dtype, fill_value)

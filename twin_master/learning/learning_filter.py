@@ -338,25 +338,40 @@ class LearningFilter:
         return result
 
     def _learnt_noise_scales(self, weight: Float, fit: GaugeFit, count: Float) -> dict[str, Learnt]:
-        """Return the posterior of each noise scale, given the weights (K,) of the hypotheses.
+        """Return the posterior of each gauge's noise scale, the true over the assumed noise.
 
-        Given a hypothesis, the square of a scale has an inverse gamma distribution with a shape and
-        a rate. Mean and variance are averaged over the hypotheses. The quantiles are approximate:
-        those of the inverse gamma distribution with the mean rate.
+        Under a hypothesis, the square of a noise scale has an inverse gamma distribution. Mean and
+        variance are averaged over the hypotheses. The quantiles are approximate: those of the
+        inverse gamma distribution whose rate is the mean over the hypotheses.
+
+        Parameters
+        ----------
+        weight : (K,) array
+            The probability of each hypothesis.
+        fit : GaugeFit
+            The fit of the G gauges under each hypothesis.
+        count : (G,) array
+            The number of observations of each gauge.
+
+        Returns
+        -------
+        dict of str to Learnt
+            The posteriors by `noise_scale[g]`, with the gauges g counted from 1.
         """
         degrees = self._gauges.degrees
-        shape = 0.5 * (degrees + count)
-        rate = 0.5 * (degrees + fit.residual_squares)
+        shape = 0.5 * (degrees + count)  # (G,)
+        rate = 0.5 * (degrees + fit.residual_squares)  # (K, G)
+        mean_rate = weight @ rate
         low_level, high_level = INTERVAL
-        # The squared scale is the rate over a gamma variate, so that the lower quantile of the
-        # scale belongs to the upper one of the variate.
-        lower = np.sqrt(weight @ rate / gammaincinv(shape, high_level))
-        upper = np.sqrt(weight @ rate / gammaincinv(shape, low_level))
+        # The squared scale is the rate over a gamma variate. So the lower bound of the scale
+        # belongs to the upper quantile of the variate.
+        lower = np.sqrt(mean_rate / gammaincinv(shape, high_level))
+        upper = np.sqrt(mean_rate / gammaincinv(shape, low_level))
         # For a gamma variate x: E(1 / sqrt(x)) = Gamma(shape - 1/2) / Gamma(shape), and
         # E(1 / x) = 1 / (shape - 1).
         mean = weight @ np.sqrt(rate) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
-        variance = np.maximum(weight @ rate / (shape - 1.0) - mean**2, 0.0)
-        deviation = np.sqrt(variance)
+        mean_square = mean_rate / (shape - 1.0)
+        deviation = np.sqrt(np.maximum(mean_square - mean**2, 0.0))
         return {
             f"noise_scale[{g + 1}]": Learnt(
                 float(mean[g]), float(deviation[g]), float(lower[g]), float(upper[g])

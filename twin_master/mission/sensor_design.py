@@ -349,20 +349,20 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
     Parameters
     ----------
     scenario : Scenario
-        The scenario; its paths are absolute.
+        The scenario, with absolute paths.
     candidates : str
         The largest number of rosettes to place evenly on the surface, or a TOML file with tables
         `gauge` and `rosette`, as in a structure file.
     folder : Path
-        Where the structure file with the new gauges is written.
+        The folder into which the structure file with the new gauges is written.
 
     Raises
     ------
     MissionInputError
-        If the belief is not a structure from a mesh, the sensors are not strain gauges that are all
-        alike, no rosette is asked for, or the structure file has its gauges in a list.
+        If the twin does not believe a structure with a mesh, if the sensors are not strain gauges
+        of one kind, if no rosette is asked for, or if the structure file has its gauges in a list.
     InvalidDesignError
-        If a candidate is wrong; the sentence names it.
+        If a new gauge does not lie on the structure; the message names the gauge.
     """
     belief, design = _extensible_structure(scenario)
     if candidates.isdecimal() and int(candidates) == 0:
@@ -422,13 +422,22 @@ def _with_sensors(
 ) -> Scenario:
     """Return the scenario with all gauges as sensors; its reward for health keeps its weight.
 
-    Learning and notices are left out, because they are set for the declared gauges.
+    The reward for health still depends on the gauges that it depended on. The tables of learning
+    and of notices are removed, because their settings hold for the declared gauges alone.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario, with the declared gauges as sensors.
+    declared_gauges, all_gauges : sequence of str
+        The names of the gauges before and after the candidates were added.
     """
     observation = scenario.observation
     titles = dict(zip(declared_gauges, observation.titles or declared_gauges, strict=True))
     health_sensors = scenario.rewards.health_sensors
     if health_sensors == "all":
         health_sensors = tuple(range(1, len(declared_gauges) + 1))
+    # Sensors are named by their numbers from 1, which the new gauges shift.
     new_health_sensors = []
     for number in health_sensors:
         gauge = declared_gauges[number - 1]

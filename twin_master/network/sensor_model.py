@@ -198,19 +198,24 @@ class GaussianSensorModel(QuantityModel):
         return {}
 
     def check_observation(self, observation: ArrayLike) -> Float:
-        """Return observations (..., G) as an array, in which NaN stands for a lost sensor.
+        """Return observations as an array of floats, after a check of shape and values.
+
+        Parameters
+        ----------
+        observation : (..., G) array-like
+            The values of the G sensors, SI. NaN stands for the value of a lost sensor.
 
         Raises
         ------
         InvalidObservationError
-            If the shape is another one, or a value is infinite.
+            If the last axis does not have G values, or a value is infinite.
         """
         observation = np.array(observation, dtype=np.float64, order="C")
-        leading_axes = observation.shape[:-1]
+        any_leading_axes = observation.shape[:-1]
         check_shape(
             "sensor values",
             observation.shape,
-            *leading_axes,
+            *any_leading_axes,
             self.sensor_count,
             error=InvalidObservationError,
         )

@@ -379,9 +379,10 @@ class _TableMaker:
         return columns
 
     def health(self) -> Columns:
-        """Return the table of the state factors: true values, and moments of the beliefs.
+        """Return the columns of `health.csv`: the state of the asset in each step.
 
-        The true values are left out if the run does not know them.
+        For each state factor, such as the stiffness loss of a region, these are the true value, if
+        the run knows the truth, and mean and standard deviation of filtered and smoothed belief.
         """
         variables = {}
         if "truth" in self.groups:

@@ -470,20 +470,20 @@ def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
 def control_changes(
     controls: Sequence[str], control_index: Index, step_name: str, first_step: int = 0
 ) -> str:
-    """Return in words when the control changed, such as "left 3g for 2g at step 31".
+    """Return a description of the changes of control, such as "left 3g for 2g at step 31".
 
     Parameters
     ----------
     controls : sequence of str
         The names of the controls.
     control_index : (steps,) array
-        The index of the control flown in each step.
+        The index of the control in each step.
     step_name : str
-        What a step is called.
+        The word for a step, such as "turn".
     first_step : int
         The number of the first step.
     """
-    # The steps whose control is not that of the step before
+    # The steps whose control differs from that of the step before
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
@@ -493,9 +493,9 @@ def control_changes(
         control = controls[int(control_index[step])]
         changes.append(f"left {previous} for {control} at {step_name} {first_step + step}")
     sentence = ", ".join(changes)
-    unnamed = len(steps) - len(changes)
-    if unnamed > 0:
-        sentence += f", and {counted(unnamed, 'more change')}"
+    further_changes = len(steps) - len(changes)
+    if further_changes > 0:
+        sentence += f", and {counted(further_changes, 'more change')}"
     return sentence
 
 
