@@ -205,6 +205,7 @@ def exact_posterior(
         half_width = _REACH * max(posterior.standard_deviation, spacing)
         narrower_lower = max(posterior.mean - half_width, lowest_allowed)
         narrower_upper = posterior.mean + half_width
+        # The grid fits the posterior once a further step would hardly narrow it.
         if narrower_upper - narrower_lower > 0.99 * (grid_upper - grid_lower):
             break
         grid_lower, grid_upper = narrower_lower, narrower_upper

@@ -241,7 +241,9 @@ class Factorisation:
         correction = self.riesz(right_hand_side - self.stiffness @ solution)
         solution = solution + correction
         error = self.backward_error(solution, right_hand_side)
-        length = max(float(np.linalg.norm(solution)), 1e-300)
+        length = max(
+            float(np.linalg.norm(solution)), 1e-300
+        )  # a zero load has no solution to scale
         change = float(np.linalg.norm(correction)) / length
         is_accurate = error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT
         if not is_accurate:

@@ -456,18 +456,18 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
     Returns
     -------
     list of State
-        First the worst state, then always the one with the largest product of its bound and its
-        distance from all that are chosen.
+        First the state with the largest bound. Each further state has the largest product of its
+        bound and its distance from the nearest state chosen before.
     """
+    # Distances are relative to the range of each input; one without a range counts as constant.
     scaled_states = states / np.maximum(np.ptp(states, axis=0), 1e-300)
     chosen_numbers = [int(bounds.argmax())]
-    distance = np.full(len(states), np.inf)
+    distance_from_nearest = np.full(len(states), np.inf)
     while len(chosen_numbers) < count:
-        distance_from_last = np.linalg.norm(
-            scaled_states - scaled_states[chosen_numbers[-1]], axis=1
-        )
-        distance = np.minimum(distance, distance_from_last)
-        score = np.where(bounds > least, bounds * distance, 0.0)
+        last_chosen = scaled_states[chosen_numbers[-1]]
+        distance_from_last = np.linalg.norm(scaled_states - last_chosen, axis=1)
+        distance_from_nearest = np.minimum(distance_from_nearest, distance_from_last)
+        score = np.where(bounds > least, bounds * distance_from_nearest, 0.0)
         if not score.any():
             break
         chosen_numbers.append(int(score.argmax()))

@@ -314,13 +314,16 @@ class WingRows:
     def _skin_fraction(self) -> FloatArray:
         """The skin's fraction (G,) of the bending stiffness at each gauge, computed from strains.
 
-        At a given bending moment the strain goes as 1 / stiffness. If a skin of fraction s loses
-        the part d of its stiffness, the ratio of the strains before and after is 1 - s d.
+        At a given bending moment the strain is proportional to 1 / stiffness. If a skin with the
+        fraction s of the bending stiffness loses the fraction d of its own stiffness, the ratio of
+        the strains before and after is 1 - s d.
         """
+        trial_loss = 0.3  # s follows from any loss d; this one is far from rounding
         terms = len(self.arrays.stiffness)
-        all_healthy = np.ones(terms)
-        soft_skin = np.append(np.full(terms - 1, 0.7), 1.0)
-        ratio = self._strain_under_lift(all_healthy) / self._strain_under_lift(soft_skin)
+        healthy = np.ones(terms)
+        # The last term of the stiffness is not that of the skin.
+        soft_skin = np.append(np.full(terms - 1, 1.0 - trial_loss), 1.0)
+        ratio = self._strain_under_lift(healthy) / self._strain_under_lift(soft_skin)
         return np.asarray((1.0 - ratio) / (1.0 - soft_skin[0]))
 
     def _strain_under_lift(self, theta: FloatArray) -> FloatArray:
@@ -332,12 +335,12 @@ class WingRows:
     def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
         """Return factors that correct the strains of gauges for local losses within a strip.
 
-        In the stiffness, a local loss is averaged over its strip between mesh lines; a gauge reads
-        the curvature at its own section. At a given bending moment the strain of a section whose
-        skin keeps the fraction r of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's
-        fraction of the bending stiffness. The factor is the mean of that over the gauge with the
-        losses where they are, over the same with smeared losses. It is one if losses end at
-        edges of strips.
+        The stiffness of the model averages a local loss over a strip between mesh lines, but a
+        gauge reads the curvature at its own section. If the skin of a section has the fraction s of
+        the bending stiffness, and keeps the fraction r of its own, the strain at a given bending
+        moment is proportional to 1 / (1 - s (1 - r)). The factor of a gauge is the mean of this
+        strain over the gauge with the local losses, divided by the mean with averaged losses. It is
+        one if losses end at the edges of strips.
 
         Parameters
         ----------

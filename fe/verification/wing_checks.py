@@ -206,6 +206,7 @@ def observed_order(ratio: float, values: Sequence[float]) -> float:
     if earlier_change * last_change <= 0.0:
         return math.nan
     order = math.log(earlier_change / last_change) / math.log(ratio)
+    # Any other order is an accident of rounding or of meshes too coarse to converge.
     return order if 0.05 < order < 12.0 else math.nan
 
 

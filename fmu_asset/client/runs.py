@@ -144,9 +144,10 @@ class FmuRuns:
         self._assets.clear()
 
     def probing_amplitude(self, name: str) -> float:
-        """Return an amplitude by which tests of linearity can vary an input in both directions.
+        """Return an amplitude by which a test of linearity can vary a load in both directions.
 
-        It is 1 in the binding's unit, or a tenth of the smaller limit of the range.
+        The amplitude is 1 in the binding's unit, or a tenth of the smaller limit of the load's
+        range if that is less.
         """
         low, high = self.asset.input_range("load", name)
         return min(1.0, 0.1 * abs(low), 0.1 * abs(high))

@@ -172,7 +172,8 @@ class InputSlot(NamedTuple):
             The same values, limited to the range. A value that differs from these by no more than
             the rounding error of a conversion of units is accepted.
         """
-        is_near_range = np.abs(clipped - values) <= 1e-12 * np.maximum(np.abs(clipped), 1.0)
+        rounding_error = 1e-12 * np.maximum(np.abs(clipped), 1.0)
+        is_near_range = np.abs(clipped - values) <= rounding_error
         acceptable = np.isfinite(values) & is_near_range
         if self.takes_whole_numbers:
             acceptable &= np.floor(values) == values

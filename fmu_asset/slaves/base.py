@@ -224,6 +224,7 @@ class Slave:
                 f"the step from t = {current_time!r} s over {step_size!r} s was refused: the "
                 "communication point must be finite, the step size finite and positive",
             )
+        # The master adds up its steps with rounding errors of its own.
         tolerance = 1e-6 * step_size + 1e-9 * abs(self._time)
         if abs(current_time - self._time) > tolerance:
             return self._refuse(

@@ -188,18 +188,19 @@ class TransitionFamily:
     def learnable(cls, scenario: Scenario) -> "TransitionFamily":
         """Return the transitions of a scenario of the kind `independent_worsening`."""
         probabilities = _assumed_probabilities(scenario)
-        # Each entry is linear in its probability p, so that its values at p = 1/4 and 3/4 determine
-        # it: slope = difference / (1/2). At p = 0 or 1 zero entries would be left out of the lists.
-        lists = _predecessors_at(scenario, 0.25)
+        # Each entry is a linear function of its probability p. Its values at p = 1/4 and 3/4
+        # determine slope and ends. At p = 0 or 1 the lists would lack the entries that are zero.
+        low, high = 0.25, 0.75
+        lists = _predecessors_at(scenario, low)
         entries = lists.probability
-        slope = 2.0 * (_predecessors_at(scenario, 0.75).probability - entries)
+        slope = 2.0 * (_predecessors_at(scenario, high).probability - entries)
         return cls(
             names=tuple(cause.name for cause in probabilities),
             assumed=np.array(list(probabilities.values())),
             lists=lists,
             parameter_index=_parameter_index(scenario, list(probabilities), lists),
-            entries_at_zero=entries + slope * -0.25,
-            entries_at_one=entries + slope * 0.75,
+            entries_at_zero=entries - slope * low,
+            entries_at_one=entries + slope * (1.0 - low),
             prior=build_graphical_model(scenario).prior,
         )
 

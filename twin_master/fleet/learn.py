@@ -63,6 +63,9 @@ NODE_DEVIATIONS = 6.0
 
 The unit is the standard deviation of the calibration.
 """
+_LEAST_PROBABILITY = 1e-3
+_LARGEST_PROBABILITY = 0.9
+"""Probabilities of worsening under which damage may grow or stay in any step."""
 _MOST_SHARED = 2
 """Largest number of probabilities to worsen for which groups share a distribution."""
 
@@ -374,8 +377,12 @@ def _explained_steps(
 
 
 def _with_all_transitions_possible(probability: Float) -> Float:
-    """Return probabilities clipped to 0.001 to 0.9, so that damage may grow or stay in any step."""
-    return probability.clip(1e-3, 0.9)
+    """Return probabilities of worsening that are neither near 0 nor near 1.
+
+    So any course of the damage is possible, and observations that are impossible with these
+    probabilities contradict the sensor model.
+    """
+    return probability.clip(_LEAST_PROBABILITY, _LARGEST_PROBABILITY)
 
 
 def _probability_grid(family: TransitionFamily, steps: Sequence[_WeighedSteps]) -> LikelihoodGrid:
