@@ -72,7 +72,7 @@ def filtered_record(
 
 
 def _interpolated(times: FloatArray, known_times: FloatArray, values: FloatArray) -> FloatArray:
-    """Return columns (N, C) that are known at some times at others, by linear interpolation."""
+    """Return columns (N, C) at new times, by linear interpolation between the known times."""
     columns = [np.interp(times, known_times, column) for column in values.T]
     return np.stack(columns, axis=1)
 
@@ -84,7 +84,7 @@ def high_pass(
     order: float = 1.0,
     levels_before: FloatArray | float | None = None,
 ) -> FloatArray:
-    """Return (s tau / (1 + s tau))^order of a signal that is linear between its samples.
+    """Apply the high-pass filter (s tau / (1 + s tau))^order to a signal, linear between samples.
 
     The response to a unit step is 1F1(order; 1; -t / tau), whose integral is t 1F1(order; 2; -t /
     tau): the inverse of s^(order - 1) tau^order / (1 + s tau)^order, Abramowitz and Stegun 1964,

@@ -275,7 +275,7 @@ def hash_file(path: str | os.PathLike[str]) -> str:
 
 
 def hash_record(record: object) -> str:
-    """Return the SHA-256 of plain data of JSON; the order of keys does not matter.
+    """Return the SHA-256 of plain data as JSON; the order of keys does not matter.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def with_present_names(
     source: str,
     error: type[Exception],
 ) -> dict[str, object]:
-    """Return the content of a file with the present name of each key that had another one.
+    """Return the content of a file, with keys that were renamed under their present names.
 
     Parameters
     ----------

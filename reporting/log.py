@@ -23,7 +23,7 @@ def module_logger(module: str) -> logging.Logger:
     Parameters
     ----------
     module : str
-        Its `__name__`.
+        The name of the module, its `__name__`.
     """
     return PACKAGE_LOGGER.getChild(module)
 

@@ -118,7 +118,7 @@ def _write_group(target: h5py.Group, group: NetcdfGroup) -> None:
 
 
 def _axis_sizes(group: NetcdfGroup) -> dict[str, int]:
-    """Return the size of each axis of a group, in the order in which axes are first used."""
+    """Return the size of each axis of a group, by name, in the order of first use."""
     sizes = {}
     for variable in {**group.variables, **group.coords}.values():
         for axis, size in zip(variable.dims, variable.values.shape, strict=True):
@@ -241,7 +241,7 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
 
 
 def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
-    """As the fork, send the groups of a file, or why it cannot be read, and end the process.
+    """In the forked process, send the groups of a file, or why it cannot be read, and end.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
 
 
 def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
-    """Return the groups of a file by their paths, or a line on why it cannot be read."""
+    """Return the groups of a file by their paths, or one line on why the file cannot be read."""
     import xarray as xr
 
     try:

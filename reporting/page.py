@@ -158,7 +158,7 @@ class Words:
 
 
 def _column_of_heading(heading: str | dict[str, str], fields: Mapping[str, object]) -> PageColumn:
-    """Return the column that a heading of the file describes, with its fields filled in."""
+    """Return the column that a heading in the file of texts describes, with fields filled in."""
     if isinstance(heading, str):
         return PageColumn(fill_template(heading, **fields))
     return number_column(fill_template(heading["number"], **fields), heading.get("unit", ""))
@@ -189,7 +189,7 @@ class Page:
         self._blocks: list[_PageBlock] = []
 
     def _add(self, kind: str, **content: object) -> None:
-        """Append a block of a kind with its content."""
+        """Append a block of content to the page."""
         self._blocks.append(_PageBlock(kind, content))
 
     def _next_number(self, kind: str) -> int:

@@ -249,7 +249,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults of the table, each with whether the table has it.
+        """Yield (is present, message) of each possible fault of the table.
 
         The first fault that the table has is raised; those after it are not evaluated.
         """
@@ -268,7 +268,7 @@ MISSING_KEY = "missing_key"
 
 
 def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
-    """Return the error by which a validator says that keys are missing.
+    """Return the error with which a validator reports missing keys.
 
     If several keys of a file are missing, one message names them all.
 

@@ -275,7 +275,7 @@ class DampedCosines:
         basis : (N, B) array
             The basis of the linear unknowns of a signal.
         amplitude : (K, C) array
-            The complex amplitudes.
+            The complex amplitude of each wave in each signal [V].
         sum_of_squares : (C,) array
             The sum of squared residuals of each signal.
         frequencies_fitted : bool

@@ -154,7 +154,7 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
 
 
 def _refuse_dead_accelerometers(record: Float) -> None:
-    """Refuse a record (N, A) in which an accelerometer shows a constant value."""
+    """Refuse a record (N, A) with an accelerometer that shows a constant value."""
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(

@@ -326,7 +326,7 @@ def calibrate_static(
     *,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> StaticCalibration:
-    """Return the posterior of e by both methods, and under other assumptions.
+    """Return the posterior of e by quadrature and by particle filter, and under other assumptions.
 
     Parameters
     ----------

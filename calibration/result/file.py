@@ -75,7 +75,7 @@ def result_bytes(calibration: Calibration) -> bytes:
 
 
 def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
-    """Return samples (N, F) of all figures as a group with one chain, as ArviZ expects it."""
+    """Return samples (N, F) of all figures as a group with one chain, the layout of ArviZ."""
     return xr.Dataset(
         {
             figure.name: (
@@ -89,7 +89,7 @@ def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Return a stored calibration, of a wing or of the parameters of any model.
+    """Read a calibration, of a wing or of any model's parameters, from its file.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[Groups, Root]:
 
 @lru_cache(maxsize=8)
 def _tree(path: Path, content: bytes) -> xr.DataTree:
-    """Return the groups of a file, which are cached for each hash of its content.
+    """Return the groups of a file; they are cached by the hash of the content.
 
     A run reads the same calibration some twenty times.
 

@@ -289,7 +289,7 @@ class Calibration:
         return float(np.mean(self.draws_of(name)))
 
     def standard_deviation(self, name: str) -> float:
-        """Return the posterior standard deviation of a figure, SI; zero where it does not vary."""
+        """Return the posterior standard deviation of a figure, SI; zero for a fixed figure."""
         return moments(self.draws_of(name))[1]
 
     def prior_moments(self, name: str) -> tuple[float, float]:
@@ -401,7 +401,7 @@ class Calibration:
         name : str
             The parameter whose values are given.
         values : (n,) array
-            Its values [unit].
+            The values of that figure, in its unit.
 
         Returns
         -------
@@ -503,7 +503,7 @@ def correlation(values: Float) -> Float:
 
 
 def check_name(asset: str) -> str:
-    """Return the name of an asset if it can be printed.
+    """Return the name of an asset; refuse a name that cannot be printed.
 
     Raises
     ------

@@ -232,7 +232,7 @@ class _RecordMaker:
         Parameters
         ----------
         procedure : Procedure
-            The procedure.
+            The procedure by which the wing was calibrated.
         states : (N, 5) array
             Its samples of e, masses and Rayleigh coefficients.
         """

@@ -119,7 +119,7 @@ def _mean_mode(windows: Sequence[RingDownMode]) -> _MeanMode:
 
 
 def _softening_sentences(windows: Sequence[RingDownMode]) -> list[str]:
-    """Return a sentence that the first frequency depends on the amplitude, if it does.
+    """Return a sentence on the dependence of the first frequency on the amplitude, if there is one.
 
     The third of the windows with the smallest amplitudes is compared with the third with the
     largest.

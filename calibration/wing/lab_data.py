@@ -49,7 +49,7 @@ def write_lab_folder(
     records: Sequence[RingDownRecord],
     total_mass: FigureReading,
 ) -> tuple[Path, ...]:
-    """Write measurements into a folder as `read_lab_folder` reads them; each file in one step.
+    """Write measurements into a folder, in the layout that `read_lab_folder` reads.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def published_data() -> LabData:
 def read_lab_folder(
     path: Path, targets: Targets | None = None, *, frequencies_fitted: bool = False
 ) -> LabData:
-    """Return the measurements in a lab folder; those of a missing step are the published ones.
+    """Return the measurements in a lab folder; for a missing step, the published measurements.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def read_lab_folder(
 
 
 def _with_origin(lab: LabData, step: int, text: str, *, read: bool) -> LabData:
-    """Return lab data in which one step has another origin."""
+    """Return lab data with another origin of one step."""
     origins = {origin.step: origin for origin in lab.origins}
     origins[step] = StepOrigin(step, read, text)
     return replace(lab, origins=tuple(origins.values()))
@@ -339,7 +339,7 @@ def _with_ring_downs(
 
 
 def _with_weighed_mass(lab: LabData, file: Path) -> LabData:
-    """Return lab data with the weighed mass of a file as its first reading."""
+    """Return lab data with the weighed mass that a file holds as its first reading."""
     mass = read_weighed_mass(file)
     _, *modes = lab.readings
     lab = replace(lab, readings=(mass, *modes))

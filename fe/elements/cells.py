@@ -204,7 +204,7 @@ class CellMesh:
 
     @property
     def unknowns(self) -> int:
-        """Number of displacements; that of a component of a node is 3 node + component."""
+        """Number of displacements; that of a node along an axis has the number 3 node + axis."""
         return AXES * len(self.points)
 
     @cached_property
@@ -358,7 +358,7 @@ class CellMesh:
     def mass(
         self, cells: IntArray, density: ArrayLike, rule: Rule | None = None
     ) -> sparse.csr_array:
-        """Return the mass of some cells, of one component of the displacement.
+        """Return the mass matrix of some cells for one component of the displacement.
 
         Parameters
         ----------

@@ -215,7 +215,7 @@ class StaticReduction:
         return float(np.max(relative))
 
     def model(self, directions: FloatArray | None = None) -> ReducedModel:
-        """Return the reduced model of the present basis, or of combinations of it.
+        """Return the reduced model on the present basis, or on combinations of its vectors.
 
         Parameters
         ----------
@@ -297,7 +297,7 @@ class StaticReduction:
         )
 
     def _residual_allowance(self) -> float:
-        """Return the bound of what the basis of residuals leaves out, per unit of coordinates.
+        """Return a bound of the residual outside the basis of residuals, per unit coordinate.
 
         By Cauchy and Schwarz |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta), where theta is
         largest at the largest parameters and the least losses.
@@ -318,8 +318,8 @@ class StaticReduction:
     def bound(self, model: ReducedModel, state: State) -> float:
         """Return the certified relative bound of a reduced model at a state.
 
-        It is the largest of all loads, each relative to its largest strain or displacement, or to
-        `least_outputs` if that is larger.
+        The result is the largest bound of all loads. The bound of a load is relative to the largest
+        strain or displacement under the load, or to `least_outputs` if that is larger.
         """
         worst = 0.0
         for number, response in enumerate(self.responses(model, state)):
@@ -418,7 +418,7 @@ class StaticReduction:
         )
 
     def compressed(self, tolerance: float) -> FloatArray:
-        """Return the fewest combinations (N, K) of the basis whose bound keeps a tolerance."""
+        """Return as few combinations (N, K) of the basis as keep the bound within a tolerance."""
         model = self.model()
         states = self.terms.training_states()
         coordinates: list[FloatArray] = []

@@ -166,7 +166,7 @@ def _project_batch(
 
 
 def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
-    """Return a small matrix by which the norm of a dual residual is evaluated.
+    """Return a small matrix that has the norm of each dual residual.
 
     The residual of a dual solution is the output minus a combination of forces, with n rows:
     r = [output, force] c. Its norm is needed for many combinations c. With the QR factorisation

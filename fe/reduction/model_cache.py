@@ -141,7 +141,7 @@ def reduced_model(
     memory_limit: float | None = None,
     with_ports: bool = False,
 ) -> ReducedModel:
-    """Return the reduced model of a wing, or of a structure file, from the cache if it is there.
+    """Return the reduced model of a wing or of a structure file, from the cache if possible.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def wing_fields(
     progress: Progress | None = None,
     settings: StructureSettings | None = None,
 ) -> WingFields:
-    """Return the reduced model of a wing with its bases on the mesh, from the cache if it is there.
+    """Return the reduced model of a wing with its bases on the mesh, from the cache if possible.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators
 
 
 def patch_arrays(design: WingDesign | None = None, progress: Progress | None = None) -> PatchArrays:
-    """Return the arrays of a wing that can be patched, from the cache if they are there.
+    """Return the arrays of a wing that can be patched, from the cache if possible.
 
     Parameters
     ----------

@@ -193,7 +193,7 @@ class ReductionTerms:
         self.loads: FloatArray = np.stack([zero_column, *load_sums.values()], axis=1)[:, 1:]
 
     def _set_outputs(self) -> None:
-        """Set the outputs and the groups in which they are judged."""
+        """Set the outputs, and the groups of outputs that are judged by a common scale."""
         rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
         self.outputs: FloatArray = np.asarray(rows.T.toarray())
         gauges = len(self.structure.gauges)
@@ -223,7 +223,7 @@ class ReductionTerms:
         return np.asarray(parameter[parameter_numbers] * remaining_stiffness[region_numbers])
 
     def losses_at(self, *fractions: float) -> FloatArray:
-        """Return losses (B, K), all of them at each of B fractions of their ranges."""
+        """Return losses (B, K): in each of B states, all K losses are at one fraction of their ranges."""
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:

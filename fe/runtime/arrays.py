@@ -225,7 +225,7 @@ class StoredArrays:
         return f"{type(self).__name__}({', '.join(plain_values)})"
 
     def _error(self, fault: str) -> ReducedModelFileError:
-        """Return the error of an inconsistent record; `fault` is the rest of its sentence."""
+        """Return the error for an inconsistent record; `fault` completes the sentence."""
         name = f"{self.record_name[0].upper()}{self.record_name[1:]}"
         return ReducedModelFileError(f"{name} {fault}; build it anew.")
 

@@ -53,7 +53,7 @@ class PatchedModes(NamedTuple):
 
 
 def solver_by_inverse(stiffness: FloatArray) -> Solver:
-    """Return the solver of a stiffness (n, n) by its inverse: NumPy has no Cholesky solution."""
+    """Return a solver by the inverse of a stiffness (n, n), as NumPy solves no Cholesky factors."""
     inverse = np.linalg.inv(stiffness)
 
     def solve(loads: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ def motion_basis(
     static : callable
         K^-1 of loads (n, k).
     mass : (n, n) array
-        M.
+        The mass matrix M [kg].
     start : (n, r) array
         Modes of a similar structure.
     static_shapes : (n, s) array

@@ -196,7 +196,7 @@ def _coordinate_system(block: _Block) -> CoordinateSystem:
 
 
 def _add_nodes(deck: Deck, block: _Block, coordinates: CoordinateSystem) -> None:
-    """Add the nodes of a *NODE, whose coordinates are in the system of the last *SYSTEM."""
+    """Add the nodes of a *NODE; their coordinates are in the system of the last *SYSTEM."""
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
@@ -264,7 +264,7 @@ def _plain_type(name: str, where: str) -> str:
 
 
 def _refuse_type(name: str, where: str) -> NoReturn:
-    """Refuse a type of elements; of a variant of a known type, the message says how it differs."""
+    """Refuse a type of elements; for a variant of a known type, the message says how it differs."""
     readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
     variant = _VARIANT.fullmatch(name)
     if variant is None or variant[1] not in _ELEMENT_TYPES:

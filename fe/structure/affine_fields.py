@@ -121,7 +121,7 @@ def affine_fields(
 
 
 def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
-    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold it."""
+    """Raise `InvalidDesignError` if the supports hold a port, whose row (n,) is then zero."""
     for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
         if not row.any():
             raise InvalidDesignError(

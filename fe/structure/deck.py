@@ -116,7 +116,7 @@ class Deck:
         kind : {"NSET", "ELSET"}
             A set of nodes, or of elements.
         name : str
-            Its name.
+            The name of the set.
         """
         key = name.casefold() if self.words else name
         return self._sets[kind].setdefault(key, _NamedSet(name, [])).members
@@ -138,7 +138,7 @@ class Deck:
         return self.counted(where, members)
 
     def counted(self, where: str, members: Sequence[int]) -> list[int]:
-        """Return members of a set as a list; refuse more of them than any mesh has."""
+        """Return the members of a set as a list; refuse more members than any mesh has."""
         self._members_left -= len(members)
         if self._members_left < 0:
             fail(where, f"the sets hold more than {_MOST_MEMBERS:,} members together.")
@@ -168,7 +168,7 @@ class Deck:
         where : str
             Its file and line.
         number : int
-            Its number.
+            The number of the element.
         element_type : str
             Its type in meshio.
         nodes : list of int
@@ -321,7 +321,7 @@ class Deck:
         return {number: index for index, number in enumerate(self.nodes)}
 
     def _flat_faces(self, name: str, members: list[int]) -> list[Face]:
-        """Return the flat elements of a set as faces; refuse those that bear loads.
+        """Return the flat elements of a set as faces; refuse elements with a section, which bear loads.
 
         Parameters
         ----------

@@ -89,7 +89,7 @@ def lines_of(
     files : tuple of Path
         The files that include one another, the one to be read last.
     comment : pattern
-        Matches comments.
+        The pattern of a comment.
     include : pattern
         Matches a line that includes a file, whose name is its group.
 

@@ -168,7 +168,7 @@ def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_
 
 
 def _load(load: MatrixLoad, files: MatrixFiles, where: str) -> FloatArray:
-    """Return the vector (n,) of a load [N], or of the field of an acceleration [m/s^2]."""
+    """Return the vector (n,) of a load [N], or of an acceleration [m/s^2] at all rows."""
     if load.acceleration is not None:
         return files.uniform_field(load.acceleration, where)
     if load.node is not None and load.force is not None:

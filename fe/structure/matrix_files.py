@@ -135,7 +135,14 @@ class MatrixFiles:
         return np.asarray(np.sum(components, axis=0))
 
     def uniform_field(self, field: Vector, where: str) -> FloatArray:
-        """Return the vector (n,) of the same shift of all nodes.
+        """Return the values (n,) of a vector field, such as an acceleration, equal at all nodes.
+
+        Parameters
+        ----------
+        field : (3,) tuple
+            The components of the field along the axes; rotations are zero.
+        where : str
+            The key that needs the field, for messages.
 
         Raises
         ------

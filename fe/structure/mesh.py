@@ -150,7 +150,7 @@ class StructureMesh(CellMesh):
         return self._members(sets, name, "cells", "cell", where)
 
     def nodes_of(self, name: str, where: str) -> IntArray:
-        """Return the nodes (m,) of a set of nodes or faces; parameters are those of `cells_of`.
+        """Return the nodes (m,) of a set of nodes or of faces; the parameters are as in `cells_of`.
 
         Raises
         ------

@@ -107,7 +107,7 @@ def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
 
 
 def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
-    """Return the nodes (E, n) of a block of elements; none for elements of an unknown type.
+    """Return the nodes (E, n) of a block of elements, or no nodes if the type is unknown.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ def _check_element_lines(path: Path) -> None:
 
 
 def _mesh_of_meshio(path: Path) -> Mesh:
-    """Return the mesh that meshio reads from a file, or say in one sentence why it does not."""
+    """Return the mesh that meshio reads from a file; if it fails, say in one sentence why."""
     printed_text = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program if it fails.

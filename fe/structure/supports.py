@@ -65,7 +65,7 @@ class Supports(NamedTuple):
 def supports(
     points: FloatArray, is_held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
 ) -> Supports:
-    """Return the free unknowns of nodes, of which some are held, sprung or rigid.
+    """Return the free unknowns of a structure, some of whose nodes are held, sprung or rigid.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def supports(
     springs : (nodes, 3) array
         Springs to the ground of nodes that belong to no rigid set [N/m].
     bodies : iterable of RigidSet
-        The rigid sets.
+        The sets of nodes that move as rigid bodies.
     """
     is_free = ~is_held
     body_expansions = []

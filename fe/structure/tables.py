@@ -293,7 +293,7 @@ class StructureDesign(DesignSection):
     def wrong_ties(
         self, table: str, key: str, named_table: str, *, tied: str, untied: str
     ) -> Iterator[Fault]:
-        """Yield faults of ties to names that another table lacks, and of names without a tie.
+        """Yield the faults of ties: names that the other table lacks, and names without a tie.
 
         Parameters
         ----------

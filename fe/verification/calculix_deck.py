@@ -299,7 +299,7 @@ def _template() -> Template:
 
 
 def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
-    """Yield the equations by which the corners of a block move with the point of its mass."""
+    """Yield the equations that make the corners of a block move with the point of its mass."""
     nodes = np.flatnonzero(block.weights).tolist()
     for corner, direction in itertools.product(block.corners, (1, 2, 3)):
         weighted = [Term(node + 1, direction, float(block.weights[node])) for node in nodes]

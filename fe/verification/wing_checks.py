@@ -239,7 +239,7 @@ class Check:
 
 
 def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[Check]:
-    """Return every check of a design; those against CalculiX if it is installed.
+    """Return all checks of a design, with those against CalculiX if CalculiX is installed.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
 
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
-    """Yield checks of the forces, masses and energies of the wing, at the load factor of its lift.
+    """Yield the checks of the wing's forces, masses and energies, at the load factor of its lift.
 
     First, rigid motions must cause no elastic force. The figure is the largest entry of K r,
     for all rigid motions r that the root allows and without the springs of the root, relative to

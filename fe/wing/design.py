@@ -28,7 +28,7 @@ _NAMES = Path(__file__).with_name("names.toml")
 
 
 def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
-    """Return the structure design of a wing: names and ranges of its inputs, names of its outputs.
+    """Return the names and ranges of a wing's inputs, and the names of its outputs, as a design.
 
     Parameters
     ----------

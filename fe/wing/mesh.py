@@ -149,7 +149,7 @@ class WingMesh(CellMesh):
 
 
 def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
-    """Return the interval of lines that contains a position, and the local coordinate in it."""
+    """Return the interval between mesh lines that contains a position, and the position in it."""
     last_interval = len(lines) - 2
     line = np.searchsorted(lines, position, side="right") - 1
     interval = int(np.clip(line, 0, last_interval))
@@ -222,7 +222,7 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
 
 
 def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return moments of the gap between the airfoil and straight edges through its mesh points.
+    """Return moments of the gap between the airfoil and the straight edges of its mesh.
 
     For each mesh line, the gap times the linear shape function (hat) of the line is integrated over
     the chord, by Gauss-Legendre quadrature in each cell.

@@ -104,7 +104,7 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
 
 
 def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
-    """Return whether a line can be added between others.
+    """Return whether a new line keeps its distance from all others.
 
     It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
     the chords.
@@ -267,7 +267,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return the interval in which the middle of each cell between mesh lines lies.
+    """Return for each cell between mesh lines the interval that contains its middle.
 
     Parameters
     ----------

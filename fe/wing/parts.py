@@ -353,7 +353,7 @@ class MeshSettings(DesignSection):
 
 
 def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
-    """Return the mean of the chord and of an elliptic distribution of its area (Schrenk 1940).
+    """Return Schrenk's lift distribution: the mean of the chord and of an ellipse of equal area.
 
     Parameters
     ----------
