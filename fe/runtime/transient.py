@@ -408,7 +408,7 @@ class ModalIntegrator:
     # ------------------------------------------------------------ change of health
 
     def take_over(self, state: TransientState, previous: "ModalIntegrator") -> TransientState:
-        """Return the state of another integrator in the modes of this one, after a change of health.
+        """Return the state of another integrator in the modes of this one, if health changes.
 
         Displacement and velocity of the structure stay what they were; they are projected on the
         new modes with the new mass matrix, exactly in reduced coordinates. What the new modes

@@ -279,7 +279,7 @@ class WingRows:
 
     @cached_property
     def static_shape_rows(self) -> FloatArray:
-        """Rows (s, n) of the load point and of `PORTS`; a basis of motion has their static shapes."""
+        """Rows (s, n) of the load point and of `PORTS`: a basis of motion has their shapes."""
         return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
     def output_row(self, name: str) -> FloatArray | None:

@@ -321,7 +321,7 @@ class Deck:
         return {number: index for index, number in enumerate(self.nodes)}
 
     def _flat_faces(self, name: str, members: list[int]) -> list[Face]:
-        """Return the flat elements of a set as faces; refuse elements with a section, which bear loads.
+        """Return the flat elements of a set as faces; refuse elements that bear loads.
 
         Parameters
         ----------

@@ -50,7 +50,7 @@ class AffineWing(AffineStructure):
 
     @property
     def load_tip(self) -> FloatArray:
-        """Upward load (n,) of 1 N at the point of the static test; as a row, displacement of the point."""
+        """Upward load (n,) of 1 N at the point of the static test; as a row, its displacement."""
         return self.load_terms[1].vector
 
     @property
