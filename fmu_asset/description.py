@@ -54,7 +54,7 @@ class Declaration:
     name : str
         Model name, with which the model identifier begins.
     description : str
-        One sentence for people.
+        A sentence that describes the FMU to people.
     table : tuple of FmuVariable
         The variables, in the order of their value references. Local ones are states, and then as
         many derivatives.

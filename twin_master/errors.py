@@ -92,13 +92,13 @@ def check_names(
     Parameters
     ----------
     owner : str
-        What has the names, as the beginning of the sentence: "the scenario has the".
+        The owner of the names, as the beginning of the sentence: "the scenario has the".
     reference : str
-        What knows names: "the binding uav_wing".
+        The place where names are known: "the binding uav_wing".
     rows : iterable of (str, iterable of str, collection of str)
         For each kind of name: what is named, in the singular; the names; the known names.
     advice : str
-        What the user can do.
+        The advice to the user, which ends the message.
 
     Raises
     ------

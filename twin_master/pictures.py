@@ -38,7 +38,7 @@ def plot_belief(
     Parameters
     ----------
     run : DataTree or RunOutcome
-        What `open_run` or `fly` returns.
+        The results of a run, from `open_run` or `fly`.
     axes : Axes or sequence of Axes, optional
         A panel for each factor; new ones of pyplot by default.
 
@@ -88,7 +88,7 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     Parameters
     ----------
     run : DataTree or RunOutcome
-        What `open_run` or `fly` returns.
+        The results of a run, from `open_run` or `fly`.
     axes : Axes, optional
         The panel; a new one of pyplot by default.
 

@@ -365,7 +365,7 @@ class CellMesh:
         cells : (n,) array of int
             The numbers of the cells.
         density : (n,) array or float
-            Their density [kg/m^3].
+            The density of the cells [kg/m^3].
         rule : Rule, optional
             Integration rule; by default the mass rule of the kind.
 

@@ -175,9 +175,9 @@ class ElementKind:
     Attributes
     ----------
     name : str
-        Its name in sentences, in the plural.
+        The name of the kind in sentences, in the plural.
     file_type, calculix : str
-        Its names in meshio and in CalculiX.
+        The names of the kind in meshio and in CalculiX.
     exponents : (k, 3) tuples
         Exponents of the monomials that span the shape functions.
     corners : (c, 3) tuples
@@ -275,7 +275,7 @@ class ElementKind:
         values : (q, k) array
             Values of the shape functions.
         gradients : (q, k, 3) array
-            Their local gradients.
+            The gradients of the shape functions by the local coordinates.
         """
         exponents = np.array(self.exponents)
         # powers 0, 1, 2 of each coordinate (q, 3, 3), and their derivatives

@@ -236,7 +236,7 @@ def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
     parts : _Parts
         The parts.
     cuts : Cuts
-        Their cuts.
+        The cuts of the parts.
     position : (n,) array of int
         The first position of the block of each vertex; changed in place.
     """

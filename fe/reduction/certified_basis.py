@@ -110,7 +110,7 @@ class StaticReduction:
     design_fields : DesignFields
         The fields of the reduced model that no basis changes.
     modal : ModalReduction
-        Its modal basis.
+        The modal basis of the structure.
     stage : Stage
         Advances after each state.
 

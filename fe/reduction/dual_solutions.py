@@ -56,7 +56,7 @@ def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> 
     terms : ReductionTerms
         The full model, with n free unknowns.
     outputs : (n, O) array
-        Its outputs, whitened.
+        The outputs of the full model, whitened.
     stage : Stage
         Advances after each state.
 

@@ -148,7 +148,7 @@ def reduced_model(
     source : WingDesign, Path or str, optional
         The design of a wing, by default the shipped one, or the path of a structure file.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
         The accuracy that is asked for of a wing; by default that of the design.
     memory_limit : float, optional
@@ -186,7 +186,7 @@ def wing_fields(
     design : WingDesign, optional
         The wing; the shipped one by default.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
         The accuracy that is asked for; by default that of the design.
 
@@ -229,7 +229,7 @@ def patch_arrays(design: WingDesign | None = None, progress: Progress | None = N
     design : WingDesign, optional
         The wing; the shipped one by default.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the arrays must be built.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingField
     operators : AffineOperators
         The full model of the wing.
     reduction : Reduction
-        Its reduced model, and the bases.
+        The reduced model of the structure, and the bases.
     """
     mesh = operators.wing_mesh
 

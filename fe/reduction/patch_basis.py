@@ -157,7 +157,7 @@ def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray
     full_model : PatchOperators
         The full model of the wing, with the rows that patches act on.
     modes : (n, m) array
-        Its modes.
+        The lowest modes of the model.
     """
     operators = full_model.operators
     lines = full_model.line_rows

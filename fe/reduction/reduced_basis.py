@@ -198,7 +198,7 @@ def measured_errors(
     structure : AffineStructure
         The full finite element model.
     model : ReducedModel
-        Its reduced model.
+        The reduced model of the structure.
     states : int
         The number of states, uniform in the ranges; each costs a factorisation.
     seed : int

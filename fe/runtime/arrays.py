@@ -134,7 +134,7 @@ class StoredArrays:
     Class attributes
     ----------------
     record_name : str
-        What the record is, with its article, for sentences.
+        The noun of the record, with its article, for sentences.
     version : int
         Version of the layout of its file.
 

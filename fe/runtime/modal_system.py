@@ -58,7 +58,7 @@ def rayleigh_coefficients(
     frequency : tuple of float
         Two different natural frequencies [Hz].
     damping_ratio : tuple of float
-        Their damping ratios [1].
+        The damping ratios of the modes [1].
 
     Returns
     -------

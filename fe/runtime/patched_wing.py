@@ -265,7 +265,7 @@ class PatchedStructure:
     wing : PatchedWing
         The wing in its basis for patches.
     stiffness, mass : (n, n) array
-        Its matrices in this state and under this patch.
+        The matrices of the wing in this state and under this patch.
     patch : ModelPatch
         The primitive changes of the model.
 

@@ -117,7 +117,7 @@ def apply_sensors(
     values : (N, C) array
         Readings of perfect sensors, in the units of the channels.
     rates : (N, C) array, optional
-        Their time derivatives, for dynamic trials.
+        The time derivatives of the readings, for dynamic trials.
     transverse, shear : (N, C) array, optional
         Strain across the direction of each gauge and engineering shear strain, for rotations.
     high_pass : callable
@@ -129,7 +129,7 @@ def apply_sensors(
     values : (N, C) array
         The readings.
     rates : (N, C) array or None
-        Their time derivatives, if those of the perfect readings were given.
+        The time derivatives of the readings, if those of the perfect readings were given.
 
     Raises
     ------

@@ -77,7 +77,7 @@ class ModalIntegrator:
     structure : StructureInMotion
         The structure whose motion is integrated.
     modes : ModeSet
-        Its modes.
+        The modes of the structure.
     damping_ratio : (M,) array
         Damping ratios of the modes, eq. (18).
 

@@ -249,7 +249,7 @@ def _plain_type(name: str, where: str) -> str:
     name : str
         The type in the deck.
     where : str
-        Its file and line.
+        The file and the line that name the type.
     """
     same_stiffness = _SAME_STIFFNESS.fullmatch(name)
     if name in _TYPES_OF_MESHIO:

@@ -293,7 +293,7 @@ def _values_with_changes(
     changed_values : mapping of str to float, optional
         The values that differ from the nominal ones, by name.
     kind : str
-        What is named in error messages: "parameter" or "free mass".
+        The noun of the values in error messages: "parameter" or "free mass".
 
     Raises
     ------

@@ -99,7 +99,7 @@ class Deck:
         word : str
             A word of the dialect; one that is not known gets a remark.
         where : str
-            Its file and line.
+            The file and the line that name the set.
         """
         assert self.words is not None
         if word in self.words.refused:
@@ -150,9 +150,9 @@ class Deck:
         Parameters
         ----------
         where : str
-            Its file and line.
+            The file and the line of the node.
         number : int
-            Its number; a node that is there twice must be at one point.
+            The number of the node; a node that is there twice must be at one point.
         coordinates : sequence of float
             x, y and z [unit of length of the file].
         """
@@ -166,11 +166,11 @@ class Deck:
         Parameters
         ----------
         where : str
-            Its file and line.
+            The file and the line of the element.
         number : int
             The number of the element.
         element_type : str
-            Its type in meshio.
+            The type of the element in meshio.
         nodes : list of int
             The numbers of its nodes.
         """

@@ -121,9 +121,9 @@ def _averaging_points(
     gauge : Gauge
         The gauge.
     point, direction, normal : (3,) array
-        Its middle [m], and unit vectors along it and normal to the surface.
+        The middle of the gauge [m], and unit vectors along it and normal to the surface.
     where : str
-        Its name in sentences.
+        The name of the gauge in sentences.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class _Parametrisation(NamedTuple):
     origin : (n, 3) array
         Local positions where the coordinates are zero.
     tangents : (n, t, 3) array
-        Their derivatives by the coordinates.
+        The derivatives of the local positions by the coordinates.
     """
 
     cells: IntArray

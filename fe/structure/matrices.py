@@ -51,7 +51,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     folder : Path
         The folder of its files.
     design_hash : str
-        Its hash.
+        The hash of the design and its files.
 
     Raises
     ------
@@ -349,7 +349,7 @@ def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
     is_faulty : (m,) array of bool
         Whether a row has the fault.
     fault : str
-        What the row has, for the message: "a negative mass".
+        The fault of the row, as the object of "has": "a negative mass".
     """
     count = int(is_faulty.sum())
     if not count:

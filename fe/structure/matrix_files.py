@@ -74,7 +74,7 @@ class MatrixFiles:
         place : (int, int)
             Node and component.
         where : str
-            What names them, for sentences.
+            The key of the design that names the node, for sentences.
 
         Raises
         ------

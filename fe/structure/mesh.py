@@ -62,7 +62,7 @@ class StructureMesh(CellMesh):
     unit : float
         Metres in a unit of length of the file.
     unit_name : str
-        Its name.
+        The name of the unit.
     node_numbers : (nn,) array of int
         Numbers of the nodes in the file, or from 1 if it has none.
     cell_numbers : (nc,) array of int
@@ -178,7 +178,7 @@ class StructureMesh(CellMesh):
         name : str
             Name of the set.
         kind, member : str
-            What the sets hold, and one member, for sentences.
+            The word for the content of the sets, and that for one member, in sentences.
         where : str
             The key in the design that names the set.
 

@@ -114,7 +114,7 @@ def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
     block_type : str
         The type of the elements in meshio.
     data : (E, n) array
-        Their nodes as meshio has read them.
+        The nodes of the elements as meshio has read them.
     suffix : str
         The ending of the file: MED has an order of nodes of its own.
     """

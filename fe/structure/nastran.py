@@ -44,9 +44,9 @@ class _Card(NamedTuple):
     word : str
         The word that it begins with.
     where : str
-        Its file and line.
+        The file and the line of the entry.
     fields : list of str
-        Its fields from the second on, with those of its continuations.
+        The fields of the entry from the second on, with those of its continuations.
     """
 
     word: str

@@ -69,7 +69,7 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
     load : MeshLoad
         The load.
     where : str
-        Its name in sentences.
+        The name of the load in sentences.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     port : MeshPort
         The port.
     where : str
-        Its name in sentences.
+        The name of the port in sentences.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
     point : (float, float, float)
         The point, in the unit of length of the mesh.
     where : str
-        What it is of, for sentences.
+        The name of the point's owner in sentences, such as a load.
 
     Raises
     ------

@@ -45,7 +45,7 @@ class Structure(AffineStructure):
     design : MeshDesign
         The design, as read from its file.
     body : Body
-        Its mesh with materials and supports.
+        The mesh of the structure, with materials and supports.
     material_of : (nc,) array of int
         Number of the material of each cell.
     region_of : (nc,) array of int
@@ -74,7 +74,7 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     design : MeshDesign
         The design, as read from its file.
     file : Path
-        Its file; the design may name the mesh relative to it.
+        The path of the design's file; the design may name the mesh relative to it.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _part_of_cells(
     labelled : list of (str, Material or Damage)
         The parts, each with its key in the file.
     kind : str
-        What the parts are, for sentences.
+        The noun of the parts in sentences.
 
     Raises
     ------

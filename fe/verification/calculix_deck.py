@@ -149,7 +149,7 @@ class CalculixDeck:
     body : Body
         Its mesh with materials and supports; the n free unknowns are in the order of its supports.
     values : mapping of str to float
-        Its state by name; the other values are nominal, and healthy.
+        The state of the structure by name; all other values are nominal, and healthy.
     loads : mapping of str to Step
         Static steps of its loads, each alone.
     grading : Grading, optional
@@ -369,7 +369,7 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     operators : AffineOperators
         The finite element operators of the wing.
     state : DigitalState
-        Its state.
+        The state of the wing.
     """
     mesh = operators.wing_mesh
     design = mesh.design

@@ -73,7 +73,7 @@ class Balance(NamedTuple):
     value, expected : float
         The sums.
     unit : str
-        Their unit.
+        The unit of both sums.
     """
 
     value: float
@@ -217,7 +217,7 @@ class Check:
     Attributes
     ----------
     group, name : str
-        What is checked.
+        The group of the check, and the quantity that is checked.
     value : float
         The figure.
     limit : float, optional
@@ -246,7 +246,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
     design : WingDesign
         The design of the wing.
     jobs : Path
-        Where CalculiX works.
+        The folder in which CalculiX writes its files.
     quick : bool
         Use coarser meshes.
     """
@@ -354,7 +354,7 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
     operators : AffineOperators
         The finite element operators of the wing.
     jobs : Path
-        Where CalculiX works.
+        The folder in which CalculiX writes its files.
     """
     damaged = tuple(
         DAMAGED_LOSSES[number % len(DAMAGED_LOSSES)] for number in range(len(operators.regions))

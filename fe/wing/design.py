@@ -329,7 +329,7 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
     content : dict
         The content of the file.
     source : str
-        Its name in sentences.
+        The name of the design in sentences.
 
     Raises
     ------

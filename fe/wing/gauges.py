@@ -67,7 +67,7 @@ class _SkinPoint(NamedTuple):
     cell : int
         The cell of the point.
     local : (3,) array
-        Its local position in the cell.
+        The local position of the point in the cell.
     """
 
     gauge: int
@@ -155,7 +155,7 @@ def _directions_in_skin(
     cells : (p,) array of int
         Cells.
     local_positions : (p, 3) array
-        One local position in each of them.
+        A local position in each of the cells.
 
     Returns
     -------

@@ -22,11 +22,11 @@ class MeshLine(NamedTuple):
     Attributes
     ----------
     fraction : float
-        Its position as a fraction of the local chord; zero for a line across the span.
+        The position of the line as a fraction of the local chord; zero across the span.
     offset : float
-        Its distance from there [m].
+        The distance of the line from this position [m].
     label : str
-        Its name in sentences.
+        The name of the line in sentences.
     """
 
     fraction: float
@@ -169,7 +169,7 @@ def span_lines(design: WingDesign) -> FloatArray:
     Returns
     -------
     (ny + 1,) array
-        Their distances from the root [m].
+        The distances of the lines from the root [m].
 
     Raises
     ------

@@ -92,7 +92,7 @@ class PatchOperators:
     operators : AffineOperators
         The finite element operators of the wing.
     layout : WingLayout
-        What has no unknowns.
+        The places and lengths of a wing, which no unknown changes.
     line_rows : LineRows
         Displacements of the lines along the span.
     strain_rows : StrainRows

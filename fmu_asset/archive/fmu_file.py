@@ -98,7 +98,7 @@ def inspect_fmu(
     Returns
     -------
     description : FmuDescription
-        What the FMU declares.
+        The declarations of the FMU.
     obstacle : str
         A sentence that says why it has no binary for this platform; empty if it has one.
 
@@ -273,7 +273,7 @@ def check_archive(
     file : Path
         The path of the archive.
     size : int
-        Its size [bytes].
+        The size of the archive [bytes].
     archive_kind : str
         The kind of file that the archive should be, for the message.
     remedy : str

@@ -20,7 +20,7 @@ class Finding:
     verdict : {"ok", "warning", "problem", "skipped"}
         A warning is allowed but makes an FMU harder to use.
     text : str
-        One sentence.
+        The finding as one sentence.
     """
 
     check: str

@@ -68,7 +68,7 @@ def check_fmu(
     step_timeout, memory_limit : float, optional
         Limits of the workers, as in `FmiAsset`.
     progress : Progress, optional
-        Where progress is shown.
+        The display of the progress.
 
     Returns
     -------

@@ -90,7 +90,7 @@ class RunChecks:
         cycles : int
             Number of instances that are made one after the other; 0 skips that check.
         progress : Progress
-            Where progress is shown.
+            The display of the progress.
         """
         checks: dict[str, Callable[[], CheckResult]] = {
             "determinism": self._check_determinism,
@@ -257,7 +257,7 @@ class RunChecks:
         step : float
             The step size that it refuses [s].
         error : FmuCallError
-            Its error.
+            The error of the step.
         """
         if self._description.can_vary_step:
             text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
@@ -320,7 +320,7 @@ class RunChecks:
         cycles : int
             The number of instances.
         progress : Progress
-            Where progress is shown.
+            The display of the progress.
         """
         half_of_cycles = cycles // 2
         number = 0

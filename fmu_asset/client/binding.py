@@ -135,17 +135,17 @@ class Binding(Section):
     control, health, load : dict of str to InputBinding
         Inputs by role and by the caller's name.
     observation : dict of str to VectorBinding
-        What is measured, in order.
+        The measured quantities, in order.
     parameter : dict of str to ParameterBinding
         Parameters by the caller's name.
     monitor : dict of str to ScalarBinding
         Further scalars to be recorded.
     port : dict of str to PortBinding
-        Where other FMUs can be coupled.
+        The ports at which other FMUs can be coupled.
     record : RecordBinding
         Further variables to be recorded, in the FMU's units.
     limits : WorkerLimits
-        What the worker may take.
+        The time and memory that the worker may take, and its permissions.
     """
 
     binding: BindingHeader

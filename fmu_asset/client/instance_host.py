@@ -64,7 +64,7 @@ class InstanceHost:
     description : FmuDescription
         The variables and abilities that the FMU declares.
     plan : Plan
-        What is exchanged; its folder is still empty.
+        The variables that each call exchanges with the FMU; the folder is still empty.
     limits : WorkerLimits
         Limits of the worker.
     isolated : bool
@@ -75,7 +75,7 @@ class InstanceHost:
     instance : FmuInstance, WorkerInstance or None
         The instance, if there is one.
     reset_trial : ResetTrial
-        What is known about restarts of the FMU.
+        The knowledge about restarts of the FMU.
     """
 
     def __init__(

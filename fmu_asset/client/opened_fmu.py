@@ -457,7 +457,7 @@ class OpenedFmu:
         error : FmuError
             The error that the FMU or its worker raised.
         action : str
-            What was done, such as "the start".
+            The action that failed, such as "the start".
         """
         for message in error.messages:
             self._log.append(("Error", message))

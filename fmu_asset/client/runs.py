@@ -165,7 +165,7 @@ class FmuRuns:
         asset : FmiAsset
             The instance at its start; if there are initial offsets, at rest under them.
         outputs : (C,) ndarray
-            Its outputs.
+            The outputs of the instance at the start.
         inputs : dict of str to (steps,) ndarray
             The value of every input in each step.
 

@@ -155,7 +155,7 @@ def partial_state_sentence(fault: str) -> str:
     Parameters
     ----------
     fault : str
-        What the FMU does wrong, such as "does not restore all of its state".
+        The fault of the FMU, such as "does not restore all of its state".
     """
     return (
         f'it declares canGetAndSetFMUstate but {fault}; write `state = "replay"` into the table '

@@ -150,7 +150,7 @@ class SteppedFmu(OpenedFmu):
         steps : int, optional
             The number of steps N; if left out, the length of the histories.
         progress : Progress, optional
-            Where progress is shown.
+            The display of the progress.
 
         Raises
         ------
@@ -238,7 +238,7 @@ class SteppedFmu(OpenedFmu):
         replies : (N, n_outputs) ndarray
             Filled with the reply block of each step.
         progress : Progress, optional
-            Where progress is shown.
+            The display of the progress.
 
         Returns
         -------
@@ -343,7 +343,7 @@ class _StepCounter:
     Parameters
     ----------
     stage : Stage
-        Where progress is shown.
+        The stage that shows the progress.
 
     Attributes
     ----------

@@ -171,7 +171,7 @@ def compiled_members(
     model : ReducedArrays
         The reduced model of the structure.
     declaration : Declaration
-        What the FMU declares for co-simulation.
+        The declarations of the FMU for co-simulation.
     roles : StructureRoles
         The role of each of its variables.
     fmi : {2, 3}

@@ -103,7 +103,7 @@ class CoupledFmus(InstanceHost):
     components : dict of str to SteppedComponent
         The components, by name.
     assets : dict of str to FmiAsset
-        Their FMUs, by name.
+        The FMUs of the components, by name.
     jacobi : bool
         Whether all components take the outputs at the beginning of the step.
     iterations : int

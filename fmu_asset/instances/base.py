@@ -88,7 +88,7 @@ class FmuInstance(Instance):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
@@ -374,7 +374,7 @@ class FmuInstance(Instance):
         Parameters
         ----------
         verb : {"Set", "Get"}
-            What is done.
+            Whether the calls set or read the variables.
         groups : tuple of VariableGroup
             The groups, which follow one another in the block.
         doubles : C array of double
@@ -413,7 +413,7 @@ class FmuInstance(Instance):
         calls : list of FmiCall
             The calls.
         purpose : str
-            What the calls are for, for the message if the FMU refuses one.
+            The purpose of the calls, for the message if the FMU refuses one.
 
         Raises
         ------

@@ -282,7 +282,7 @@ class LinearInputs:
         The request block: time, step size, inputs at the end of the step, linear inputs at its
         begin.
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
@@ -337,7 +337,7 @@ class Instance(Protocol):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------

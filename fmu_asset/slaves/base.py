@@ -179,9 +179,9 @@ class Slave:
         checked_rows : int
             The number of rows, from the first, whose values must lie in their ranges.
         action : str
-            What is done, for messages.
+            The action, for messages.
         consequence : str
-            What a refusal means, for messages.
+            The consequence of a refusal, for messages.
         """
         try:
             if not self._check_ranges(checked_rows, consequence):
@@ -381,7 +381,7 @@ class Slave:
         first, end : int
             First row, and end of the rows.
         consequence : str
-            What a refusal means, for messages.
+            The consequence of a refusal, for messages.
         """
         values = self._values
         for index in range(first, end):

@@ -50,7 +50,7 @@ class StructureBehaviour:
     model : ReducedModel
         The reduced model of the structure.
     table : sequence of FmuVariable
-        Its variables, the inputs first.
+        The variables of the FMU, the inputs first.
     roles : StructureRoles
         Roles of variables.
     effects : SwitchableEffects, optional

@@ -236,7 +236,7 @@ class _ModelTable(VariableTable):
         group : _ValueGroup
             The group of the variable.
         name, variable : str
-            Its name in the model and in the FMU.
+            The name of the value in the model, and that of the variable in the FMU.
         """
         self.add(
             variable,

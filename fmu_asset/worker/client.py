@@ -43,7 +43,7 @@ class _CallKind(NamedTuple):
     limit : str
         Attribute of `WorkerLimits` with its limit of time.
     action : str
-        Its name in a sentence.
+        The name of the action in a sentence.
     """
 
     limit: Literal["load_time", "step_time"]
@@ -81,7 +81,7 @@ class WorkerLimits(Section):
     sandbox : bool
         Whether the system keeps the FMU from the user's files, from programs and from the network.
     read, write, ports, programs
-        What the sandbox grants all the same; see `Grants`.
+        The files, ports and programs that the sandbox grants all the same; see `Grants`.
     """
 
     step_time: Positive = 60.0
@@ -114,7 +114,7 @@ class WorkerInstance(Instance):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
     scratch : Path
         Folder of the worker alone; it is removed when the worker ends.
     limits : WorkerLimits

@@ -155,7 +155,7 @@ class WorkerProcess:
         Parameters
         ----------
         action : str
-            What the worker was doing, such as "a step".
+            The action of the worker at that time, such as "a step".
         """
         is_alive = not self._wait_for_end(CLOSE_LIMIT)
         self.kill()

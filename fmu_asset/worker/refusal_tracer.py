@@ -158,7 +158,7 @@ class RefusalTracer:
         call : SystemCall
             The call.
         arguments : list of int
-            Its arguments.
+            The arguments of the call.
         """
         count, first_description = self._refused.get(call.kind, (0, ""))
         description = first_description or self._description(thread, call, arguments)

@@ -211,7 +211,7 @@ class _Server:
         kind : Answer
             The kind of the answer.
         payload : bytes-like
-            Its content.
+            The content of the answer.
         """
         if os.getpid() != self._process:
             os._exit(0)  # this is a copy of the worker that the FMU has made

@@ -193,9 +193,9 @@ class FlownAndBelieved:
     Attributes
     ----------
     asset : str
-        What flies.
+        The asset that flies, in words.
     model : str
-        What predicts the observations of the twin.
+        The model that predicts the observations of the twin, in words.
     differ : bool
         Whether they are known to be different models.
     """
@@ -215,7 +215,7 @@ def calibration_sentence(
     record : mapping
         The record of the calibration that a run folder contains.
     asset, believed : str
-        What flies and what the twin believes, in words.
+        The asset that flies and the model that the twin believes, in words.
     hashes : mapping of str to str
         The hashes of the files and designs of the run, by name.
 

@@ -436,7 +436,7 @@ class LibrarySource(AssetSource):
         Parameters
         ----------
         verb : str
-            What is compared, for the message: "has the sensors".
+            The verb and the compared things, for the message: "has the sensors".
         of_library, of_scenario : sequence of str
             The labels of the library, and those that the scenario asks for.
         """

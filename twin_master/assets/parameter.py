@@ -257,7 +257,7 @@ def check_calibration(
         The hash of the believed design; empty if it is not known, or if the twin does not believe
         the model.
     advice : str
-        What the user can do about an unknown parameter, for the message.
+        The advice to the user about an unknown parameter, for the message.
 
     Raises
     ------

@@ -64,7 +64,7 @@ class ChosenValue(NamedTuple):
     Attributes
     ----------
     description : str
-        Which value it is, in words.
+        The value in words.
     name : str
         The input.
     value : float

@@ -93,7 +93,7 @@ def resolve_scenario(
     loaded_scenario : LoadedScenario
         The scenario and its file.
     overrides : Overrides or mapping, optional
-        What differs from the scenario.
+        The values that replace those of the scenario.
 
     Raises
     ------

@@ -257,7 +257,7 @@ class StrainLibrarySource(AssetSource):
     library : StrainLibrary
         The library.
     path : Path, optional
-        Its file, of which a run folder gets a copy.
+        The path of the library's file, of which a run folder gets a copy.
     """
 
     label = "strain library"

@@ -56,7 +56,7 @@ class SamplingOutcome:
     path : Path
         The path of the file.
     library : ObservationLibrary
-        Its content.
+        The content of the library.
     kept_blocks, block_count : int
         The number of blocks that an interrupted sampling had finished, and of all blocks.
     workers : int

@@ -401,7 +401,7 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
     begin : int
         The position of the first byte of the damaged line in the file.
     reason : str
-        What is wrong with the line, as a clause that the error message quotes.
+        The fault of the line, as a clause that the error message quotes.
     """
     line_number = 1
     undamaged_lines_before = 0

@@ -111,7 +111,7 @@ def fly(
     plant : Plant
         The asset and its truth, at the same step as the twin.
     *sinks : callable
-        What stores each step, see `operate`.
+        The functions that store each step, see `operate`.
     history : History, optional
         The steps flown so far; the new ones are added to it, also if an error ends the flight.
     progress : Progress, optional

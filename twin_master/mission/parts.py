@@ -141,7 +141,7 @@ class TwinParts:
         Parameters
         ----------
         twin : TwinBeforeFlight
-            What the twin knows; its sensor model is that of the scenario.
+            The knowledge of the twin; its sensor model is that of the scenario.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class TwinParts:
         Parameters
         ----------
         twin : TwinBeforeFlight
-            What the twin knows; its estimator is that of the scenario.
+            The knowledge of the twin; its estimator is that of the scenario.
 
         Raises
         ------

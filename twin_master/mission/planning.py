@@ -71,7 +71,7 @@ def plan_within_limit(
     scenario : Scenario
         The scenario of the mission.
     problem : DecisionProblem
-        Its decision problem, without a price.
+        The decision problem of the mission, without a price.
     rewards : RewardModel
         The rewards, which contain the health limit.
 
@@ -196,7 +196,7 @@ class ComparedPolicy:
     Attributes
     ----------
     name : str
-        What the rule is called.
+        The name of the rule.
     returns : (B,) array
         The return of each mission. Missions of the same number meet the same random numbers under
         all rules.

@@ -57,7 +57,7 @@ class Knowledge:
     Attributes
     ----------
     scenario : Scenario
-        What is to be flown.
+        The scenario to fly.
     model : GraphicalModel
         The states, controls and transitions.
     draws : ParameterDraws
@@ -395,7 +395,7 @@ def prepare_knowledge(
     Parameters
     ----------
     scenario : Scenario
-        What is to be flown.
+        The scenario to fly.
     source : AssetSource
         The source of the asset, already prepared.
     seed : int
@@ -441,7 +441,7 @@ def prepare_twin(
     scenario : LoadedScenario, str or Path
         The scenario, its shipped name, or its file.
     overrides : Overrides or mapping, optional
-        What differs from the file, as for `fly`.
+        The values that replace those of the file, as for `fly`.
     progress : Progress, optional
         Shows the stages of the modelling.
 

@@ -243,7 +243,7 @@ def refilter(
     lag : int or None
         The lag of the twin, in steps.
     settled : SettledState, optional
-        Where to begin; before the first step if left out.
+        The state to begin with; the one before the first step if left out.
     """
     models = models_in_force(models)
     first_step = 0 if settled is None else max(settled.step, 0)

@@ -94,7 +94,7 @@ def residual_summary(
     from_step : int
         The number of the first step that is evaluated.
     models : sequence of BelievedModel
-        What the twin believed in the steps, in the order of adoption.
+        The models that the twin believed in the steps, in the order of adoption.
     """
     history = history.without_first(from_step - history.first_step)
     if not history.steps or np.isnan(history.observed).all():

@@ -299,7 +299,7 @@ def level_separations(
     Parameters
     ----------
     knowledge : Knowledge
-        What the twin knows.
+        The knowledge of the twin.
     readings : sequence of DrawnReadings
         The readings under each control.
     sensors : sequence of int

@@ -105,7 +105,7 @@ class _TrueStates(NamedTuple):
     Attributes
     ----------
     state_index : (B,) array
-        Their indices; zeros if they are scripted.
+        The indices of the states; zeros if the states are scripted.
     state : (B, F) array
         The value of each state factor, SI.
     """
@@ -214,7 +214,7 @@ def fly_side_by_side(
     Parameters
     ----------
     knowledge : Knowledge
-        What all twins know; the scenario neither learns nor gives notices.
+        The knowledge of all twins; the scenario neither learns nor gives notices.
     truths : sequence of Truth
         The truth of each twin.
     assets : sequence of Asset
@@ -363,7 +363,7 @@ def fly_one_by_one(
     Parameters
     ----------
     knowledge : Knowledge
-        What all twins know.
+        The knowledge of all twins.
     truths : sequence of Truth
         The truth of each twin.
     asset_of : callable

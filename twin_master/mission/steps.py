@@ -53,9 +53,9 @@ class Reading:
     revises : int or None
         The earlier step that the observation belongs to; None is the next step.
     unreadable : dict of int to str
-        What a sensor sent if it was not a number, by the index of the sensor.
+        The content that a sensor sent in the place of a number, by the index of the sensor.
     ground_truth : GroundTruth or None
-        What really happened in the step; None for a real asset.
+        The true state and values in the step; None for a real asset.
     """
 
     observed: Float
@@ -233,7 +233,7 @@ class Truth:
     Parameters
     ----------
     scenario : Scenario
-        What happens.
+        The scenario of the mission.
     model : GraphicalModel
         The states, and the transitions that random growth of damage follows.
     seed : int
@@ -467,7 +467,7 @@ class Plant:
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario of the mission.
     truth : Truth
         Damage, noise and faults.
     asset : Asset

@@ -81,11 +81,11 @@ class Learnt:
     Attributes
     ----------
     mean, standard_deviation : float
-        Its moments, in `unit`.
+        The moments of the quantity, in `unit`.
     lower, upper : float
         The bounds of its central 90 % interval, in `unit`.
     unit : str
-        Its unit.
+        The unit of the quantity.
     """
 
     mean: float
@@ -173,7 +173,7 @@ class Hypothesis:
     name : str
         `model`, `gauge 5 off`, ..., `none of these`.
     probability : float
-        Its posterior probability.
+        The posterior probability of the hypothesis.
     belief : (S,) array or None
         p(D_t | hypothesis, o_0..o_t); None if no state is believed under the hypothesis.
     """
@@ -196,11 +196,11 @@ class Estimate:
     log_evidence : float
         log p(o_t | o_0..o_{t-1}), under the model.
     carried : Carried
-        What the next step needs.
+        The arrays that the next step needs.
     learnt : dict of str to Learnt
         The posterior of each learnt quantity, by name.
     notices : tuple of Notice
-        What the operator should know of this step.
+        The notices to the operator in this step.
     suspicion : Suspicion or None
         How well the model explains the sensors; None if that is not watched.
     hypotheses : tuple of Hypothesis

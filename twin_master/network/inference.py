@@ -34,7 +34,7 @@ class Filtered:
     filtered : (..., S) array
         p(D_t | o_0..o_t).
     log_filtered : (..., S) array
-        Its logarithm, which the next step needs.
+        The logarithm of the filtered belief, which the next step needs.
     log_evidence : (...) array
         log p(o_t | o_0..o_{t-1}); the sum over steps is the log evidence of all observations.
     """
@@ -102,7 +102,7 @@ def _check_sequence(
     log_rows : (T, S) array
         A logarithm for each step and state.
     what : str
-        What the rows are, for the message.
+        The noun of the rows, for the message.
     """
     control = np.array(control_index, dtype=np.int64, order="C")
     check_shape("controls", control.shape, control.size)

@@ -43,7 +43,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
         Distributions along the last axis: finite, not negative, and each with a sum of one within
         `ROW_SUM_TOLERANCE`.
     name : str
-        What the matrix is, for the message.
+        The noun of the matrix, for the message.
 
     Raises
     ------
@@ -106,9 +106,9 @@ def check_shape(
     Parameters
     ----------
     what : str
-        What the array is, for the message.
+        The noun of the array, for the message.
     shape : tuple of int
-        Its shape.
+        The shape of the array.
     *expected : int or str
         The expected length of each axis; a word, such as "draws", stands for any length.
     error : type
@@ -144,7 +144,7 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     parts : dict of str to float
         The size of each array [bytes], by a description in words.
     advice : str
-        What the user can do to make them smaller, for the message.
+        The advice on how to make the arrays smaller, for the message.
 
     Raises
     ------

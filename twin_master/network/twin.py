@@ -126,7 +126,7 @@ class TwinStep(Estimate):
     decision_probability : (U,) array
         policy(U | D) averaged over the belief on which the twin decides.
     next_control : int
-        Its mode, the first of equals: the control to fly in step t + 1.
+        The most probable next control, the first of equals: the control to fly in step t + 1.
     """
 
     step: int

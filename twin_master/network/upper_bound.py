@@ -42,7 +42,7 @@ class SparseBeliefs(NamedTuple):
     state : (entries,) array
         The state of each entry.
     probability : (entries,) array
-        Its probability.
+        The probability of this state.
     """
 
     start: Index
@@ -156,7 +156,7 @@ class _NextRows:
     belief_and_control : (N, U, P) array
         The parts of each next belief: flat indices of a belief and a control in (J, U).
     weight : (N, U, P) array
-        Their weights.
+        The weights of these beliefs.
     certain_probability : (N, C) array
         The probability of each of the C states whose corner is one of the beliefs.
     first_row : (J U,) array

@@ -248,7 +248,7 @@ def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
     Parameters
     ----------
     what : str
-        What is named, in the singular, for the message: "state".
+        The noun of the named things, in the singular, for the message: "state".
     names : sequence of str
         All names.
     """
@@ -269,7 +269,7 @@ def unknown_name_fault(name: str, known_names: Sequence[str], key: str, what: st
     key : str
         The key that holds the name, for the message.
     what : str
-        What is named, in the singular, for the message: "control".
+        The noun of the named things, in the singular, for the message: "control".
     """
     message = f"`{key}` must name a {what} ({', '.join(known_names)}), and `{name}` came"
     return name not in known_names, message
@@ -289,7 +289,7 @@ def incomplete_table_fault(
     key : str
         The location of the table in the file, for the message: "rewards.control".
     what : str
-        What is named, in the singular, for the message: "control".
+        The noun of the named things, in the singular, for the message: "control".
     """
     present_names = ", ".join(table) or "none"
     message = (
@@ -306,6 +306,6 @@ def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
     unit : str
         The unit of the stored levels; "1" for a fraction, which is printed in percent.
     percent : str
-        What the unit of percentages is called.
+        The printed unit of percentages.
     """
     return (100.0, percent) if unit == "1" else (1.0, unit)

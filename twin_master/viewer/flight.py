@@ -86,7 +86,7 @@ class _JournalledKnowledge(NamedTuple):
     Attributes
     ----------
     begin : int
-        Where this line begins in the journal [bytes].
+        The position in the journal at which this line begins [bytes].
     knowledge : Knowledge
         The model of the twin, with its plan.
     """
@@ -212,7 +212,7 @@ class Flight:
         record : dict
             The line.
         begin : int
-            Where the line begins [bytes].
+            The position at which the line begins [bytes].
         """
         is_step = "filtered" in record
         if is_step and record["step"] == self.steps:
@@ -416,7 +416,7 @@ def _expectation_without_learning(
     Parameters
     ----------
     knowledge : Knowledge
-        What the twin knows.
+        The knowledge of the twin.
     joint : (n, S, U) array
         The beliefs over states and controls.
     rows : (n, G + I) array or None

@@ -103,7 +103,7 @@ class Watch:
     Attributes
     ----------
     source : AssetSource
-        What the twin believes of the asset.
+        The source of the model that the twin believes.
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel

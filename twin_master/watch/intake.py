@@ -69,7 +69,7 @@ class _QueuedReading:
     reading : Reading
         The reading.
     status : StepStatus
-        What was received of its step.
+        Whether a message of the step has come, and with its control.
     """
 
     step: int

@@ -109,7 +109,7 @@ class _SensorReadings:
     sensors : set of int
         The indices of the sensors that the message names.
     unreadable : dict of int to str
-        What came in the place of a number, by the index of the sensor.
+        The content that stood in the place of a number, by the index of the sensor.
     ignored : dict of str to str
         As in `Message`.
     nested_name : str

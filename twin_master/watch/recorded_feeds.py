@@ -103,7 +103,7 @@ class RecordedFeed(Feed):
         line : bytes
             The line, with its line feed.
         begin : int
-            Where the line begins in its file [bytes].
+            The position in the file at which the line begins [bytes].
         """
         return line
 
@@ -225,7 +225,7 @@ class FolderFeed(RecordedFeed):
         line : bytes
             The line, with its line feed if it is complete.
         begin : int
-            Where the line begins in the journal [bytes].
+            The position in the journal at which the line begins [bytes].
         """
         record = record_of_line(line, self.path)  # None if the checksum or the JSON is wrong
         if record is None and line.endswith(b"\n"):
