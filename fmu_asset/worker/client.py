@@ -80,8 +80,12 @@ class WorkerLimits(Section):
         Resident memory [MiB].
     sandbox : bool
         Whether the system keeps the FMU from the user's files, from programs and from the network.
-    read, write, ports, programs
-        The files, ports and programs that the sandbox grants all the same; see `Grants`.
+    read, write : tuple of str
+        Files and folders that the FMU may read or write in the sandbox; see `Grants` for paths.
+    ports : tuple of int
+        TCP ports to which the FMU may connect from the sandbox, on any host.
+    programs : bool
+        Whether the FMU may start programs in the sandbox.
     """
 
     step_time: Positive = 60.0
