@@ -295,7 +295,7 @@ def _refuse_steady(record: RingDownRecord) -> None:
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
-    """Refuse the modes of a record if one of them is not a decaying oscillation.
+    """Refuse modes that are not decaying oscillations.
 
     Parameters
     ----------

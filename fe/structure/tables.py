@@ -302,7 +302,8 @@ class StructureDesign(DesignSection):
         named_table : str
             The table whose rows have these names.
         tied, untied : str
-            The ends of the messages about a row that is tied, and about a name without a tie.
+            The words of a message on a row that is tied to a name, and on a name without such a
+            row.
         """
         known_names = [row.name for row in getattr(self, named_table)]
         place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}

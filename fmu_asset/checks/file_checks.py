@@ -116,7 +116,7 @@ def _check_units(description: FmuDescription) -> list[CheckResult]:
             "SI."
         )
     if not sentences:
-        text = "All real variables have units, and these mean what is usual."
+        text = "All real variables have units, and these have their usual meaning."
         return [CheckResult("ok", text)]
     return [CheckResult("warning", sentence) for sentence in sentences]
 

@@ -560,7 +560,9 @@ def test_elements_of_an_array_go_in_and_a_whole_array_comes_out(port_of_arrays):
 
 
 def test_a_port_of_two_elements_takes_two_values(port_of_arrays):
-    with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
+    with pytest.raises(
+        errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 were given"
+    ):
         port_of_arrays.step(port={"p.force": 1.0})
 
 
