@@ -358,7 +358,7 @@ def color_bar(
     label : str
         The quantity and its unit.
     ax : Axes or sequence of Axes, optional
-        The panels beside which the scale is drawn, if it has no panel of its own.
+        The panels next to which the scale is drawn, if it has no panel of its own.
     cax : Axes, optional
         The panel in which the scale is drawn.
     location : str, optional
@@ -382,7 +382,7 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
     label : str
         Its letter, such as ``a``.
     title : str
-        A few words beside the letter.
+        A few words after the letter.
     """
     axes.set_title("  ".join(text for text in (label, title) if text), loc="left")
 

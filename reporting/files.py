@@ -17,7 +17,7 @@ from pathlib import Path
 from reporting.errors import DiskFullError, FileNotWrittenError
 
 TEMPORARY_SUFFIX = ".partial"
-"""Ending of the temporary names, by which the leftovers of a killed process are recognised."""
+"""Ending of temporary names, which marks the leftovers of a killed process."""
 
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})

@@ -35,7 +35,7 @@ except ImportError:
     ) from None
 
 Info = dict[str, Any]
-"""What is known of a step beside its observation, see `ScenarioEnvironment`."""
+"""Facts about a step in addition to its observation, see `ScenarioEnvironment`."""
 
 
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):

@@ -96,7 +96,7 @@ def check_names(
     reference : str
         The place where names are known: "the binding uav_wing".
     rows : iterable of (str, iterable of str, collection of str)
-        For each kind of name: what is named, in the singular; the names; the known names.
+        For each kind of name: the noun of the kind in the singular, the names, and the known names.
     advice : str
         The advice to the user, which ends the message.
 

@@ -66,7 +66,7 @@ def create_run_folder(
     *,
     replace: bool = False,
 ) -> Iterator[None]:
-    """Create a folder with its configuration and copies of what is flown, in one step, and lock it.
+    """Create a run folder with configuration and copies of all flown files, in one step; lock it.
 
     The folder is locked until the context ends.
 
@@ -207,7 +207,7 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
 
 
 def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:
-    """Write the hashes of what is flown into the configuration, or check them if they are there.
+    """Write the hashes of all flown files into the configuration, or check them if they are there.
 
     Parameters
     ----------

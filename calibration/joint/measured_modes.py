@@ -252,7 +252,7 @@ def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
     fit : RingDownFit
         The record with its two fitted modes.
     delay : float
-        The time by which the start is later [s].
+        The delay of the start [s].
 
     Returns
     -------

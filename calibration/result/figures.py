@@ -1,4 +1,4 @@
-"""Figures of any calibration: samples pair by pair, and readings beside the model."""
+"""Figures of any calibration: samples pair by pair, and readings compared with the model."""
 
 import math
 from collections.abc import Sequence

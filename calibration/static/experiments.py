@@ -14,7 +14,7 @@ from reporting.arrays import Float
 from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
-"""Gravity by which the authors convert a mass on the scale to a load [m/s^2]."""
+"""Gravity with which the authors convert a mass on the scale to a load [m/s^2]."""
 
 HALF_WIDTH_95 = 1.96
 """Half-width of a 95 % interval of a Gaussian, in standard deviations, as rounded in the paper."""
@@ -33,7 +33,7 @@ MEASUREMENTS_FILE = Path("step2") / "load_displacement_measurements.csv"
 
 
 class _UnitError(NamedTuple):
-    """A unit other than N or mm, by which load over displacement changes by a factor."""
+    """A unit other than N or mm, which changes load over displacement by a factor."""
 
     factor: float
     remedy: str

@@ -186,7 +186,7 @@ class LabData:
     trials : Fits or None
         The fitted ring-downs of step 3; None if the readings are the published ones.
     authors : PaperSamples or None
-        The authors' own results of step 3, to be drawn beside ours.
+        The authors' own results of step 3, to be drawn next to ours.
     """
 
     lengths: Lengths

@@ -81,7 +81,7 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
                 on_cut = np.zeros(len(part), dtype=bool)
                 on_cut[crossing_edges[is_in_half]] = True
                 cost = _cut_costs(part, weight, total, on_cut, is_above)
-                # keep what is better than before
+                # keep the cuts that cost less than the best cuts before
                 is_better = cost < lowest_cost
                 lowest_cost[is_better] = cost[is_better]
                 is_cut_here = is_better[part]

@@ -37,7 +37,7 @@ PATCHED_STATES = 240
 DAMAGED_LOSS = 0.7
 """Stiffness loss of every damage region in the second state of health of the working basis."""
 LIFT_POLYNOMIALS = 6
-"""Legendre polynomials along the span by which the lift is weighted for the working basis."""
+"""Number of Legendre polynomials along the span that weight the lift for the working basis."""
 MODES = 8
 """Modes that are snapshots."""
 INERTIA_SHAPES = 6

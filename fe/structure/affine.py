@@ -141,7 +141,7 @@ class AffineStructure:
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
-    """Number of the load by which two modes are followed: those that add most to its compliance."""
+    """Number of the load whose compliance chooses the two tracked modes: those that add most to it."""
 
     @property
     def unknowns(self) -> int:

@@ -36,7 +36,7 @@ class SurfaceRow(NamedTuple):
 
 
 class Face(NamedTuple):
-    """The nodes of a face or a flat element, of which the first so many are corners."""
+    """The nodes of a face or a flat element, the corners first, and the number of corners."""
 
     nodes: list[int]
     corner_count: int
@@ -215,7 +215,7 @@ class Deck:
         for name, members in self._sets["NSET"].values():
             indices = self._node_indices(members, f"the set {name!r}")
             node_sets[name] = new_index[_sorted_once(indices)]
-        # sets of elements hold cells, or else faces
+        # a set of elements holds cells, or flat elements that stand for faces
         faces_by_name = {}
         for name, rows in self.surfaces.items():
             faces_by_name[name] = list(self._surface_faces(rows, kind, solids))

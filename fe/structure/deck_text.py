@@ -46,7 +46,7 @@ class DeckWords(NamedTuple):
     read : dict of str to list of str
         Words that are read, each with the parameters that are read.
     flat : dict of str to str
-        Types of elements in `FLAT`, by which other programs write lines and surfaces.
+        Types of elements in `FLAT` with which other programs write lines and surfaces.
     """
 
     mark: str

@@ -216,7 +216,7 @@ class StructureMesh(CellMesh):
         return surface
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
-        """Return the faces of a set of faces, or else those whose corners are all among nodes.
+        """Return the faces of a set, or the surface faces with all corners among some nodes.
 
         Parameters
         ----------

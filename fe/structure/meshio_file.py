@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from meshio import Mesh
 
 _MOST_VALUES = 1000
-"""Most values of an array of integers by which it is read as sets."""
+"""Largest number of distinct values for which an array of integers is read as sets."""
 
 _LEFT_OUT = 0
 """Number that no element has: they are counted from one."""

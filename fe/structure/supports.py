@@ -1,4 +1,4 @@
-"""Supports of a mesh: what is held, sprung and rigid, and whether the structure is free to move."""
+"""Supports of a mesh: held, sprung and rigid nodes, and whether the structure is free to move."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -67,11 +67,11 @@ class Step(NamedTuple):
     load : (n,) array
         The load [N], which replaces that of the step before; empty if that stays.
     lines : iterable of str
-        Loads that CalculiX applies itself, and what is printed.
+        Loads that CalculiX applies itself, and the printed results.
     nodal : bool
         Whether the load is given as nodal forces, and not by lines.
     procedure : tuple of str
-        Lines that say what is solved.
+        Lines that say which problem is solved.
     """
 
     load: FloatArray = np.empty(0)

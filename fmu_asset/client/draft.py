@@ -40,7 +40,7 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     """Return a binding file for an FMU, to be corrected by somebody who knows its model.
 
     Inputs are controls, unless their name or unit indicates health or load. Real outputs are
-    observations, numbered ones together; other outputs are recorded beside them. A force input with
+    observations, numbered ones together; other outputs are recorded in addition. A force input with
     a displacement or velocity output of the same stem becomes a port. The text is checked against
     the FMU before it is returned.
 

@@ -41,7 +41,7 @@ class Exchange:
     outputs : OutputTable
         Outputs that are read from the reply block.
     recorded_units : dict of str to str
-        Units of what is read beside the observations, by name.
+        Units of the outputs that are read in addition to the observations, by name.
     output_names : list of str
         Names of all values of the reply block.
     sent, read : tuple of VariableInfo

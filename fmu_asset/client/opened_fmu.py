@@ -92,7 +92,7 @@ class OpenedFmu:
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
     def _chosen_state_method(self) -> StateMethod:
-        """Return how states are saved: as the binding says, or else as the FMU is able to."""
+        """Return how states are saved: as the binding says, or as the FMU supports it best."""
         state_method = self.binding.binding.state
         if state_method != "auto":
             return state_method

@@ -116,7 +116,7 @@ def _observations(resolver: BindingResolver) -> list[_RequestedOutput]:
 
 
 def _extras(resolver: BindingResolver, ports: Sequence[PortQuantity]) -> list[_RequestedOutput]:
-    """Return the outputs that are read beside the observations.
+    """Return the outputs that are read in addition to the observations.
 
     These are monitors, recorded variables and outputs of ports.
     """

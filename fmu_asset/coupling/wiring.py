@@ -279,7 +279,7 @@ class Wiring:
         causalities : tuple of str
             The causalities that the variable may have.
         role, needed : str
-            The role of the end, and what is needed there, for the message.
+            The role of the end, and the requirement that it must meet, for the message.
         """
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:

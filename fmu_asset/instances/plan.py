@@ -267,7 +267,7 @@ def prepare_call(function: CFunction, *arguments: object) -> Callable[[], int]:
 
 
 _ROUNDING = 1e-12
-"""Share of a step by which a time may miss its end."""
+"""Fraction of a step by which a time may miss the end of the step."""
 
 
 class LinearInputs:

@@ -433,7 +433,7 @@ class WorkerInstance(Instance):
         Parameters
         ----------
         deadline : float
-            The time on the monotonic clock by which the answer must have come [s].
+            The latest time of the answer, on the monotonic clock [s].
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The tracer by which a supervisor counts what the sandbox refuses its worker (ptrace(2))."""
+"""The tracer with which a supervisor counts the calls that the sandbox refuses (ptrace(2))."""
 
 import ctypes
 import json

@@ -48,7 +48,7 @@ HASHED_COPIES = {
     "ssp": SSP_COPY,
     "strain_library": LIBRARY_COPY,
 }
-"""The copies of files in a run folder of which the run records the hash, by the hash's name."""
+"""The copies of files in a run folder whose hashes the run records, by the names of the hashes."""
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
 NO_ASSET = (
@@ -255,7 +255,7 @@ class AssetSource:
     label: ClassVar = "asset"
     """What flies or is believed, in words, if it is the same for all sources of the class."""
     differ: bool = False
-    """Whether the believed model is known to be another one than that which flies."""
+    """Whether the believed model is known to differ from the model that flies."""
     model: "ReducedModel | None" = None
     """The reduced model of what flies or is believed, once it is prepared, if there is one."""
 

@@ -257,7 +257,7 @@ class StrainLibrarySource(AssetSource):
     library : StrainLibrary
         The library.
     path : Path, optional
-        The path of the library's file, of which a run folder gets a copy.
+        The path of the library's file; a run folder gets a copy of it.
     """
 
     label = "strain library"

@@ -98,7 +98,7 @@ class LearntExpectation:
     rewards : RewardModel
         The rewards of the asset.
     policy : (S, U) array
-        p(U | D), by which controls are predicted.
+        The policy p(U | D) that predicts the controls.
     """
 
     learning: LearningFilter
@@ -234,7 +234,7 @@ class LearntExpectation:
     ) -> tuple[Float, Float]:
         """Return mean and standard deviation (G,) of a quantity that each gauge may have learnt.
 
-        A gauge that did not learn it has the default value for certain.
+        If a gauge has not learnt the quantity, its value is the default, with deviation zero.
         """
         certain = Learnt(default, 0.0, default, default)
         numbers = range(1, self.learning.sensor_model.sensor_count + 1)

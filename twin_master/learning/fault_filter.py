@@ -183,7 +183,7 @@ class FaultFilter:
         rows[is_nonzero] = self._model.transition.forward(control_index, rows[is_nonzero])
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: float) -> None:
-        """Let faults of single gauges begin in this step, and fade what is learnt of their gains.
+        """Let faults of single gauges begin in this step, and let the sums about their gains fade.
 
         A fault that begins now has the belief and the sums of squares of the model so far.
 

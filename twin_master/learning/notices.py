@@ -12,7 +12,7 @@ from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Sus
 from twin_master.network.sensor_model import GaussianSensorModel
 
 CLEARLY_BETTER = float(np.log(10.0))
-"""Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
+"""Smallest log evidence of free gains over a single gauge, which is the simpler explanation."""
 _OR_THE_ASSET = "or the asset near it differs from the model, for example because it has softened"
 """Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
 _LEAST_NAMED_PROBABILITY = 0.1

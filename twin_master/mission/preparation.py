@@ -339,7 +339,7 @@ class Knowledge:
 
     @cached_property
     def true_model(self) -> GraphicalModel:
-        """The model by which true damage grows: that of the twin, or with other probabilities."""
+        """The model of true damage growth: that of the twin, or one with other probabilities."""
         probability = self.scenario.truth.probability
         if not probability:
             return self.model

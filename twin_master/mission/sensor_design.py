@@ -3,8 +3,8 @@
 The information of a set of sensors is the expected logarithm of the posterior probability of the
 true state over its prior probability. The expectation is over simulated readings, with all states
 equally probable. Effects that move all sensors together (a damage between two levels, the
-calibrated parameter) count as such, not as independent noise. A structure may have candidates
-beside the gauges of its file.
+calibrated parameter) count as common, not as independent noise. A structure may have candidates
+in addition to the gauges of its file.
 """
 
 import itertools

@@ -196,9 +196,9 @@ def ration_controls(
     chosen_controls : (B,) array
         The next controls that were decided for each twin alone.
     policy : BeliefPolicy
-        The policy by which they were decided.
+        The policy that has decided on the controls.
     scarce : sequence of int
-        The controls of which there are few, such as inspections.
+        The scarce controls, such as inspections.
     budget : int
         The largest number of scarce controls.
     """

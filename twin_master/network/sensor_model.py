@@ -302,7 +302,7 @@ class GaussianSensorModel(QuantityModel):
         Raises
         ------
         InvalidObservationError, InvalidModelError
-            If the shape is another one or a value is infinite; if there is no such control.
+            If the shape is wrong, if a value is infinite, or if there is no such control.
         """
         values, other_log_density = self.split_observation(observation)
         log_density = self._log_densities(values[None], [control_index], 1)[0, :, 0]

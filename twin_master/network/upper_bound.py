@@ -17,7 +17,7 @@ from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.planner import value_iteration
 
 _MOST_PARTS = 4
-"""Largest number of beliefs of which a row is composed; the corners are not counted."""
+"""Largest number of beliefs that compose a row; the corners are not counted."""
 _ROUNDED_PROBABILITY = 0.15
 """Probabilities below this fraction of the largest are left out of a simplified belief."""
 _MOST_PRODUCTS = 1e9

@@ -1,4 +1,4 @@
-"""The figures of a mission, each beside the one that the scenario gives as its reference."""
+"""The figures of a mission, each with the reference value that the scenario gives."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

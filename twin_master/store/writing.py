@@ -228,7 +228,7 @@ class RunOutcome:
         return open_run(self.folder)
 
     def _repr_html_(self) -> str:
-        """Return the figures of the run beside their references, for a notebook."""
+        """Return the figures of the run with their reference values, for a notebook."""
         rows = []
         for figure, printed_figure in zip(self.figures, printed_figures(self.figures), strict=True):
             rows.append([figure.title, printed_figure.value, figure.unit, printed_figure.reference])

@@ -393,7 +393,7 @@ def _folder_of_watch(loaded_scenario: LoadedScenario | None, folder: Path | str 
 def _scenario_for_reading(
     loaded_scenario: LoadedScenario | None, folder: Path, *, allow_unknown: bool
 ) -> Scenario:
-    """Return the scenario by which observations are read, with absolute paths.
+    """Return the scenario whose sensors the observations name, with absolute paths.
 
     It is the loaded scenario, or, for a resumed watch without one, that of the folder.
     """

@@ -1,4 +1,4 @@
-"""A patch of the model that a watch believes: the patched model, and its trial beside the other.
+"""A patch of the model that a watch believes: the patched model, and its trial against the old.
 
 The outcome of a trial follows from the journal up to one of its lines. So it can be computed
 beside the watch, which goes on meanwhile.
@@ -189,7 +189,7 @@ def merge_patches(believed: Path | None, new_patch: Path) -> bytes:
 
 
 def describe_policy_change(before: Knowledge, after: Knowledge) -> str:
-    """Return how the policy of a model differs from that of another one, in a sentence.
+    """Return a sentence on the difference between the policies of two models.
 
     Parameters
     ----------

@@ -239,7 +239,7 @@ class FolderFeed(RecordedFeed):
             return Refused("the line has another layout")
 
     def _message_of(self, line: JournalLine) -> Message | Refused | None:
-        """Return the observation in a line of the journal; None if no message came of its step.
+        """Return the observation in a line of the journal; None if its step had no message.
 
         A journal of an asset with other sensors or controls is refused.
         """
