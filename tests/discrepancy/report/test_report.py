@@ -200,7 +200,7 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
-        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5, n + 2.0)
         for n, effect in enumerate(FEW[:count])
     )
     (told,) = (
