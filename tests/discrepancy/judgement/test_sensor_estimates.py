@@ -9,13 +9,13 @@ import pytest
 from discrepancy.catalogue.library import library
 from discrepancy.files.verdict import read_verdict_file, write_verdict
 from discrepancy.fits.normal_equations import normal_equations
-from discrepancy.judgement.moved_unknowns import unknowns_moved_within_prior
+from discrepancy.judgement.moved_unknowns import moved_sentence, unknowns_moved_within_prior
 from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import render_report, verdict_card
 from discrepancy.report.printed import verdict_lines
 from discrepancy.report.sensor_table import MOST_PRINTED_SENSORS, printed_sensor_table
-from discrepancy.verdict import SensorValue, VerdictKind
+from discrepancy.verdict import MovedUnknown, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
 from reporting.page import Table
 from tests.discrepancy.core import kit
@@ -136,6 +136,12 @@ def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(model):  # n
     assert f"{abs(farthest.deviations):.1f} deviations)" in verdict.sentence
     assert "where an error of the model may hide" in verdict.sentence
     assert farthest.name in verdict_card(verdict)
+
+
+def test_a_moved_zero_has_the_unit_of_the_report():
+    moved = MovedUnknown("zero of g2 in 'unloading'", 0.0, 8e-7, -1.8e-6, -2.25, "1")
+    told = "the zero of g2 in 'unloading' to -1.8 µε (stated to 0.8 µε; 2.2 deviations)"
+    assert told in moved_sentence([moved])
 
 
 def test_a_prior_that_is_narrow_hides_nothing():

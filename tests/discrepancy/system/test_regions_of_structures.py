@@ -107,6 +107,9 @@ def test_a_large_loss_ends_where_the_model_does(write_beam, tmp_path) -> None:
         trial.health[:, trial.regions.index("z2")] = 0.2
     (primitive,) = hiding(campaign, model, "region_stiffness_loss", {"loss": 0.9}, "z2")
     assert 1.0 - 0.8 * (1.0 - primitive.loss) == pytest.approx(0.3)
+    patched = model.with_patch(ModelPatch((RegionStiffnessLoss("z2", 0.1),)))
+    (primitive,) = hiding(campaign, patched, "region_stiffness_loss", {"loss": 0.9}, "z2")
+    assert 1.0 - 0.8 * 0.9 * (1.0 - primitive.loss) == pytest.approx(0.3)
 
 
 def test_the_wing_loses_stiffness_anywhere_along_its_span_instead() -> None:
