@@ -9,7 +9,6 @@ from discrepancy.judgement.noise_forecast import LARGEST_NOISE_FACTOR
 from discrepancy.judgement.separability import DETECTION_DISTANCE, compute_separability
 from discrepancy.report.decidability_text import campaign_needs
 from tests.discrepancy.rigs import chosen, setting_of, simulated
-from tests.discrepancy.system.test_regions_of_structures import beam_file, model  # noqa: F401
 
 EFFECTS = chosen("region_stiffness_loss")
 
@@ -25,48 +24,50 @@ def with_noise_and_gains(campaign, noise_factor, gain_deviation):
     return replace(campaign, channels=channels)
 
 
-def detectability_of_loss(campaign, model):  # noqa: F811
-    separability = compute_separability(campaign, model, setting_of(campaign, model), EFFECTS)
+def detectability_of_loss(campaign, beam_model):
+    separability = compute_separability(campaign, beam_model, setting_of(campaign, beam_model), EFFECTS)
     (row,) = separability.detectability
     told = [
         line
-        for line in campaign_needs(separability, campaign, EFFECTS, model.kinds)
+        for line in campaign_needs(separability, campaign, EFFECTS, beam_model.kinds)
         if "would not be seen" in line
     ]
     return row, told
 
 
 @pytest.mark.parametrize(("gain_deviation", "noise_factor"), [(0.005, 100.0), (0.02, 45.0)])
-def test_with_the_forecast_noise_the_effect_is_just_seen(gain_deviation, noise_factor, model):  # noqa: F811
+def test_with_the_forecast_noise_the_effect_is_just_seen(gain_deviation, noise_factor, beam_model):
     """Also where stated gains hide a part of it, so that half the noise is not four times the distance."""
-    campaign = simulated(model, "static", 3)
+    campaign = simulated(beam_model, "static", 3)
     noisy = with_noise_and_gains(campaign, noise_factor, gain_deviation)
-    row, (told,) = detectability_of_loss(noisy, model)
+    row, (told,) = detectability_of_loss(noisy, beam_model)
     assert row.distance < DETECTION_DISTANCE
     assert row.noise_factor >= sqrt(DETECTION_DISTANCE / row.distance)
     assert f"with noise {row.noise_factor:.2g} times smaller" in told
     forecast = with_noise_and_gains(campaign, noise_factor / row.noise_factor, gain_deviation)
-    seen, _ = detectability_of_loss(forecast, model)
+    seen, _ = detectability_of_loss(forecast, beam_model)
     # with less noise the distance is that of a smaller change, and the loss is not quite linear
     assert seen.distance == pytest.approx(DETECTION_DISTANCE, rel=0.1)
 
 
-def test_where_stated_gains_hide_an_effect_less_noise_is_not_promised(model):  # noqa: F811
-    campaign = simulated(model, "static", 3)
-    row, (told,) = detectability_of_loss(with_noise_and_gains(campaign, 1.0, 0.12), model)
+def test_where_stated_gains_hide_an_effect_less_noise_is_not_promised(beam_model):
+    campaign = simulated(beam_model, "static", 3)
+    row, (told,) = detectability_of_loss(with_noise_and_gains(campaign, 1.0, 0.12), beam_model)
     assert isinf(row.noise_factor)
     assert "less noise or more trials would not help" in told
     assert "times smaller" not in told
     assert any(name.startswith("the gain of g3 (stated to 12 %)") for name in row.imitated_by)
     assert all(name in told for name in row.imitated_by)
     quiet = with_noise_and_gains(campaign, 1.0 / LARGEST_NOISE_FACTOR, 0.12)
-    assert detectability_of_loss(quiet, model)[0].distance < DETECTION_DISTANCE
+    assert detectability_of_loss(quiet, beam_model)[0].distance < DETECTION_DISTANCE
     # what the sentence asks for helps
     calibrated = with_noise_and_gains(campaign, 1.0, 0.005)
-    assert detectability_of_loss(calibrated, model)[0].distance > DETECTION_DISTANCE
+    assert detectability_of_loss(calibrated, beam_model)[0].distance > DETECTION_DISTANCE
 
 
-def test_an_effect_that_is_seen_needs_no_less_noise(model):  # noqa: F811
-    row, told = detectability_of_loss(with_noise_and_gains(simulated(model, "static", 3), 1.0, 0.005), model)
+def test_an_effect_that_is_seen_needs_no_less_noise(beam_model):
+    row, told = detectability_of_loss(
+        with_noise_and_gains(simulated(beam_model, "static", 3), 1.0, 0.005), beam_model
+    )
     assert row.noise_factor == 1.0
     assert told == []
