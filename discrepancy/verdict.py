@@ -19,7 +19,7 @@ class VerdictKind(StrEnum):
     NOTHING_MISSING = "nothing missing"  # the model explains the data
     NAMED = "named"  # one effect, or a set of effects
     NAMED_IN_PART = (
-        "named in part"  # they close most of the gap; the rest is no noise and has no name
+        "named in part"  # they close most of the gap; the rest is not a noise and has no name
     )
     FAMILY = "family"  # an effect of this family with a shape of its own
     GROUP = "group"  # one of a group that these data cannot separate
@@ -51,7 +51,8 @@ class GapWindow:
     channels : tuple of str
         Names of the channels that show the gap.
     begin, end : Moment or None
-        Begin and end of the window; None if it begins with the first sample, or ends with the last.
+        Beginning and end of the window; None if it begins with the first sample, or ends with the
+        last.
     first, last : float
         Times of the first and the last sample of the record [s].
     size : float
@@ -144,7 +145,7 @@ class Hypothesis:
     Attributes
     ----------
     effects : tuple of NamedEffect
-        Effects of the hypothesis; empty for 'none', the model as it is.
+        Effects of the hypothesis; empty for 'none', the unchanged model.
     log_evidence : float
         ln p(data | hypothesis) by Laplace's approximation [nat].
     probability : float
@@ -315,7 +316,7 @@ class ForceAtPort:
 
 @dataclass(frozen=True)
 class UnfittedRecord:
-    """A record that the model is not fitted to: the fit leaves more than the signal's own variance.
+    """A record that the model does not fit: its residuals vary more than the signal itself.
 
     `left` is the rms residual, `varies` the standard deviation of the readings about their mean
     [channel's unit].
@@ -333,7 +334,7 @@ class UnfittedRecord:
 
 @dataclass(frozen=True)
 class MovedUnknown:
-    """A parameter, gain or zero that a fit without effects moves far from what is stated.
+    """A parameter, gain or zero that a fit without effects moves far from its stated value.
 
     Attributes
     ----------
@@ -402,7 +403,7 @@ class SensorEstimate:
 
 @dataclass(frozen=True)
 class NotFitted:
-    """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
+    """An effect that was not fitted, the reason, and the largest predicted `gain` [nat]."""
 
     identifier: str
     """Identifier of the effect in the catalogue."""

@@ -184,7 +184,7 @@ def investigate(
         kind = VerdictKind.DATA_ERROR
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
-    with stage("Fitting what is known, and searching the catalogue", "name") as tell:
+    with stage("Fitting the known parameters, and searching the catalogue", "name") as tell:
         problem = problem_without_wrong_ends(campaign, model)
         campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
@@ -198,7 +198,7 @@ def investigate(
         if share > SEARCH.largest_step_error:
             remarks.append(
                 f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
-                f"{SEARCH.largest_step_error:g} that is wanted: probabilities may be too sharp."
+                f"permitted {SEARCH.largest_step_error:g}: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = search.residuals(search.no_effect)
@@ -219,7 +219,7 @@ def investigate(
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
-        with stage("Seeing the missing force", "force"):
+        with stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
                 problem, search.force_search, search.force_hypotheses, fit
             )
@@ -289,12 +289,13 @@ def _remarks(
         remarks.append(look_alikes)
     if not problem.model.parameters:
         remarks.append(
-            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or "
-            "damping a little off can be taken for an effect: give it some with their deviations."
+            f"The model {problem.model.name!r} has no uncertain parameter, so that a small error "
+            "in stiffness or damping can be mistaken for an effect: give it uncertain parameters "
+            "with their standard deviations."
         )
     if fit.candidate.terms and not fit.converged:
         remarks.append(
-            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
+            "The fit of the verdict ended before it converged: its intervals may be too narrow."
         )
     return remarks
 
@@ -378,8 +379,8 @@ def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
                 count = int(is_wrong[:, column].sum())
                 new_remarks.append(
                     f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the "
-                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far off model and "
-                    "neighbours and left out."
+                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far from both model "
+                    "and neighbours, and left out."
                 )
             trials[trial.name] = replace(trial, used=trial.used & ~is_wrong)
     if not new_remarks:

@@ -188,13 +188,14 @@ def places_of(effect: EffectInSetting) -> Names:
 
 _NO_STRAIN = "The campaign has no strain channel."
 NO_TURNING_PORT = (
-    "No port has a motion that turns: one that goes one way shows no memory and no zero."
+    "No port moves back and forth, and a motion in one direction shows neither hysteresis nor a "
+    "rest position."
 )
 _NO_STATE = "The model has no port of a state (a level, a charge), at which a flow could act."
 NO_PLACES = {
     "strain channels": _NO_STRAIN,
     "strain channels, or all": _NO_STRAIN,
-    "held ports": "Nothing holds a port of the model, so that no place is its zero.",
+    "held ports": "No port of the model is held by a stiffness, so that none has a rest position.",
     "turning ports": NO_TURNING_PORT,
     "damage regions": (
         "The model can lose stiffness anywhere along its length, so that local_stiffness_loss is "

@@ -117,7 +117,7 @@ def read_residuals(path: Path) -> ResidualSet:
             return _residual_set(tree)
     except _DAMAGED as error:
         raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({type(error).__name__}: "
+            f"{path} is damaged or is not a file of residuals ({type(error).__name__}: "
             f"{one_line(error)}); write it again."
         ) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")

@@ -383,9 +383,9 @@ class FmuModel(DescribedModel):
             or self._has_jumping_port_speed(system)
         ):
             raise ModelError(
-                f"The FMU model {self.name!r} does not tell by its answers to single forces how "
-                "its ports move; it is not linear, or they are too few or too rough, or speeds "
-                "jump with forces."
+                f"The FMU model {self.name!r} does not show by its responses to single forces how "
+                "its ports move: it is not linear, the responses are too short or too rough, or "
+                "speeds jump with forces."
             )
         system = system.in_coordinates_of(mean_system)
         # rows that give positions and speeds (derivatives of order 0 and 1) of the ports

@@ -51,9 +51,10 @@ def reach_verdict(
     effects : sequence of Effect
         The catalogue.
     on_progress : callable
-        Takes a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     on_search : callable
-        Takes each search as it begins.
+        The function that receives each search when it begins.
 
     Returns
     -------
@@ -95,7 +96,7 @@ def _verdict_of_two_searches(
     is_unexplained = first_outcome.verdict.kind is VerdictKind.UNEXPLAINED
     if not first_search.force_hypotheses or not is_unexplained:
         return first_outcome
-    on_progress("nothing follows the missing force: comparing whole simulations")
+    on_progress("no effect follows the missing force: comparing whole simulations")
     # the first search may have refined the time steps, so fit again
     no_effect = try_fit(problem, Candidate(), first_search.no_effect.point)
     second_search = Search(
@@ -214,9 +215,9 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     # reason 1: errors that any instrument has
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
-            f"The model explains the data but for {causes} below "
-            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of what it acts on, which is a nuisance of the "
-            "instruments and no name."
+            f"The model explains the data except for {causes} below "
+            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of the quantity; an error that small counts as "
+            "a nuisance of the instruments, and is not named."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     # reason 2: a gain that only keeps calibrated parameters within their priors
@@ -227,9 +228,10 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     if not check_held_out(search.residuals(search.no_effect)).passed:
         return None
     sentence = (
-        "The model predicts held-out trials as it is, but with calibrated parameters beside their "
-        f"priors{_implausible_parameters_clause(search)}. An error of the instruments ({causes}) "
-        "would do as well: with one channel these data cannot tell them apart."
+        "The model predicts held-out trials as it is, but with calibrated parameters outside "
+        f"their priors{_implausible_parameters_clause(search)}. An error of the instruments "
+        f"({causes}) would explain them as well: with one channel, these data cannot distinguish "
+        "the two."
     )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     return replace(

@@ -86,12 +86,13 @@ def group_lines(separability: Separability, hint: str = "the table says to which
     )
     if not separability.identifiers or not shows_any:
         return [
-            "These trials show none of the effects that can be tested: nothing moves in what the "
-            "model predicts of them. Say how each trial begins and what drives it."
+            "These trials show none of the effects that can be tested: the model predicts no "
+            "motion in them. State how each trial begins and what drives it."
         ]
     if not separability.groups:
         return [
-            "Every effect that can be tested here can be told from every other at its prior median."
+            "Every effect that can be tested here can be distinguished from every other one at its "
+            "prior median."
         ]
     lines = []
     for group in separability.groups:
@@ -138,7 +139,7 @@ def campaign_needs(
         sentences.append(
             f"Give a noise record for {', '.join(without_noise)} (samples at rest, or a standard "
             "deviation with its degrees of freedom): without it the absolute gate cannot be "
-            "applied, and the sizes above take a thousandth of the range for its noise."
+            "applied, and the sizes above assume a thousandth of the range as its noise."
         )
     if not campaign.held_out:
         sentences.append(
@@ -171,8 +172,8 @@ def _sentence_on_group(
     names = listing(name.replace("_", " ") for name in group)
     if not kinds:
         return (
-            f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
-            "load, a known added mass, another temperature, strain beside displacement."
+            f"To tell {names} apart, vary what was kept constant: another amplitude, sign or place "
+            "of the load, a known added mass, another temperature, strain beside displacement."
         )
     texts_of_kinds = " or ".join(WORDS_OF_KINDS[kind] for kind in kinds)
     return f"To tell {names} apart, add {texts_of_kinds}: some of them act there and others do not."
@@ -209,10 +210,12 @@ def _sentence_on_noise(hidden: Sequence[Detectability]) -> list[str]:
     names = [_name_in_sentence(detectability) for detectability in hidden]
     improvement = f"with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials"
     if len(names) == 1:
-        return [f"At its prior median {names[0]} would not be seen; it would be {improvement}."]
+        return [
+            f"At its prior median {names[0]} would not be detectable; it would be {improvement}."
+        ]
     return [
-        f"At their prior medians {listing(names)} would not be seen; {_name_in_sentence(nearest)} "
-        f"would be the first, {improvement}."
+        f"At their prior medians {listing(names)} would not be detectable; "
+        f"{_name_in_sentence(nearest)} would be the first, {improvement}."
     ]
 
 
@@ -228,17 +231,14 @@ def _sentences_on_unknowns(hidden: Sequence[Detectability]) -> list[str]:
     sentences = []
     for unknowns, names in effects_by_unknowns.items():
         medians = "At its prior median" if len(names) == 1 else "At their prior medians"
+        beginning = f"{medians} {listing(names)} would not be detectable, and less noise or more "
         if not unknowns:
-            sentences.append(
-                f"{medians} {listing(names)} would not be seen, and less noise or more trials "
-                "would not help: these trials hardly depend on it."
-            )
+            sentences.append(f"{beginning}trials would not help: these trials hardly depend on it.")
             continue
         sentences.append(
-            f"{medians} {listing(names)} would not be seen, and less noise or more trials would "
-            f"not help: within what is stated, {listing(unknowns)} can change the readings alike. "
-            "Calibrate these more closely, or add a channel or a kind of trial that tells them "
-            "apart."
+            f"{beginning}trials would not help: within what is stated, {listing(unknowns)} can "
+            "change the readings alike. Calibrate these more closely, or add a channel or a kind "
+            "of trial that tells them apart."
         )
     return sentences
 

@@ -35,7 +35,7 @@ MOST_PRINTED_EXPERIMENTS = 3
 
 
 def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
-    """Yield what is printed of an investigation: lines, and the tables of effects and sensors.
+    """Yield the printed lines of an investigation, and the tables of effects and sensors.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def check_lines(
     faults: Sequence[DataFault],
     separability: Separability | None,
 ) -> Iterator[str | Table]:
-    """Yield what is printed of a campaign: its faults, and which effects it can decide on.
+    """Yield the printed lines on a campaign: its faults, and the effects that it can decide on.
 
     Parameters
     ----------

@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import Scales
@@ -105,8 +106,10 @@ class Model(ABC):
 
     @property
     def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs as they are listed in a sentence."""
-        return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
+        """The outputs with quantity and SI unit, as they are listed in a sentence."""
+        return tuple(
+            f"{name} ({quantity_with_unit(quantity)})" for name, quantity in self.quantities.items()
+        )
 
     # ------------------------------------------------------------ what each kind of model defines
 
@@ -198,7 +201,7 @@ class Model(ABC):
         if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
             raise ModelError(
                 f"The trial {trial.name!r} is a ring-down, which {self.quoted_name} cannot begin, "
-                'since it is free, driven or has states; say kind = "driven" and begins = '
+                'since it is free, driven or has states; set kind = "driven" and begins = '
                 '"unknown".'
             )
         is_driven = trial.kind is TrialKind.DRIVEN
@@ -287,7 +290,7 @@ class Model(ABC):
 
     @property
     def unpatched_parameters(self) -> tuple[ParameterPrior, ...]:
-        """Calibrated parameters as they are without what is added."""
+        """Calibrated parameters of the model without the patch."""
         if self._unpatched_parameters is None:
             return self.parameters
         return self._unpatched_parameters
@@ -321,7 +324,7 @@ class Model(ABC):
     def built_in_sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
-        They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
+        They are not a part of the model's responses: `discrepancy.system.sensing.observe` applies
         them, since what sensors show of a response depends on all of them together.
         """
         return self.patch.of(*SENSORS)
@@ -367,7 +370,7 @@ class Model(ABC):
         if conditions.parameters.shape != (count,):
             raise ModelError(
                 f"{capital(self.quoted_name)} has {counted(count, 'parameter')}, but "
-                f"{conditions.parameters.size} came."
+                f"{conditions.parameters.size} were given."
             )
         whole_patch = (self.patch + patch).in_trial(trial.name)
         self.check_trial(trial)
@@ -421,7 +424,7 @@ class Model(ABC):
             Its sensors name channels of a campaign, or outputs of the model; they come before those
             of a response's patch.
         calibrated : mapping of str to (float, float)
-            Means and standard deviations of those parameters that differ from the model's.
+            Means and standard deviations of the parameters that differ from those of the model.
         """
         parameters = []
         for parameter in self.parameters:

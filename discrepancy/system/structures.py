@@ -14,6 +14,7 @@ from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
@@ -161,9 +162,9 @@ class StructureModel(SystemModel):
         for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port "
-                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
-                    "[[port]] out of the file."
+                    f"The port {port!r} of the structure {self.name} moves exactly as its port "
+                    f"{other_port!r} does, so that no reading can distinguish their forces: remove "
+                    "this [[port]] from the file."
                 )
 
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
@@ -418,12 +419,15 @@ class WingModel(SystemModel):
 
     @property
     def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs as they are listed in a sentence."""
+        """The outputs with quantity and SI unit, as they are listed in a sentence."""
+        strain = quantity_with_unit(Quantity.STRAIN)
+        displacement = quantity_with_unit(Quantity.DISPLACEMENT)
         return (
-            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]",
-            "tip_displacement",
-            "load_point_displacement",
-            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction",
+            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}] ({strain})",
+            f"tip_displacement ({displacement})",
+            f"load_point_displacement ({displacement})",
+            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction "
+            f"({displacement})",
         )
 
     def supports(self, primitive: type[Primitive]) -> bool:

@@ -196,7 +196,7 @@ class SystemModel(Model):
             if len(case.patch.of(PortLoad)):
                 raise ModelError(
                     f"The trial {trial.name!r} is a ring-down, which no force with a course in "
-                    'time can act on; say kind = "driven" and begins = "unknown".'
+                    'time can act on; set kind = "driven" and begins = "unknown".'
                 )
             row = self.force_row(trial.load_place, case.state)
             return replace(

@@ -286,7 +286,7 @@ def _primitive_from_row(row: object, where: str) -> Primitive:
     kind = row.get("kind") if isinstance(row, Mapping) else row
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(
-            f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}."
+            f"{where} has the kind {kind!r}, but the known ones are {', '.join(PRIMITIVES)}."
         )
     primitive_type = PRIMITIVES[kind]
     values = {name: value for name, value in row.items() if name not in ("kind", "windows")}

@@ -392,7 +392,7 @@ class PatchedStructure:
 
     @cached_property
     def modes(self) -> PatchedModes:
-        """The modes that move."""
+        """The modes of the motion."""
         return self.lowest_modes(MODE_COUNT, self._static_shape_rows)
 
     @property

@@ -43,7 +43,7 @@ EFFECTS = pytest.mark.parametrize("effect", BEAM, ids=lambda effect: effect.iden
 
 
 def medians(effect):
-    """Prior medians; one deviation above zero where the median is no effect."""
+    """Prior medians; one deviation above zero where the median is not an effect."""
     return {item.name: item.prior.value(0.0) or item.prior.value(1.0) for item in effect.parameters}
 
 
@@ -323,7 +323,7 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory():
     ("other", "places"), [("root", ("tip",)), ("span", ("tip", "span")), ("joint", ("tip", "joint"))]
 )
 def test_a_port_stands_for_the_others_of_a_wing_alone(other, places):
-    """A model with a port of another name is no wing: at all of its ports an effect is tried."""
+    """A model with a port of another name is not a wing: at all of its ports an effect is tried."""
     ports = f"""
         port = [{{ name = "tip", vector = [0.0, 1.0] }}, {{ name = "{other}", vector = [1.0, 0.0] }}]
         """

@@ -30,7 +30,7 @@ def detectability_of_loss(campaign, beam_model):
     told = [
         line
         for line in campaign_needs(separability, campaign, EFFECTS, beam_model.kinds)
-        if "would not be seen" in line
+        if "would not be detectable" in line
     ]
     return row, told
 
