@@ -200,7 +200,7 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
-        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5, n + 2.0)
         for n, effect in enumerate(FEW[:count])
     )
     (told,) = (
@@ -208,7 +208,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
         for line in campaign_needs(
             Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
         )
-        if "would not be seen" in line
+        if "would not be detectable" in line
     )
     first = FEW[0].identifier.replace("_", " ")
     assert told.count(first) == (1 if count == 1 else 2)
