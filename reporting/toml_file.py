@@ -83,7 +83,7 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> Tom
         raise error(too_deep(source)) from None
     except ValueError:  # Python turns no text of more than 4,300 digits into an integer
         raise error(
-            f"{source} holds an integer of thousands of digits; 64 bits are what TOML allows."
+            f"{source} holds an integer of thousands of digits, but TOML allows 64 bits."
         ) from None
     check_nesting(document, source, error)
     _check_integers(document, "", source, error)
@@ -137,8 +137,8 @@ def _check_integers(
             _check_integers(value, location_of_value, source, error)
         elif not -(2**63) <= value < 2**63:
             raise error(
-                f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, "
-                "and 63 beside the sign are what TOML allows."
+                f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, but "
+                "TOML allows 63 in addition to the sign."
             )
 
 
@@ -354,7 +354,7 @@ _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 
 
 def _validation_message(error: ValidationError, model: object, what: str, first_index: int) -> str:
-    """Return the message about the fault that helps the user most, of those pydantic found.
+    """Return the message about the fault, among those of pydantic, that helps the user most.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
         expectation = f"{_EXPECTED_TYPES[kind]} is expected"
     else:
         expectation = small(fault["msg"])
-    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
+    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} was given"
     if kind in _WORD_TYPES and isinstance(fault["input"], str):
         words = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
         word = nearest_word(fault["input"], words)

@@ -46,7 +46,10 @@ def simulate(
         Path | None,
         typer.Option(
             "--binding",
-            help="Its binding file; without one, all outputs in the FMU's units.",
+            help=(
+                "Binding file of the FMU; without one, all outputs are given in the units of the "
+                "FMU."
+            ),
         ),
     ] = None,
     inputs: Annotated[
@@ -194,7 +197,7 @@ def simulate_system(
         typer.Option(
             "--iterations",
             min=1,
-            help="How often a step of a circle of components is made at most.",
+            help="Largest number of iterations of a step if components form a loop.",
         ),
     ] = 1,
     delay: Annotated[
@@ -293,7 +296,9 @@ def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
-        raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
+        raise FmuInputError(
+            f"--interpolation must be zero-order or linear, but {kind!r} was given."
+        )
     return binding.with_header(interpolation=kind)
 
 

@@ -84,12 +84,12 @@ class ColumnReader:
         role = self._determine_role(sheet, head, unit)
         self._check_role(sheet, head, role)
         if not unit and role != LEFT_OUT:
-            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
+            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a plain number")
         if not unit or role == LEFT_OUT:
             return LaboratoryColumn(sheet, head, role, unit)
         try:
             if role == "temperature" and unit == "K":
-                raise ValueError("a temperature must be in degC, and 'K' came")
+                raise ValueError("a temperature must be in degC, but 'K' was given")
             is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN
             is_output = is_driven and self._output_quantity(role) is not None
             if role == "force" and is_driven and not is_output:

@@ -79,7 +79,8 @@ class LaboratoryImport:
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
             raise CampaignFileError(
-                f"Two files have one name of {listing(names)}: rename one; trials have it."
+                f"Two files have the same name among {listing(names)}: rename one, because trials "
+                "are named after their files."
             )
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
         check_subjects(answers, [*heads], names)
@@ -161,7 +162,7 @@ class LaboratoryImport:
         files = [name for name, kind in self.kinds.items() if kind == NOISE]
         if len(files) > 1:
             raise CampaignFileError(
-                f"Noise is read from one file, and {listing(files)} came: give one of them."
+                f"Noise is read from one file, but {listing(files)} were given: give one of them."
             )
         return files[0] if files else None
 
@@ -187,15 +188,15 @@ class LaboratoryImport:
         if any(column.role == "time" for column in columns):
             if self._questionnaire.stated_answer("interval", sheet.name) is not None:
                 raise CampaignFileError(
-                    f"{sheet.name} has a column of times, and --interval came for it: leave one of "
-                    "them out."
+                    f"{sheet.name} has a column of times, but --interval was given for it, too: "
+                    "leave one of them out."
                 )
             return None
         # while the role of a column is not known, it may be the time
         roles_are_known = all(column.role for column in columns)
         if not roles_are_known or self.kinds[sheet.name] not in _RECORDED_IN_TIME:
             return None
-        expected = "seconds between its rows, as no column is a time"
+        expected = "seconds between its rows, because no column is a time"
         answer = self._questionnaire.ask("interval", sheet.name, expected)
         return sampling_interval(answer) if answer else None
 
@@ -210,8 +211,8 @@ class LaboratoryImport:
             return None
         choices = [*map(str, Start)]
         expected = (
-            f"how it begins, {listing(choices, 'or')}: at rest under what acts at first, under "
-            "nothing, or not"
+            f"how it begins, {listing(choices, 'or')}: at rest under the first loads, at rest "
+            "without loads, or in an unknown state"
         )
         answer = self._questionnaire.ask_or_assume(
             Start.SETTLED.value, "begins", file, expected, choices
@@ -229,13 +230,13 @@ class LaboratoryImport:
                     f"--held-out is for trials, and {file} holds samples at rest."
                 )
             return False
-        expected = "whether it is kept for proof and not fitted, yes or no"
+        expected = "whether it is held out for the proof and not fitted, yes or no"
         answer = self._questionnaire.ask_or_assume("no", "held-out", file, expected, ("yes", "no"))
         return answer == "yes"
 
     def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
-        expected = "how far the point was held that was let go, such as 15.5mm"
+        expected = "displacement at which the release point was held, such as 15.5mm"
         answer = self._questionnaire.ask("release", file, expected)
         return release_in_si(answer or "1m")
 
@@ -323,7 +324,8 @@ class LaboratoryImport:
             }
             if tables.setdefault(column.title, table) != table:
                 raise CampaignFileError(
-                    f"{column.title!r} is something else in {column.sheet.name}."
+                    f"{column.title!r} has another quantity or unit in {column.sheet.name} than in "
+                    "another file: rename one."
                 )
         return [*tables.values()]
 

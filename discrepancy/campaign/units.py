@@ -119,7 +119,9 @@ def factor_to_si(quantity: Quantity, unit: str) -> float:
     except ValueError:
         usual = listing(UNITS[quantity].usual, "or")
         name = quantity.value.replace("_", " ")
-        raise ValueError(f"{name} must have a unit such as {usual}, and {unit!r} came") from None
+        raise ValueError(
+            f"{name} must have a unit such as {usual}, but {unit!r} was given"
+        ) from None
 
 
 def _factor_to_si(quantity: Quantity, unit: str) -> float:

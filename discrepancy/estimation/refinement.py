@@ -59,7 +59,7 @@ def refine_hypotheses(
     effect_count : int
         The number of effects that were compared, by which the prior of each is smaller.
     on_progress : callable
-        The function that takes a line on what is estimated.
+        The function that receives a line for the progress display: the estimate that runs.
     """
 
     def score(hypothesis: ForceHypothesis) -> float:

@@ -216,7 +216,7 @@ def _verdict_by_comparison(
     members = [best, *comparison.competing_hypotheses(best)]
     other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
-        reason = f"{other_count} others are as much of it: that tells nothing"
+        reason = f"{other_count} others explain as much, so that none of them can be named"
         return _unexplained_outcome(comparison, simulation_verdict, best, reason)
     # conditions that a name must fulfil
     if comparison.enlarges_error(best):
@@ -238,7 +238,10 @@ def _verdict_by_comparison(
     if all(comparison.passes_absolute_fit(member) for member in members):
         return _group_outcome(comparison, members, probability)
     names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
-    reason = f"it leaves more than noise, and these data do not tell it from {listing(names, 'or')}"
+    reason = (
+        "it leaves more than noise, and these data do not distinguish it from "
+        f"{listing(names, 'or')}"
+    )
     return _unexplained_outcome(comparison, simulation_verdict, best, reason)
 
 
@@ -266,7 +269,7 @@ def _named_in_part_outcome(
     if canonical:
         phrases.append(canonical)
     if family:
-        phrases.append(f"an effect of the family {family}, with a shape of its own,")
+        phrases.append(f"an effect of the family {family}, with a fitted shape,")
     # what it explains, and what remains
     share_clause = comparison.closed_share_clause(best)
     sentence = (
@@ -274,7 +277,7 @@ def _named_in_part_outcome(
         f"{share_clause}."
     )
     if comparison.has_held_out and not share.held_out:
-        sentence += " In the trials held out it has hardly any force."
+        sentence += " In the held-out trials it has hardly any force."
     sentence += f" It leaves {comparison.unexplained_text(best, share)}, which is unexplained."
     sentence += shape_sentence(comparison, best)
     sentence += unproved_addition_sentence(comparison, best)
@@ -453,7 +456,7 @@ def not_named_sentence(reason: str) -> str:
     Parameters
     ----------
     reason : str
-        The reason as a clause or a sentence, such as "What is left follows the loads."
+        The reason as a clause or a sentence, such as "The residuals follow the loads."
     """
     return f"It is not named, because {small(reason.removesuffix('.'))}."
 
@@ -463,9 +466,9 @@ def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: Hypo
     effects = effects_text(named_effects(comparison.problem, hypothesis))
     nearest = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
-        return f"{nearest} it cannot be simulated: nothing is named."
+        return f"{nearest} it cannot be simulated: no effect is named."
     share_clause = comparison.closed_share_clause(hypothesis)
-    return f"{nearest} {share_clause}: nothing is named, and nothing to be applied."
+    return f"{nearest} {share_clause}: no effect is named, and there is nothing to apply."
 
 
 def _outcome_of_comparison(

@@ -298,7 +298,7 @@ def check_held_out(after: ResidualSet) -> Gate:
     held_out_scores = compute_scores(after.held_out)
     excess = chi_square_of(after.held_out).excess
     if not isfinite(excess):
-        return _held_out_gate(None, nan, "No noise record to judge them by.")
+        return _held_out_gate(None, nan, "There is no noise record to judge them by.")
     if excess > HELD_OUT_DEVIATIONS:
         reason = f"On held-out trials χ² per sample is {chi_square_text(held_out_scores)}."
         return _held_out_gate(False, excess, reason)
@@ -379,7 +379,7 @@ def _closed_share_or_reason(
     """
     closed = closed_share(before, after)
     if closed is None:
-        return None, "The model as it was leaves no error at all."
+        return None, "The unchanged model leaves no error at all."
     if closed.trials != "held-out":
         return closed, "No trial was held out."
     chi_square_before = _chi_square_by_diagonal(before.held_out or before)
@@ -458,7 +458,7 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
 
 
 def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
-    """Return a sentence on what is left in the residuals of a model that contains the effect.
+    """Return a sentence on the residuals of a model that contains the effect.
 
     Parameters
     ----------
@@ -488,7 +488,7 @@ def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
             f"The size is that of noise ({chi_square_phrase}), but residuals are not white "
             f"(p = {scores.whiteness:.1g})."
         )
-    return f"Nothing that these data can show remains ({chi_square_phrase})."
+    return f"These data show no remaining error ({chi_square_phrase})."
 
 
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:

@@ -16,7 +16,14 @@ from discrepancy.errors import ModelError
 from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    ModelPatch,
+    PortForce,
+    Primitive,
+    RegionStiffnessLoss,
+)
 from fe.runtime.state import Losses
 from reporting.memory import ResultCache
 from reporting.words import brief, capital, comma_list, counted
@@ -47,6 +54,8 @@ class Model(ABC):
         Primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
         Damage regions.
+    largest_losses : mapping of str to float
+        Largest stiffness loss of each damage region that the model can have.
     kinds : frozenset of TrialKind
         Kinds of trials that it can simulate.
     load_places : tuple of str, optional
@@ -71,6 +80,7 @@ class Model(ABC):
     stations: tuple[float, float] | None = None
     patch: ModelPatch = NO_PATCH
     regions: tuple[str, ...] = ()
+    largest_losses: Mapping[str, float] = MappingProxyType({})
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
@@ -191,7 +201,7 @@ class Model(ABC):
         if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
             raise ModelError(
                 f"The trial {trial.name!r} is a ring-down, which {self.quoted_name} cannot begin, "
-                'since it is free, driven or has states; say kind = "driven" and begins = '
+                'since it is free, driven or has states; set kind = "driven" and begins = '
                 '"unknown".'
             )
         is_driven = trial.kind is TrialKind.DRIVEN
@@ -236,15 +246,19 @@ class Model(ABC):
                 f"{primitive.kind!r}{reason}."
             )
 
-    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
-        """Return the losses of the model's regions in each row.
+    def region_losses(
+        self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
+    ) -> list[Losses]:
+        """Return the stiffness losses of the model's regions in each row.
 
         Parameters
         ----------
         trial : Trial
             Trial that names regions.
         health : (N, K) array
-            Losses of these regions.
+            Losses of these regions that the campaign states.
+        patch : ModelPatch
+            A patch, whose `RegionStiffnessLoss` act on the stiffness that the stated losses leave.
 
         Raises
         ------
@@ -260,13 +274,23 @@ class Model(ABC):
                     f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
                     f"{self.quoted_name} has {comma_list(self.regions)}."
                 )
+        for primitive in patch:
+            if not isinstance(primitive, RegionStiffnessLoss):
+                continue
+            if primitive.region not in self.regions:
+                raise ModelError(
+                    f"The patch takes stiffness from the damage region {primitive.region!r}, but "
+                    f"{self.quoted_name} has {comma_list(self.regions)}."
+                )
+            column = self.regions.index(primitive.region)
+            losses[:, column] = 1.0 - (1.0 - losses[:, column]) * (1.0 - primitive.loss)
         return [tuple(row) for row in losses.tolist()]
 
     # ------------------------------------------------------------ parameters
 
     @property
     def unpatched_parameters(self) -> tuple[ParameterPrior, ...]:
-        """Calibrated parameters as they are without what is added."""
+        """Calibrated parameters of the model without the patch."""
         if self._unpatched_parameters is None:
             return self.parameters
         return self._unpatched_parameters
@@ -300,7 +324,7 @@ class Model(ABC):
     def built_in_sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
-        They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
+        They are not a part of the model's responses: `discrepancy.system.sensing.observe` applies
         them, since what sensors show of a response depends on all of them together.
         """
         return self.patch.of(*SENSORS)
@@ -346,7 +370,7 @@ class Model(ABC):
         if conditions.parameters.shape != (count,):
             raise ModelError(
                 f"{capital(self.quoted_name)} has {counted(count, 'parameter')}, but "
-                f"{conditions.parameters.size} came."
+                f"{conditions.parameters.size} were given."
             )
         whole_patch = (self.patch + patch).in_trial(trial.name)
         self.check_trial(trial)
@@ -400,7 +424,7 @@ class Model(ABC):
             Its sensors name channels of a campaign, or outputs of the model; they come before those
             of a response's patch.
         calibrated : mapping of str to (float, float)
-            Means and standard deviations of those parameters that differ from the model's.
+            Means and standard deviations of the parameters that differ from those of the model.
         """
         parameters = []
         for parameter in self.parameters:

@@ -99,6 +99,7 @@ class StructureModel(SystemModel):
         self.model = model
         self.name = model.name
         self.regions = model.regions
+        self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
         # loads
         units = zip(model.controls, model.control_units, strict=True)
@@ -161,9 +162,9 @@ class StructureModel(SystemModel):
         for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port "
-                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
-                    "[[port]] out of the file."
+                    f"The port {port!r} of the structure {self.name} moves exactly as its port "
+                    f"{other_port!r} does, so that no reading can distinguish their forces: remove "
+                    "this [[port]] from the file."
                 )
 
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
@@ -197,10 +198,13 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, and errors of its forces.
+        It carries sensors, laws at its ports, losses of its damage regions, and errors of its
+        forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
+        if primitive is changes.RegionStiffnessLoss:
+            return bool(self.regions)
         if primitive is changes.LoadGain:
             return bool(self.forces)
         return primitive in SENSORS
@@ -345,6 +349,7 @@ class WingModel(SystemModel):
         validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
         self.parameters = wing_priors(validity, **prior)
         self.regions = arrays.regions
+        self.largest_losses = {region: validity[region][1] for region in arrays.regions}
         self.length = self.wing.span
         self.stations = (0.0, self.wing.span)
         self.port_rows = self.wing.port_rows

@@ -51,7 +51,7 @@ StandardVersion = Literal["1.0", "2.0", "3.0"]
 """Version of FMI that a binding asks for."""
 
 StateChoice = Literal["auto", "serialised", "replay"]
-"""How `save_state` keeps the state; auto trusts what the FMU declares."""
+"""How `save_state` saves the state; `auto` relies on the declarations of the FMU."""
 
 Interpolation = Literal["zero-order", "linear"]
 """Course of inputs between communication points."""
@@ -77,28 +77,29 @@ class BindingHeader(Section):
     step_size : float
         Communication step of the FMU [s].
     decimation : int
-        Communication steps between two observations; the inputs are held meanwhile.
+        Number of communication steps from one observation to the next; the inputs are held in
+        between.
     start_time : float
         Start of the FMU [s].
     stop_time : float, optional
         End of the experiment that the FMU is told at its start [s]; some do not start without one.
         The asset itself does not stop there.
     fmi_version : {"1.0", "2.0", "3.0"}, optional
-        Version of FMI that the FMU must have; any if absent.
+        Version of FMI that the FMU must have; without this key any version is allowed.
     interface : {"co-simulation", "model-exchange"}, optional
         Interface by which it is run; co-simulation if it offers that.
     tolerance : float, optional
         Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
         that the FMU declares for its default experiment, and at most 1e-6 for ours [1].
     interpolation : {"zero-order", "linear"}
-        Course of inputs between communication points: held, or, where the FMU can follow and both
-        ends are continuous, in a straight line to the value given for a step, which they reach at
-        its end.
+        Course of inputs between communication points. They are held, or they move in a straight
+        line to the value of a step and reach it at the end of the step, if the FMU supports it and
+        both ends are continuous.
     structural_parameters : dict of str to float
         Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow
         [unit of the FMU].
     state : {"auto", "serialised", "replay"}
-        How `save_state` keeps the state; auto trusts what the FMU declares.
+        How `save_state` saves the state; `auto` relies on the declarations of the FMU.
     description : str
         A line for people.
     """
@@ -231,7 +232,7 @@ class Binding(Section):
         Raises
         ------
         InvalidChoiceError
-            If a word is none of those that the table may hold.
+            If a word is not one of those that the table may have.
         """
         for name, allowed in _HEADER_WORDS.items():
             if name in changes:

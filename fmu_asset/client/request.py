@@ -223,7 +223,7 @@ class RequestBlock:
         Raises
         ------
         FmuFileError
-            If a start value is no number.
+            If a start value is not a number.
         """
         given_arrays = set()
         for role, values in inputs.items():
@@ -303,7 +303,7 @@ class RequestBlock:
         BindingError
             If a name is not in the binding.
         FmuInputError
-            If a value is no number, not finite or out of range, or the histories have different
+            If a value is not a number, not finite or out of range, or the histories have different
             lengths.
         """
         slots_and_values = []

@@ -64,7 +64,7 @@ class SteppedFmu(OpenedFmu):
         begin = self._start_time + self.step_index * self._interval
         if self._linear_count:
             # Linear inputs begin at their values at the end of the last step. The block holds their
-            # values at the end of the step first, and those at its begin last.
+            # values at the end of the step first, and those at its beginning last.
             request[-self._linear_count :] = request[2 : 2 + self._linear_count]
         try:
             self._exchange.request.place(request, inputs)

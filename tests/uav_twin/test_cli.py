@@ -197,7 +197,7 @@ def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
     checks[:] = [Check("wing", "mass", 1e-3, 1e-10), Check("wing", "energy", nan, 1e-5)]
     done = command("wing", "verify")
     assert (done.returncode, done.stdout.count("BROKEN")) == (1, 2)
-    assert "2 of 2 checks broke their limit: wing, mass; wing, energy." in done.stderr
+    assert "2 of 2 checks exceeded their limits: wing, mass; wing, energy." in done.stderr
 
 
 INPUTS = Inputs(__file__)

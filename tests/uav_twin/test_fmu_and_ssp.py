@@ -165,7 +165,7 @@ def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
     given.write_text("time,u\n0,0\n")
     for more, sentence in (
         (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
-        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, and 'cubic' came"),
+        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, but 'cubic' was given"),
     ):
         assert sentence in refused("fmu", "simulate", *wanted, *more, "--replace", code=None)
 

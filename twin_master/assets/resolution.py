@@ -125,7 +125,8 @@ def resolve_scenario(
         for design_table in _design_tables(table)
     ):
         raise MissionInputError(
-            "the design of a calibration is asked for, and there is no calibration file: give "
+            "the scenario asks for the design of a calibration, but there is no calibration file: "
+            "give "
             '--calibration, or `source = "file"` in the table `calibration`.'
         )
     source = str(loaded.path)

@@ -275,7 +275,7 @@ def prepare_kit(
     is_real : bool
         Whether the assets are real, so that no asset is simulated.
     parts : TwinParts
-        The parts of the twins that a user gives in the place of those of the scenario.
+        The parts of the twins that a user gives instead of those of the scenario.
 
     Returns
     -------

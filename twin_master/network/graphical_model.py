@@ -67,7 +67,7 @@ class Factor:
         nearest_level = int(distance.argmin())
         if not distance[nearest_level] <= self.slack:
             raise InvalidModelError(
-                f"{value} is no level of factor {self.name!r}; its levels are "
+                f"{value} is not a level of factor {self.name!r}; its levels are "
                 f"{comma_list(self.levels)}"
             )
         return nearest_level
@@ -123,7 +123,7 @@ class StateSpace:
         Raises
         ------
         InvalidModelError
-            If a value is no level of its factor.
+            If a value is not a level of its factor.
         """
         if len(levels) != len(self.factors):
             raise InvalidModelError(
@@ -276,7 +276,7 @@ class GraphicalModel:
         Raises
         ------
         InvalidModelError
-            If levels do not increase, a row is no distribution, or the table of a factor is
+            If levels do not increase, a row is not a distribution, or the table of a factor is
             missing.
         """
         states = StateSpace(tuple(Factor(name, tuple(values)) for name, values in levels.items()))

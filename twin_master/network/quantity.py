@@ -118,7 +118,8 @@ class QuantityModel:
     Raises
     ------
     InvalidModelError
-        If the array has another rank, is empty or not finite, or the weights are no distribution.
+        If the array has another rank, is empty or not finite, or the weights are not a
+        distribution.
     """
 
     def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:

@@ -577,5 +577,5 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
         raise InvalidModelError(
             f"`{key}` is {sensor_noise:g} for sensor {sensor + 1}, and all that sensors of its "
             f"unit ({unit}) can show by the twin's model lies between {low:.3g} and {high:.3g}: "
-            f"such a sensor tells nothing; {advice}."
+            f"such a sensor gives no information; {advice}."
         )

@@ -55,7 +55,7 @@ class _Switch:
 
 
 def _decision_sentence(run: Run) -> str:
-    """Return the sentence on the flown controls, and on the delay of a fallback behind the damage.
+    """Return the sentence on the flown controls, and on the delay from the damage to the fallback.
 
     A fallback is the change from the first control after the true state has reached the level at
     which the policy leaves it.
@@ -121,7 +121,7 @@ def _changes_of_control(run: Run) -> str:
 
 
 def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
-    """Return the clause on the step of the fallback and its delay behind the damage."""
+    """Return the clause on the step of the fallback and on the delay from the damage to it."""
     row = fallback.fallback_step
     assert row is not None
     if np.count_nonzero(np.diff(run.control_index)) == 1:
@@ -201,7 +201,7 @@ def _belief_sentence(run: Run) -> str:
 
 
 def _decided_by(run: Run) -> str:
-    """Return what decided on the last control according to the run's summary.
+    """Return the hypothesis that decided on the last control, from the run's summary.
 
     This is "model" unless an alarm overrides the model.
     """

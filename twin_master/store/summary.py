@@ -126,7 +126,7 @@ def find_fallback(
     A level of the policy stands for all true values that are nearest to it. So the true state calls
     for another control from the middle between the two levels on between which the policy changes.
 
-    T is the number of steps, S that of states, F that of state factors.
+    T is the number of steps, S the number of states, and F the number of state factors.
 
     Parameters
     ----------
@@ -527,7 +527,7 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     fallback_step = fallback.fallback_step
     delay = fallback.delay
     if fallback.early_step is not None and delay == 0:
-        # The other control was in force before the damage: this is no fallback from it.
+        # The other control was in force before the damage: this is not a fallback from it.
         fallback_step = None
         delay = None
     step = scenario.mission.step_name

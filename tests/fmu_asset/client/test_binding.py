@@ -166,7 +166,9 @@ def test_limits_of_the_caller_come_first():
 
 @pytest.mark.parametrize("memory", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_impossible_limit_is_refused(memory):
-    with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
+    with pytest.raises(
+        FmuInputError, match=r"the limits of the worker: memory: .*, but .* was given"
+    ):
         worker_limits(LIMITED, None, None, memory)
 
 
