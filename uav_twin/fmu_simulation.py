@@ -249,8 +249,8 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise FmuInputError(
-                f"--set {text} is not understood; write NAME=VALUE: a number, true or false, the "
-                "name of an enumeration's item, a text, or several values with commas between."
+                f"--set {text} cannot be read; write NAME=VALUE: a number, true or false, the name "
+                "of an enumeration's item, a text, or several values with commas between."
             )
         values[name] = value
     return values

@@ -152,9 +152,7 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
     """
     remark = ""
     if filled_loads:
-        remark += (
-            f"; loads are filled in there as they go between their samples: {listing(filled_loads)}"
-        )
+        remark += f"; loads are interpolated there: {listing(filled_loads)}"
     if outside:
         stamps = counted(outside, "stamp")
         remark += f"; {stamps} before or after their records {is_or_are(outside)} left out"

@@ -211,7 +211,7 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     larger = replace(found.proof.closed, value=-0.3)
     assert not has_applicable_effects(found.verdict, replace(found.proof, closed=larger))
     applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
-    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
+    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: not a name.")
     stored = read_patch(applied.path)
     assert stored.verdict is VerdictKind.UNEXPLAINED
     assert [effect.identifier for effect in stored.effects] == ["stiffness_drift"]

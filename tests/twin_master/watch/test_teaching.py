@@ -174,7 +174,7 @@ def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(n
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
-        ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
+        ("named", -0.002, "nats of evidence, but 3 are needed: it is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
