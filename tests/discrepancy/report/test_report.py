@@ -208,7 +208,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
         for line in campaign_needs(
             Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
         )
-        if "would not be seen" in line
+        if "would not be detectable" in line
     )
     first = FEW[0].identifier.replace("_", " ")
     assert told.count(first) == (1 if count == 1 else 2)
@@ -257,7 +257,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
         "displacement 3.1 standard deviations of the noise over 0.25 s, swinging at 2 Hz",
         "<td>No flight trial.</td><td>washout and inertia relief</td>",
         "<td>Screened out</td><td>free play (0.3 nat)</td>",
-        "stands for most of what is missing",
+        "explains most of what is missing",
     ):
         assert words in text
     assert remainders_sentence(replace(drag.verdict, remainders=())) == ""

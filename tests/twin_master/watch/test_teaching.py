@@ -328,7 +328,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
     assert (verdict["step"], model["step"]) == (32, 45)
     assert verdict["to_step"] < 32
     assert model["model"]["from_step"] < 20
-    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
+    assert model["model"]["notice"]["sentence"].endswith("these data cannot tell which of them is true.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
     twin, patched = (one.knowledge.twin() for one in noticing.models)
