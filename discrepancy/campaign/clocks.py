@@ -129,7 +129,7 @@ def merge_clocks(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
             f"{unread_titles[0]!r} are known, but a load must be known whenever a channel is read."
         )
-    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and are merged into one"
     if not clocks_are_equal:
         remark = (
             f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "

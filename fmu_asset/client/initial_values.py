@@ -157,7 +157,7 @@ class InitialValueTable:
         return resolver.start_slot(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
-        """Return the text parameter of a name in the binding, or else in the FMU, if it is one."""
+        """Return the text parameter of a name of binding or FMU; None if there is none."""
         if name in self._text_parameters or name in self._parameter_slots:
             return self._text_parameters.get(name)
         variable = self._resolver.description.variable(name)
