@@ -109,8 +109,7 @@ def simulate(
         )
     if interpolation is not None and inputs is None:
         raise FmuInputError(
-            "--interpolation says how inputs go on between the rows of --inputs: give --inputs, "
-            "too."
+            "--interpolation is for the course between the rows of --inputs: give --inputs, too."
         )
     isolated = not in_process
     # Without a binding: the default experiment of the FMU
