@@ -154,7 +154,7 @@ def _sentence_on_group(
     kinds_of_effects: Sequence[frozenset[TrialKind]],
     missing_kinds: Collection[TrialKind],
 ) -> str:
-    """Return which trials would distinguish effects that look alike, or that loads must vary.
+    """Return a sentence on trials or changes of load that distinguish similar effects.
 
     Parameters
     ----------
