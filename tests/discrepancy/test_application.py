@@ -344,7 +344,7 @@ def test_the_best_hypothesis_can_be_applied_if_it_takes_error_away(unexplained):
 def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(unexplained, tmp_path):
     applied = apply_verdict(unexplained[1], tmp_path / "patched.json")
     patch = read_patch(applied.path)
-    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
+    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: not a name.")
     assert patch.sentence.startswith(applied.sentence)
     assert (patch.verdict, [effect.identifier for effect in patch.effects]) == (
         VerdictKind.UNEXPLAINED,
@@ -353,7 +353,7 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(unexplained, tmp_p
 
 
 def test_what_is_no_law_at_a_port_does_not_stand_in_the_file_of_a_lumped_model(unexplained, tmp_path):
-    sentence = "only laws at the ports of a lumped model can stand in its own file"
+    sentence = "only laws at the ports of a lumped model can be written into its own file"
     with pytest.raises(ModelError, match=sentence):
         apply_verdict(unexplained[1], tmp_path / "patched.toml")
 
@@ -374,7 +374,7 @@ def own_file(tmp_path, monkeypatch):
     ("options", "sentence"),
     [
         (("--out", "there.toml"), "there.toml exists: choose another --out or give --replace"),
-        (("--out", "LABORATORY/rig.toml", "--replace"), "is what the patched model is made of"),
+        (("--out", "LABORATORY/rig.toml", "--replace"), "is a file from which the patched model is made"),
         (("--out", "model.xml"), "must end in one of .toml, .json, .fmu"),
         (("--out", "model.fmu"), "only a wing is packed with its effects"),
         (("--member", "free_play"), "has no group: leave it out"),
@@ -453,7 +453,7 @@ def test_files_beneath_a_patched_model_are_not_replaced(second_verdict):
     files = (*beneath, second_verdict.folder / "verdict.json", second_verdict.folder / "patch.json")
     assert choose_model(second_verdict.folder / "patch.json").beneath == beneath
     for file in files:
-        with pytest.raises(FileNotWrittenError, match="is what the patched model is made of"):
+        with pytest.raises(FileNotWrittenError, match="is a file from which the patched model is made"):
             apply_verdict(second_verdict.folder, file, replace=True)
 
 

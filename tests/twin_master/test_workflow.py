@@ -77,7 +77,7 @@ def test_an_empty_folder_is_replaced(tmp_path):
     assert (folder / "config.json").is_file()
 
 
-@pytest.mark.parametrize(("name", "sentence"), [(".", "left unchanged"), ("thesis.txt", "no folder")])
+@pytest.mark.parametrize(("name", "sentence"), [(".", "left unchanged"), ("thesis.txt", "not a folder")])
 def test_what_is_no_run_is_not_replaced(tmp_path, name, sentence):
     thesis = written(tmp_path, "important", name="thesis.txt")
     with pytest.raises(RunFolderError, match=sentence):
@@ -148,7 +148,7 @@ def test_a_run_that_was_moved_aside_is_told_to_be_back(killed_replacement, libra
     notes = noted(monkeypatch)
     with pytest.raises(RunFolderError):
         fly(killed_replacement.folder, library_file)
-    is_back = [note.endswith("the run that was there is back.") for note in notes]
+    is_back = [note.endswith("the previous run was restored.") for note in notes]
     assert is_back == ([True] if killed_replacement.was_moved_aside else [])
 
 

@@ -168,7 +168,7 @@ def test_figures_of_a_ring_down_have_all_digits_and_are_drawn(figures_of_peaks):
 
 def test_extremes_are_fitted_only_in_records_that_were_read_off_a_plot(simulated_lab):
     sentence = refused("calibrate", "ringdown", "--data", simulated_lab, "--extremes")
-    assert "only one read off a plot does" in sentence
+    assert "only a record read off a plot has them" in sentence
 
 
 def test_a_wing_that_is_an_fmu_is_measured_as_the_model_is(wing, tmp_path):

@@ -458,7 +458,7 @@ def falling_body():
 def test_a_port_whose_motion_goes_one_way_shows_no_memory(falling_body, name):
     model, fall = falling_body
     (effect,) = chosen(name)
-    assert "motion that turns" in (effect.unavailable(setting_of(fall, model)) or "")
+    assert "moves back and forth" in (effect.unavailable(setting_of(fall, model)) or "")
 
 
 def test_a_port_whose_motion_goes_one_way_shows_drag(falling_body):

@@ -295,7 +295,7 @@ def test_a_forced_trial_that_begins_under_a_force_is_taken_to_begin_at_rest(
     rows = "".join(f"{row},{first_force if row == 0 else 1},{20 + row},{row}\n" for row in range(10))
     pushed = ("second.csv", "", f"time,force,plate,turned\n{rows}")
     remarks = " ".join(read_campaign(campaign_folder(tmp_path / "a", HEATED, forced, pushed)).remarks)
-    assert ("'second' is taken to begin at rest under what acts" in remarks) is is_assumed
+    assert ("'second' is taken to begin at rest under the loads" in remarks) is is_assumed
 
 
 @pytest.fixture(scope="module")

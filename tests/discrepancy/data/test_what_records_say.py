@@ -75,7 +75,7 @@ def test_a_parameter_that_a_push_does_not_tell_is_named():
     slippery = model_of(CART_FILE.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }"))
     (unobservable,) = unobservable_parameter_faults(pushed(), slippery)
     (fault,) = check_against_model(pushed(), slippery)
-    sentence = "do not tell the calibrated parameter 'damping_factor' (100%)"
+    sentence = "do not determine the calibrated parameter 'damping_factor' (100%)"
     assert sentence in unobservable.sentence
     assert (fault.kind, fault.fatal) == (FaultKind.UNOBSERVABLE, False)
 

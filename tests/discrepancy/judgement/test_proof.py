@@ -133,7 +133,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other(c
 
 def test_a_closed_gap_gains_log_score_and_leaves_nothing(closing_proof):
     assert closing_proof.log_score_gain > 5.0 * closing_proof.log_score_gain_error > 0.0
-    assert closing_proof.remaining.startswith("These data show no remains")
+    assert closing_proof.remaining.startswith("These data show no remaining error")
 
 
 def test_the_gain_of_log_score_does_not_depend_on_the_own_noise_of_the_later_fit(

@@ -354,7 +354,7 @@ def test_a_watch_that_takes_the_place_of_another_takes_up_nothing_of_it(station,
 def check_refusal_before_the_first_step(sentence: str) -> None:
     """Check that a refused watch says how to begin once its cause is mended."""
     assert "refuses the twin" in sentence
-    assert "Nothing was observed yet: once this is mended" in sentence
+    assert "Nothing was observed yet: correct the cause" in sentence
 
 
 def test_a_broker_that_refuses_what_it_allowed_before(watch, broker, tmp_path):

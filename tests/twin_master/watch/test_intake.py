@@ -361,7 +361,7 @@ def test_cells_without_a_unit_or_a_finite_number_are_unreadable(csv):
 def test_a_step_is_a_whole_number(csv):
     whole, half = csv.messages("step,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n")
     assert (whole.step, whole.observed[0]) == (12, 1e-4)
-    assert "no number" in str(half)
+    assert "not a number" in str(half)
 
 
 def test_cells_without_an_end_and_other_bytes_are_refused(csv):

@@ -295,7 +295,7 @@ def test_the_picture_of_a_patch_is_kept_beside_the_watch(patched_watch, tmp_path
     ("kind", "gain", "sentence"),
     [
         ("named", 0.3, "and is not adopted."),
-        ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
+        ("named", -0.002, "nats of evidence, but 3 are needed: it is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ],
@@ -477,7 +477,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(live_t
 
 def test_the_adoption_of_a_group_says_that_its_members_are_not_told_apart(live_teaching):
     sentence = live_teaching.model["notice"]["sentence"]
-    assert sentence.endswith("which of them is true these data cannot tell.")
+    assert sentence.endswith("these data cannot tell which of them is true.")
 
 
 def test_a_model_that_was_built_beside_live_steps_is_believed_from_its_step_on_to_the_bit(

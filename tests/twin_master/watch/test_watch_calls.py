@@ -251,5 +251,5 @@ def test_a_watch_does_not_replace_what_it_reads(watch_of_misspelt_column, scenar
 
 
 def test_a_watch_that_is_resumed_takes_no_options(python_watch, recorded):
-    with pytest.raises(MissionInputError, match="give nothing beside --resume"):
+    with pytest.raises(MissionInputError, match="leave out options that would change them"):
         uav_twin.watch(None, recorded, python_watch.folder, {"seed": 3}, resume=True)
