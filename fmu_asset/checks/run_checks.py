@@ -286,7 +286,9 @@ class RunChecks:
                         try:
                             self._step_with(asset, role, name, value)
                         except FmuError as error:
-                            limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
+                            # the unit of a plain number, "1", is not printed
+                            unit = "" if input_binding.unit == "1" else f" {input_binding.unit}"
+                            limit = f"{input_binding.variable} = {value:g}{unit}"
                             failures.append(f"{limit}: {one_line(error)}")
         if failures:
             text = (
