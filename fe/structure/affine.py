@@ -141,7 +141,7 @@ class AffineStructure:
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
-    """Number of the load whose compliance chooses the two tracked modes: those that add most to it."""
+    """Number of the load for tracking: the two tracked modes add most to its compliance."""
 
     @property
     def unknowns(self) -> int:
