@@ -101,8 +101,8 @@ class ReducedModel(ReducedArrays):
     @cached_property
     def _loss_inputs(self) -> slice:
         """The losses of the regions among the inputs."""
-        first = len(self.parameters)
-        return slice(first, first + len(self.regions))
+        first_loss = len(self.parameters)
+        return slice(first_loss, first_loss + len(self.regions))
 
     def vector(
         self, values: InputValues | None = None, stiffness_loss: LossValues = (), **named: float
@@ -245,8 +245,8 @@ class ReducedModel(ReducedArrays):
 
     def mass_coefficients(self, vector: FloatArray) -> FloatArray:
         """Return the coefficients (1 + P,) of the mass terms at inputs (V,)."""
-        first = self._loss_inputs.stop
-        return np.concatenate(([1.0], vector[first : first + len(self.masses)]))
+        first_mass = self._loss_inputs.stop
+        return np.concatenate(([1.0], vector[first_mass : first_mass + len(self.masses)]))
 
     # ------------------------------------------------------------ motion
 

@@ -174,8 +174,8 @@ def pythonfmu_version() -> str:
         installed_version = "none"
     if installed_version != PYTHONFMU_VERSION:
         raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed_version} is installed; "
-            "install the project's requirements."
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed_version} is "
+            "installed; install the project's requirements."
         )
     return installed_version
 

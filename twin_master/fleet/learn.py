@@ -502,7 +502,7 @@ def _evidence_of_noise(
     Twins whose observations no course of states explains are left out.
     """
     probability = _with_all_transitions_possible(family.assumed)
-    total = 0.0
+    total_log_evidence = 0.0
     for knowledge, observed_rows, control in observations:
         if nodes is None:
             model = with_noise_factor(knowledge.sensor_model, factor)
@@ -513,8 +513,8 @@ def _evidence_of_noise(
             model = with_noise_factor(knowledge.sensor_model, factor, nodes.predicted)
             at_nodes = parameter_evidence(family, probability, model, observed_rows, control)
             log_evidence = _average_over_nodes(at_nodes, nodes.prior)
-        total += float(log_evidence[np.isfinite(log_evidence)].sum())
-    return total
+        total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
+    return total_log_evidence
 
 
 def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:

@@ -183,8 +183,8 @@ def last_steps(group: "xr.DataTree") -> Index:
     """Return the number of the last flown step of each twin, a (B,) array; 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
     flown_steps = (stored_values(group, "observed/control_index") >= 0).sum(axis=1)
-    last: Index = np.maximum(flown_steps - 1, 0)
-    return last
+    last_step: Index = np.maximum(flown_steps - 1, 0)
+    return last_step
 
 
 def severity(scenario: Scenario, mean: ArrayLike) -> Float:

@@ -171,9 +171,11 @@ class HypothesisWeights:
         """
         self.current = self.current + log_ratio
         self.hidden = self.hidden + log_ratio[RECOVERED]
-        total = np.logaddexp(np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden))
-        self.current -= total
-        self.hidden -= total
+        log_total_weight = np.logaddexp(
+            np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden)
+        )
+        self.current -= log_total_weight
+        self.hidden -= log_total_weight
 
     @property
     def log_right_after_fault(self) -> float:

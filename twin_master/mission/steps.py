@@ -425,8 +425,10 @@ def _possible_states(probability: Float) -> _NextStates:
 def _draw(states: _NextStates, uniform: Float) -> Index:
     """Return a state for each uniform random number, by inverse transform sampling."""
     # Rounding may leave the last cumulative probability a little below one.
-    last = len(states.state_indices) - 1
-    position = np.searchsorted(states.cumulative_probability, uniform, side="right").clip(max=last)
+    last_position = len(states.state_indices) - 1
+    position = np.searchsorted(states.cumulative_probability, uniform, side="right").clip(
+        max=last_position
+    )
     return np.asarray(states.state_indices[position])
 
 

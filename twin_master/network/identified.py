@@ -89,16 +89,16 @@ class IdentifiedSensorModel(GaussianSensorModel):
 
         # Covariance in each state: identification, noise and model error, interval of the state.
         shape = (self.state_count, present_columns.size, present_columns.size)
-        total = np.array(
+        total_covariance = np.array(
             np.broadcast_to(covariance[np.ix_(present_columns, present_columns)], shape)
         )
         diagonal = np.arange(present_columns.size)
         noise = self.independent_standard_deviation[:, control_index, present_columns]
-        total[:, diagonal, diagonal] += noise**2
+        total_covariance[:, diagonal, diagonal] += noise**2
         interval = self.interval[:, control_index, present_columns]
-        total += interval @ interval.swapaxes(1, 2)
+        total_covariance += interval @ interval.swapaxes(1, 2)
         try:
-            root = np.linalg.cholesky(total)
+            root = np.linalg.cholesky(total_covariance)
         except np.linalg.LinAlgError:
             raise InvalidObservationError(
                 "the covariance of the observation is not positive definite"
