@@ -139,7 +139,7 @@ class ModalSystem:
 
     @cached_property
     def full_stiffness(self) -> FloatArray:
-        """S (M, M), also where the stiffness couples no coordinates."""
+        """The stiffness matrix S (M, M), also if the stiffness couples no coordinates."""
         return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
 
     @cached_property

@@ -236,15 +236,15 @@ class ReducedModel(ReducedArrays):
         return np.asarray(values[..., first] * values[..., second])
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., T) of the stiffness terms at inputs (..., V)."""
+        """Return the coefficients of the T stiffness terms at values of the V inputs: (..., T)."""
         return self._products(vectors, self._stiffness_factor_columns)
 
     def load_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., L) of the loads at inputs (..., V)."""
+        """Return the coefficients of the L loads at values of the V inputs: (..., L)."""
         return self._products(vectors, self._load_factor_columns)
 
     def mass_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (1 + P,) of the mass terms at inputs (V,)."""
+        """Return the coefficients of structure and P free masses at V inputs: (1 + P,)."""
         first_mass = self._loss_inputs.stop
         return np.concatenate(([1.0], vector[first_mass : first_mass + len(self.masses)]))
 

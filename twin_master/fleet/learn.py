@@ -518,7 +518,7 @@ def _evidence_of_noise(
 
 
 def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
-    """Return the log evidence (B,) averaged over nodes with a prior (E,), from (B, E) at nodes."""
+    """Return the log evidence of B twins averaged over E nodes, whose prior is given."""
     largest = log_evidence.max(axis=1, keepdims=True)  # keeps the exponential from underflowing
     return np.asarray(largest[:, 0] + np.log(np.exp(log_evidence - largest) @ prior))
 

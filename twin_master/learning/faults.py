@@ -94,12 +94,12 @@ class FreeGainStatistics:
 
     @classmethod
     def from_array(cls, array: Float) -> "FreeGainStatistics":
-        """Return a copy of the statistics in an array (G, 5), in the order of the fields."""
+        """Return the statistics of G gauges from an array (G, 5), in the order of the fields."""
         free_probability, fixed_squares, sum_cc, sum_cx, free_squares = array.T.copy()
         return cls(free_probability, fixed_squares, sum_cc, sum_cx, free_squares)
 
     def as_array(self) -> Float:
-        """Return the statistics as an array (G, 5), in the order of the fields."""
+        """Return the statistics of G gauges as an array (G, 5), in the order of the fields."""
         return np.column_stack(
             [
                 self.free_probability,

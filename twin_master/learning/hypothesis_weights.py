@@ -190,7 +190,7 @@ class HypothesisWeights:
 
     @property
     def gauge_fault_probability(self) -> Float:
-        """Probability of each gain error of each gauge (G K,), whether this shows or not."""
+        """Probability of each of K gain errors of G gauges (G K,), whether it shows or not."""
         log_hidden = self.hidden[GAUGES_OF_FAULTS]
         return np.asarray(np.exp(np.logaddexp(self.current[GAUGE_FAULTS], log_hidden)))
 

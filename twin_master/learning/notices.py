@@ -54,7 +54,7 @@ class NoticeWriter:
     hypothesis_names: tuple[str, ...]
 
     def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
-        """Return whether each reading (G,) is implausible in every state under a control.
+        """Return for each of G gauges whether its reading is implausible in every state.
 
         A missing reading (NaN) is not absurd.
         """

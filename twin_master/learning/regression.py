@@ -73,7 +73,7 @@ class RegressionSums(NamedTuple):
 
     @classmethod
     def view(cls, array: Float) -> "RegressionSums":
-        """Return the sums that an array (K, G, 6) holds, without a copy."""
+        """Return the sums in an array (K, G, 6) for K hypotheses and G gauges, without a copy."""
         return cls._make(np.moveaxis(array, -1, 0))
 
 

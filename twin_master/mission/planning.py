@@ -36,7 +36,7 @@ _BISECTIONS = 4
 
 
 def discounts(scenario: Scenario) -> Float:
-    """Return the discount factor of each control (U,); zero if the control ends the mission."""
+    """Return the discount factor of each of U controls; zero if the control ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
 

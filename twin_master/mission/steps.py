@@ -417,7 +417,7 @@ class DamageGrowth:
 
 
 def _possible_states(probability: Float) -> _NextStates:
-    """Return the states of positive probability (S,) with their cumulative probability."""
+    """Return the states that have a positive probability, with their cumulative probability."""
     possible_states = np.flatnonzero(probability > 0.0)
     return _NextStates(np.cumsum(probability[possible_states]), possible_states)
 
@@ -552,7 +552,7 @@ class Plant:
         )
 
     def _state_in_asset(self, reading: AssetReading) -> Float:
-        """Return the true state (F,) that an asset with damage of its own reports."""
+        """Return the F true state factors that an asset with damage of its own reports."""
         if reading.state is None:
             raise MissionInputError(
                 f"step {self.step}: the asset does not report its damage, which the table `truth` "
