@@ -374,9 +374,11 @@ def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
     return np.array(rows)
 
 
-def _first_difference(first: Float, second: Float) -> str:
+def _first_difference(first_run: Float, second_run: Float) -> str:
     """Return the first values that differ between two arrays of equal shape, for a message."""
     # Compare bits, since 0.0 and -0.0 are equal numbers.
-    differs = first.ravel().view(np.uint64) != second.ravel().view(np.uint64)
+    differs = first_run.ravel().view(np.uint64) != second_run.ravel().view(np.uint64)
     position = np.flatnonzero(differs)[0]
-    return f"first ({float(first.flat[position])!r}), then ({float(second.flat[position])!r})"
+    return (
+        f"first ({float(first_run.flat[position])!r}), then ({float(second_run.flat[position])!r})"
+    )
