@@ -84,7 +84,7 @@ def print_calibration(
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The result of the calibration.
     written : Path or None
         The file of the calibration, if one was written.
     json : bool
@@ -326,7 +326,7 @@ class RingDownRow(NamedTuple):
         The mean over the trials, the standard deviation between trials, and the standard error of
         the mean.
     paper : float
-        The published figure.
+        The value that the paper publishes.
     """
 
     figure: str

@@ -560,7 +560,7 @@ def _parameter_values(
     numbers : list of str
         "VALUE" in the order of the names, or "NAME=VALUE".
     names : list of str
-        Names of the parameters.
+        The names of the parameters.
 
     Raises
     ------

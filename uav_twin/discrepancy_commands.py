@@ -152,15 +152,15 @@ def _origin_of_verdict(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     choice : ModelChoice
         The model that it is compared with.
     effects : list of Path
-        Files of further effects.
+        The paths of files with further effects.
     command : str
         The command that repeats the investigation in any folder.
     seed : int
-        Seed of all draws.
+        The seed of all random draws.
     """
     from discrepancy.document import Origin
     from reporting.files import hash_file
@@ -224,7 +224,7 @@ def _assess_campaign(
     calibrate : int or None
         The number of simulated campaigns.
     seed : int
-        Seed of their draws.
+        The seed of the random draws.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def _print_conclusion(
     Parameters
     ----------
     content : ReportInput
-        The investigation.
+        The results of the investigation.
     folder : Path
         The folder of the verdict.
     report : Path or None
@@ -475,11 +475,11 @@ def _check_record(
     Parameters
     ----------
     data : Campaign
-        The campaign.
+        The campaign after the checks of its data.
     model : str
-        Name of the model.
+        The name of the model.
     faults : sequence of DataFault
-        Faults of the data.
+        The faults that were found in the data.
     separability : Separability or None
         The detectability of each effect, and the groups of effects that the campaign cannot tell
         apart; None if a fault is fatal. A magnitude that is detectable at no value is null.

@@ -248,7 +248,7 @@ def _build_script(script: str, target: Path, *, replace: bool) -> None:
     script : str
         The name of a shipped script, or the path of a script.
     target : Path
-        The FMU to write.
+        The path of the FMU to write.
     replace : bool
         Whether to replace an existing file.
     """

@@ -222,7 +222,7 @@ def simulate_system(
 
 
 def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
-    """Refuse result files of an unknown format, and existing ones that are not to be replaced.
+    """Refuse result files of an unknown format, and existing files that may not be replaced.
 
     This is checked before the simulation, so that its result is not lost.
     """
@@ -258,7 +258,7 @@ def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     Parameters
     ----------
     binding : Binding
-        The binding.
+        The binding of the FMU's variables to roles.
     kind : str or None
         The value of `--interpolation`; None leaves the binding as it is.
     """
@@ -286,7 +286,7 @@ def _write_and_print_history(
     asset : FmiAsset
         The FMU, at the end of the simulation.
     history : ObservationHistory
-        Its outputs over time.
+        The outputs of the FMU over time.
     file : Path
         The file of the FMU.
     out, plot : Path or None

@@ -84,7 +84,7 @@ class ImportDialogue:
 
     @property
     def open_count(self) -> int:
-        """The number of questions that are open now; an answer may open further ones."""
+        """The number of questions that are open now; an answer may raise further questions."""
         questions = sum(len(subjects) for subjects in self.understanding.questions.values())
         return questions + sum(len(texts) for texts in self.understanding.assumptions.values())
 

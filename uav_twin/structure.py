@@ -64,7 +64,7 @@ def find_structure(file: Path) -> Path:
 
 
 def is_structure_file(design: Path) -> bool:
-    """Return whether a design file is that of a structure, and not of a wing."""
+    """Return whether a design file describes a structure, and not a wing."""
     from fe.structure.design import is_structure
     from reporting.toml_file import read_toml
 

@@ -97,7 +97,7 @@ def _write_wing_fields(
 
 
 def _print_wing(record: dict[str, Any]) -> None:
-    """Print masses, stiffness and frequencies of a wing beside the published ones.
+    """Print masses, stiffness and frequencies of a wing beside their published values.
 
     The files that were written are printed, too.
     """

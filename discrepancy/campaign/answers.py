@@ -44,16 +44,18 @@ class Questionnaire:
         """
         return self.answers.get(option, {}).get(subject)
 
-    def ask(self, option: str, subject: str, expected: str, choices: Collection[str] = ()) -> str:
+    def ask(
+        self, option: str, subject: str, expected_answer: str, choices: Collection[str] = ()
+    ) -> str:
         """Return an answer; if there is none, note an open question and return an empty text.
 
         Parameters
         ----------
         option : str
-            The option, without dashes.
+            The name of the option, without dashes.
         subject : str
             The column or file; empty for all.
-        expected : str
+        expected_answer : str
             What the option expects, for the user.
         choices : collection of str
             The answers that are allowed; any if empty.
@@ -66,7 +68,7 @@ class Questionnaire:
         answers = self.answers.get(option, {})
         answer = answers.get(subject, answers.get(""))
         if answer is None:
-            subjects = self.questions.setdefault((option, expected), [])
+            subjects = self.questions.setdefault((option, expected_answer), [])
             if subject not in subjects:
                 subjects.append(subject)
             return ""
@@ -77,7 +79,12 @@ class Questionnaire:
         return answer
 
     def ask_or_assume(
-        self, default: str, option: str, subject: str, expected: str, choices: Collection[str] = ()
+        self,
+        default: str,
+        option: str,
+        subject: str,
+        expected_answer: str,
+        choices: Collection[str] = (),
     ) -> str:
         """Return an answer; if there is none, note the default as assumed and return it.
 
@@ -85,9 +92,9 @@ class Questionnaire:
         """
         answers = self.answers.get(option, {})
         if subject not in answers and "" not in answers:
-            self.assumptions.setdefault((option, expected), {})[subject] = default
+            self.assumptions.setdefault((option, expected_answer), {})[subject] = default
             return default
-        return self.ask(option, subject, expected, choices)
+        return self.ask(option, subject, expected_answer, choices)
 
     def is_assumed(self, option: str, subject: str) -> bool:
         """Return whether the default answer of an option was used for a subject."""
@@ -116,11 +123,11 @@ def check_subjects(answers: Answers, heads: Collection[str], files: Collection[s
     """
     for option in (*OF_COLUMNS, *OF_FILES):
         subjects = heads if option in OF_COLUMNS else files
-        allowed = {*subjects}
+        allowed_subjects = {*subjects}
         if option in OF_FILES or option in OF_ALL_COLUMNS:
-            allowed.add("")
-        for name in answers.get(option, {}).keys() - allowed:
-            expected = listing(map(repr, filter(None, subjects)), "or")
+            allowed_subjects.add("")
+        for name in answers.get(option, {}).keys() - allowed_subjects:
+            expected_subjects = listing(map(repr, filter(None, subjects)), "or")
             raise CampaignFileError(
-                f"--{option} must be NAME=... about {expected}, and {name!r} came."
+                f"--{option} must be NAME=... about {expected_subjects}, and {name!r} came."
             )

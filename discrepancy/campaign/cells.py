@@ -42,7 +42,7 @@ def plain_number(cell: str, mark: str) -> str | None:
     Parameters
     ----------
     cell : str
-        The cell.
+        The text of the cell.
     mark : str
         Decimal mark: a point or a comma.
     """
@@ -77,7 +77,7 @@ def _seconds_of_cell(cell: str, place: str) -> Decimal:
     Parameters
     ----------
     cell : str
-        The cell.
+        The text of the cell.
     place : str
         File and line, for messages.
 
@@ -168,8 +168,8 @@ def _continue_past_midnight(times: Sequence[Decimal]) -> list[Decimal]:
     """
     days = 0
     continued = [times[0]]
-    for previous, time_of_day in pairwise(times):
-        if time_of_day < previous - _HALF_DAY:
+    for previous_time, time_of_day in pairwise(times):
+        if time_of_day < previous_time - _HALF_DAY:
             days += 1
         continued.append(time_of_day + days * _DAY)
     return continued
@@ -189,7 +189,7 @@ def decimal_mark(
     place : str
         Name of the file and what its rows are called, for messages.
     separator : str
-        Character between the cells.
+        The character between two cells.
 
     Returns
     -------

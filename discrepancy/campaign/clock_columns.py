@@ -49,12 +49,12 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
             f"has which is not clear ({reason}): put each column of times before its columns, or "
             "leave all but one out with --column NAME=-."
         )
-    used = {column.head: column for column in columns if column.role != LEFT_OUT}
+    used_columns = {column.head: column for column in columns if column.role != LEFT_OUT}
     clocks = []
     for time in times:
-        stamped = tuple(used[head] for head in stamped_heads[time] if head in used)
+        stamped = tuple(used_columns[head] for head in stamped_heads[time] if head in used_columns)
         if stamped:
-            clocks.append(TableClock(used[time], stamped))
+            clocks.append(TableClock(used_columns[time], stamped))
     return tuple(clocks)
 
 
@@ -67,8 +67,8 @@ def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str,
         For each column of times the names of the columns that were read at these times. None if a
         column of readings fits no column of times or several, or if a column of times gets none.
     """
-    common = shared_words(times)
-    labels = {time: words_of_head(time) - common for time in times}
+    common_words = shared_words(times)
+    labels = {time: words_of_head(time) - common_words for time in times}
     stamped: dict[str, list[str]] = {time: [] for time in times}
     for head in readings:
         matching = [

@@ -51,7 +51,7 @@ class _ClockTimes:
     Attributes
     ----------
     seconds : (n,) ndarray
-        Times [s], strictly increasing.
+        The times [s], which increase strictly.
     rows : list of int
         Rows of the table in which they stand.
     """
@@ -190,7 +190,7 @@ def _hold_of_load(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> 
 def _place_cells(
     cells: Sequence[str], rows: Sequence[int], positions: Sequence[int], count: int
 ) -> list[str]:
-    """Return `count` cells, with cells of a table at some positions and empty ones elsewhere.
+    """Return `count` cells: cells of a table at some positions, and empty cells elsewhere.
 
     Parameters
     ----------
@@ -224,11 +224,11 @@ def _line_numbers(
     clocks : sequence of TableClock
         The clocks of one table.
     times : sequence of _ClockTimes
-        Times of each clock.
+        The times of each clock of the file.
     positions : sequence of sequence of int
         For each clock, the indices of its times among the merged times.
     count : int
-        Number of merged times.
+        The number of times that were merged.
     """
     lines_of_rows = clocks[0].times.sheet.lines
     lines = [0] * count
@@ -302,16 +302,16 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
                     f"{sheet.name}, line {sheet.lines[row]}: {column.head!r} has a reading and "
                     f"{clock.times.head!r} no time: give it, or leave the reading out."
                 )
-    printed = [cells[row] for row in rows]
-    seconds = np.array([float(cell) for cell in printed])
+    printed_times = [cells[row] for row in rows]
+    seconds = np.array([float(cell) for cell in printed_times])
     backwards = np.flatnonzero(np.diff(seconds) <= 0.0)
     if backwards.size:
         user = f"the column {clock.times.head!r}"
         raise CampaignDataError(
-            decreasing_times_message(sheet.name, user, printed, int(backwards[0]))
+            decreasing_times_message(sheet.name, user, printed_times, int(backwards[0]))
         )
     if len(rows) > 1:
-        seconds = undo_rounding(seconds, printed)
+        seconds = undo_rounding(seconds, printed_times)
     return _ClockTimes(seconds, rows)
 
 
@@ -324,7 +324,7 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
     Parameters
     ----------
     times : sequence of _ClockTimes
-        Times of each clock.
+        The times of each clock of the file.
 
     Returns
     -------
@@ -395,7 +395,7 @@ def _fill_between_samples(
 
 
 def _stamped_columns_text(clocks: Sequence[TableClock]) -> str:
-    """Return the beginning of a remark: which columns are stamped by which column of times."""
+    """Return the beginning of a remark, which lists the columns that a column of times stamps."""
     phrases = []
     for clock in clocks:
         heads = listing(repr(column.head) for column in clock.columns)

@@ -112,7 +112,7 @@ def role_by_unit(
     Parameters
     ----------
     head : str
-        Name of the column.
+        The name of the column as printed at its head.
     heads, units : sequence of str
         Names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
@@ -132,7 +132,7 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     Parameters
     ----------
     head : str
-        Name of the column.
+        The name of the column as printed at its head.
     unit : str
         Unit of its cells; empty if the file does not state it.
     scale : str
@@ -260,7 +260,7 @@ def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
     Parameters
     ----------
     unit : str
-        Unit of its readings.
+        The unit of the readings.
     answer : str or None
         The option `--quantity`, which decides.
 
@@ -328,7 +328,7 @@ def units_of_columns(
     Parameters
     ----------
     columns : iterable of LaboratoryColumn
-        Columns of all tables.
+        The columns of all tables.
     kinds : mapping of str to str
         Kind of each table's trial, by the name of the table.
     """
@@ -343,21 +343,23 @@ def units_of_columns(
     return units
 
 
-def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[str, str]) -> str:
+def origin_remark(
+    sheet: Sheet, columns: Sequence[LaboratoryColumn], scales: Mapping[str, str]
+) -> str:
     """Return the remark on the source file of a table and on the role of each of its columns.
 
     Parameters
     ----------
     sheet : Sheet
         The table.
-    used : sequence of LaboratoryColumn
+    columns : sequence of LaboratoryColumn
         Its columns that are not left out.
     scales : mapping of str to str
         Values of the option `--scale` of the import, by the head of the column they apply to.
     """
     phrases = []
     empty_cell_count = 0
-    for column in used:
+    for column in columns:
         scale = f" times {scales[column.head]}" if column.head in scales else ""
         phrases.append(f"{column.head!r} [{column.unit}]{scale} is {column.role}")
         empty_cell_count += sheet.columns[sheet.heads.index(column.head)].count("")
@@ -382,13 +384,11 @@ def missing_answers(questions: Mapping[tuple[str, str], Sequence[str]]) -> str:
         names of the files, that need a value. A single empty name means one value for all.
     """
     option_phrases = []
-    for (option, expected), subjects in questions.items():
+    for (option, expected_answer), subjects in questions.items():
         placeholder = "..."
         if subjects[0]:
             placeholder = f"NAME=... for {listing(map(repr, subjects))}"
-        option_phrases.append(f"--{option} {placeholder} ({expected})")
-    missing = sum(map(len, questions.values()))
-    return (
-        f"{counted(missing, 'answer')} {is_or_are(missing)} missing, and nothing was written: "
-        f"give {'; '.join(option_phrases)}."
-    )
+        option_phrases.append(f"--{option} {placeholder} ({expected_answer})")
+    answer_count = sum(map(len, questions.values()))
+    answers_text = f"{counted(answer_count, 'answer')} {is_or_are(answer_count)} missing"
+    return f"{answers_text}, and nothing was written: give {'; '.join(option_phrases)}."

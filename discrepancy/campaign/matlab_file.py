@@ -30,7 +30,7 @@ class MatlabTable(NamedTuple):
     heads : tuple of str
         Names of its C columns.
     columns : tuple of tuple of str
-        Cells (C, N).
+        The cells of C columns with N rows each.
     remark : str
         How many rows there are, and which variables are left out.
     """
@@ -132,24 +132,26 @@ def _hdf5_content(path: Path) -> dict[str, object]:
     """
     variables: dict[str, object] = {}
     with h5py.File(path, "r") as file:
-        for name, stored in file.items():
+        for name, stored_object in file.items():
             if name.startswith("#"):  # references that the format keeps for itself
                 continue
-            if isinstance(stored, h5py.Group):
-                variables[name] = {field: _hdf5_array(value) for field, value in stored.items()}
+            if isinstance(stored_object, h5py.Group):
+                variables[name] = {
+                    field: _hdf5_array(value) for field, value in stored_object.items()
+                }
             else:
-                variables[name] = _hdf5_array(stored)
+                variables[name] = _hdf5_array(stored_object)
     return variables
 
 
-def _hdf5_array(stored: h5py.Dataset | h5py.Group) -> np.ndarray | None:
+def _hdf5_array(stored_object: h5py.Dataset | h5py.Group) -> np.ndarray | None:
     """Return a matrix, which HDF5 has transposed; None for a group, a text or an empty array."""
-    if isinstance(stored, h5py.Group):
+    if isinstance(stored_object, h5py.Group):
         return None
-    is_text = stored.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
-    if is_text or "MATLAB_empty" in stored.attrs:
+    is_text = stored_object.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
+    if is_text or "MATLAB_empty" in stored_object.attrs:
         return None
-    return np.transpose(stored[()])
+    return np.transpose(stored_object[()])
 
 
 def _columns(name: str, value: object) -> dict[str, np.ndarray]:

@@ -232,9 +232,9 @@ def remove_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tupl
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
 
     Returns
     -------
@@ -268,9 +268,9 @@ def strongest_line_near(
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     frequency : float
         Centre of the band that is searched [Hz].
     half_width : float
@@ -312,9 +312,9 @@ def _strongest_line(samples: FloatArray, interval: float, low: float, high: floa
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     low, high : float
         Ends of the band of frequencies that is searched [Hz].
 
@@ -345,7 +345,7 @@ def fit_autoregression(series: FloatArray) -> tuple[FloatArray, float]:
     Parameters
     ----------
     series : (n,) ndarray
-        Samples, mean removed.
+        The samples of the record, minus their mean.
 
     Returns
     -------

@@ -92,7 +92,7 @@ class SeriesTest(NamedTuple):
     p_value: float
 
 
-def ljung_box(series: FloatArray, used: BoolArray | None = None) -> SeriesTest:
+def ljung_box(series: FloatArray, is_used: BoolArray | None = None) -> SeriesTest:
     """Test whether a series of residuals is white by the statistic of Ljung and Box.
 
     With the autocorrelations rho_k, Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20, n / 5) lags
@@ -105,23 +105,23 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> SeriesTest:
     ----------
     series : (N,) ndarray
         Residuals, with a mean of zero.
-    used : (N,) ndarray of bool, optional
+    is_used : (N,) ndarray of bool, optional
         False for samples that are left out. Then n is the number of used samples, and n - k is
         replaced by the number of pairs of used samples at lag k, which keeps the mean of Q exact.
     """
-    if used is None:
+    if is_used is None:
         count = series.size
         values = series
     else:
-        count = int(used.sum())
-        values = np.where(used, series, 0.0)
+        count = int(is_used.sum())
+        values = np.where(is_used, series, 0.0)
     lags = min(LAGS, count // 5)
     if lags < 1 or not np.any(values):
         return SeriesTest(0.0, 1.0)
-    if used is None:
+    if is_used is None:
         pairs = count - np.arange(1.0, lags + 1)
     else:
-        pairs = lag_products(used.astype(float), lags)[0, 1:]
+        pairs = lag_products(is_used.astype(float), lags)[0, 1:]
     statistic = float(_portmanteau(values[np.newaxis], count, pairs)[0])
     mean, deviation, skewness = _portmanteau_moments(count, lags)
     # the standardised gamma distribution of this skewness (Pearson's type III)
@@ -139,9 +139,9 @@ def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     Parameters
     ----------
     rows : (M, N) or (N,) ndarray
-        Series.
+        One series of N samples, or M of them.
     lags : int
-        Largest lag.
+        The largest lag, in samples.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     Parameters
     ----------
     series : sequence of (N,) ndarray
-        Records of any lengths.
+        The records, of any lengths.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
 def statistical_inefficiency(
     rho: FloatArray, white_variance: FloatArray, ratio: float = 1.0
 ) -> float:
-    """Return the number of samples over the effective number of independent ones.
+    """Return how many samples of a correlated record count as one independent sample.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
     zero even for white noise, so the expected sum of their squares by chance is subtracted. That
@@ -273,10 +273,10 @@ def cumulative_periodogram(series: FloatArray) -> SeriesTest:
     Biometrika 56, 1-15).
     """
     ordinates = periodogram(series)
-    total = float(ordinates.sum())
-    if total == 0.0 or ordinates.size < 3:
+    total_power = float(ordinates.sum())
+    if total_power == 0.0 or ordinates.size < 3:
         return SeriesTest(0.0, 1.0)
-    fractions = np.cumsum(ordinates)[:-1] / total
+    fractions = np.cumsum(ordinates)[:-1] / total_power
     test = stats.kstest(np.clip(fractions, 0.0, 1.0), "uniform")
     return SeriesTest(float(test.statistic), float(test.pvalue))
 
@@ -306,11 +306,11 @@ def fisher_g(series: FloatArray) -> LineTest:
     as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
     """
     ordinates = periodogram(series)
-    total = float(ordinates.sum())
-    if total == 0.0:
+    total_power = float(ordinates.sum())
+    if total_power == 0.0:
         return LineTest(0.0, 1.0, 0)
     largest = int(np.argmax(ordinates))
-    g = float(ordinates[largest]) / total
+    g = float(ordinates[largest]) / total_power
     first_term = ordinates.size * (1.0 - g) ** (ordinates.size - 1)
     return LineTest(g, float(-np.expm1(-first_term)), largest + 1)
 

@@ -94,7 +94,7 @@ class Sheet:
         Parameters
         ----------
         head : str
-            Name of the column.
+            The name of the column as printed at its head.
         decimal : str
             Decimal mark of its cells.
         """
@@ -288,7 +288,7 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
     Parameters
     ----------
     path : path
-        The workbook.
+        The path of the workbook.
     sheet_name : str
         Name of the sheet; empty for the only one that is not empty.
 

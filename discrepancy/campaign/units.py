@@ -79,7 +79,7 @@ def conversion_factor(unit: str, si: str) -> float:
     unit : str
         The unit, as a file or a logger writes it.
     si : str
-        The unit of SI.
+        The SI unit of the quantity.
 
     Raises
     ------

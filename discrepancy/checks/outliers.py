@@ -68,21 +68,21 @@ def mark_outliers(campaign: Campaign) -> Campaign:
     if a parabola through the others scatters by less than twice the noise and misses this row by
     more than eight standard deviations. Both rules need a noise record.
     """
-    used = {trial.name: trial.used.copy() for trial in campaign.trials}
+    is_used = {trial.name: trial.used.copy() for trial in campaign.trials}
     remarks = list(campaign.remarks)
     for trial, channel, is_outlier in find_outliers(campaign):
         count = int(is_outlier.sum())
-        total = len(is_outlier)
-        too_many = trial.is_dynamic and count > LARGEST_SHARE * total
+        reading_count = len(is_outlier)
+        too_many = trial.is_dynamic and count > LARGEST_SHARE * reading_count
         if too_many or "outliers" in campaign.accepted_faults(channel, trial.name):
             continue
-        used[trial.name][is_outlier, trial.channels.index(channel)] = False
+        is_used[trial.name][is_outlier, trial.channels.index(channel)] = False
         outliers = "is an outlier" if count == 1 else "are outliers"
         remarks.append(
-            f"{count} of {total} readings of {channel!r} in the trial {trial.name!r} {outliers} "
-            "and left out."
+            f"{count} of {reading_count} readings of {channel!r} in the trial {trial.name!r} "
+            f"{outliers} and left out."
         )
-    trials = tuple(replace(trial, used=used[trial.name]) for trial in campaign.trials)
+    trials = tuple(replace(trial, used=is_used[trial.name]) for trial in campaign.trials)
     return replace(campaign, trials=trials, remarks=tuple(remarks))
 
 
@@ -92,9 +92,9 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     Yields
     ------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     channel : str
-        Name of the channel.
+        The name of the channel.
     is_outlier : (N,) ndarray of bool
         Which of its readings are outliers.
     """
@@ -104,21 +104,21 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     }
     for name, channel in campaign.channels.items():
         outliers_of_repeats = repeat_outliers(campaign, channel)
-        for trial, values, used in campaign.records(name):
+        for trial, values, is_used in campaign.records(name):
             if trial.is_dynamic:
                 noise = trial.noise_deviation(channel)
-                outliers = sample_outliers(values, used, weights[trial.name], noise=noise)
+                outliers = sample_outliers(values, is_used, weights[trial.name], noise=noise)
             elif trial.name in outliers_of_repeats:
-                outliers = outliers_of_repeats[trial.name] & used
+                outliers = outliers_of_repeats[trial.name] & is_used
             else:
-                outliers = row_outlier(trial, values, used, channel)
+                outliers = row_outlier(trial, values, is_used, channel)
             if outliers.any():
                 yield trial, name, outliers
 
 
 def sample_outliers(
     values: FloatArray,
-    used: BoolArray | None = None,
+    is_used: BoolArray | None = None,
     weights: Weights | None = None,
     *,
     noise: float = 0.0,
@@ -130,8 +130,8 @@ def sample_outliers(
     Parameters
     ----------
     values : (N,) ndarray
-        The record.
-    used : (N,) ndarray of bool, optional
+        The samples of the record.
+    is_used : (N,) ndarray of bool, optional
         False for samples that are left out: they are interpolated and never outliers.
     weights : callable, optional
         Weights of the local polynomials at the record's times; those of even samples by default.
@@ -140,22 +140,22 @@ def sample_outliers(
     """
     count = len(values)
     largest_reading = float(np.max(np.abs(values), initial=0.0))
-    if used is None:
-        used = np.ones(count, dtype=bool)
-    if count < 4 * _EDGE_SAMPLES + 4 or used.sum() < 0.5 * count or largest_reading == 0.0:
+    if is_used is None:
+        is_used = np.ones(count, dtype=bool)
+    if count < 4 * _EDGE_SAMPLES + 4 or is_used.sum() < 0.5 * count or largest_reading == 0.0:
         return np.zeros(count, dtype=bool)
     # scaled, so that squares of readings of any size stay in range
     indices = np.arange(count)
     record = np.where(
-        used,
+        is_used,
         values / largest_reading,
-        np.interp(indices, indices[used], values[used] / largest_reading),
+        np.interp(indices, indices[is_used], values[is_used] / largest_reading),
     )
     polynomial = _best_polynomial(record, weights or even_weights)
     # Rounding to a quantum q has the standard deviation q / sqrt(12). A record at rest may show no
     # rounding at all, so that this is the least scatter that residuals are compared with.
     weight_norm = float(np.linalg.norm(even_weights(polynomial.width, polynomial.degree)))
-    rounding = quantum_of(values[used] / largest_reading) * 12.0**-0.5 * weight_norm
+    rounding = quantum_of(values[is_used] / largest_reading) * 12.0**-0.5 * weight_norm
 
     # readings within the noise are no outliers
     noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
@@ -166,7 +166,7 @@ def sample_outliers(
     deviation = np.abs((record - cleaned) * weight_of_sample + residual)
     is_beyond_noise = deviation > noise_limit
     is_beyond_scatter = deviation > OUTLIER_DEVIATIONS * _comparison_deviation(residual, rounding)
-    outliers = used & suspects & is_beyond_noise & is_beyond_scatter
+    outliers = is_used & suspects & is_beyond_noise & is_beyond_scatter
     # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
     is_event = np.convolve(is_crowded, np.ones(5), mode="same") > 0
@@ -195,7 +195,7 @@ def _find_suspects(
     Parameters
     ----------
     record : (N,) ndarray
-        The record.
+        The samples of the record.
     polynomial : LocalPolynomial
         The polynomial that predicts each sample.
     rounding : float
@@ -238,7 +238,7 @@ def _find_suspects(
 
 
 def wrong_end_readings(
-    residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0
+    residual: FloatArray, is_used: BoolArray, noise: FloatArray | float = 0.0
 ) -> BoolArray:
     """Return which of the first and last three samples of records are single wrong readings.
 
@@ -251,7 +251,7 @@ def wrong_end_readings(
     ----------
     residual : (N, C) ndarray
         Readings minus prediction; the model need not fit.
-    used : (N, C) ndarray of bool
+    is_used : (N, C) ndarray of bool
         False for samples that are left out.
     noise : (C,) ndarray or float
         Standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
@@ -265,7 +265,7 @@ def wrong_end_readings(
     wrong = np.zeros(residual.shape, dtype=bool)
     noise = np.broadcast_to(noise, residual.shape[1:])
     for column in range(residual.shape[1]):
-        rows = np.flatnonzero(used[:, column])
+        rows = np.flatnonzero(is_used[:, column])
         if len(rows) >= 8 * _EDGE_SAMPLES:
             is_wrong = _wrong_ends_of_channel(residual[rows, column], float(noise[column]))
             wrong[rows, column] = is_wrong
@@ -286,7 +286,7 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     Parameters
     ----------
     residual : (N,) ndarray
-        Readings minus prediction.
+        The readings minus their prediction.
     noise : float
         Standard deviation of the noise; 0 if it is not known.
     """
@@ -317,9 +317,9 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
     residual : (N,) ndarray
         Residuals of the local polynomial.
     index : int
-        Index of the sample.
+        The index of the sample.
     polynomial : LocalPolynomial
-        The polynomial.
+        The local polynomial that smooths a record.
     """
     width = polynomial.width
     low = max(index - width, 0)
@@ -340,7 +340,7 @@ def _robust_scatter(residual: FloatArray) -> float:
 
 
 def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
-    """Return the robust standard deviation (N,) with which each residual (N,) is compared.
+    """Return the robust standard deviation (N,) that each residual (N,) is compared with.
 
     It is that of the whole record or that of the samples around it, whichever is larger, and at
     least `least`.

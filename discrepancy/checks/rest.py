@@ -35,7 +35,7 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     frequency : float, optional
         Frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
     """
@@ -98,7 +98,7 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
     residual : (n,) ndarray
         The noise record without mains lines, mean removed.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     frequency : float
         Frequency of the mode [Hz].
     """
@@ -125,7 +125,7 @@ def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | Non
     residual : (n,) ndarray
         The noise record without mains lines and drift.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     """
     quarters = np.array_split(residual, 4)
     # mean absolute values, which single spikes change less than the standard deviation

@@ -95,10 +95,10 @@ class MotionEstimator(GaussNewton):
         current = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            smoothed = self.iterate(laws, current, speed_window, MOST_PASSING_ITERATIONS)
-            if smoothed is None:
+            estimate = self.iterate(laws, current, speed_window, MOST_PASSING_ITERATIONS)
+            if estimate is None:
                 return None
-            current = start_from_estimate(smoothed)
+            current = start_from_estimate(estimate)
         return self._lower_missing_forces(laws, current, SPEED_WINDOWS[-1])
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
@@ -246,17 +246,17 @@ class MotionEstimator(GaussNewton):
             The largest number of linearisations of the last estimate.
         """
         start = start_from_estimate(estimate)
-        linear = self.linearise(laws, start, estimate.speed_window)
-        if linear is None:
+        linearisation = self.linearise(laws, start, estimate.speed_window)
+        if linearisation is None:
             return estimate
         processes = dict(start.processes)
-        first_evidence = self.evidence_with_processes(linear, processes)
+        first_evidence = self.evidence_with_processes(linearisation, processes)
         largest_evidence = first_evidence
         for factor in factors:
             for _ in range(repetitions):
                 last_evidence = largest_evidence
                 processes, largest_evidence = self._try_factor(
-                    linear, processes, largest_evidence, factor
+                    linearisation, processes, largest_evidence, factor
                 )
                 if largest_evidence < last_evidence + LEAST_RISE:
                     break
@@ -271,23 +271,23 @@ class MotionEstimator(GaussNewton):
 
     def _try_factor(
         self,
-        linear: Linearisation,
+        linearisation: Linearisation,
         processes: dict[int, Process],
         largest_evidence: float,
         factor: float,
     ) -> tuple[dict[int, Process], float]:
-        """Return missing forces, each size and time changed by a factor if that is more probable.
+        """Multiply each size and time of missing forces by a factor if that is more probable.
 
         Parameters
         ----------
-        linear : Linearisation
-            The trials.
+        linearisation : Linearisation
+            All trials, linear about the present estimate.
         processes : dict of int to Process
             The missing forces, by the number of the port.
         largest_evidence : float
             Their log evidence [nat].
         factor : float
-            The factor by which, or by whose inverse, each size and time is multiplied.
+            The factor; each size and time is multiplied by the factor, or else by its inverse.
 
         Returns
         -------
@@ -303,7 +303,7 @@ class MotionEstimator(GaussNewton):
                 changed_processes = processes | {
                     port: replace(processes[port], **{quantity: value})
                 }
-                evidence = self.evidence_with_processes(linear, changed_processes)
+                evidence = self.evidence_with_processes(linearisation, changed_processes)
                 if evidence > largest_evidence:
                     processes, largest_evidence = changed_processes, evidence
                     break

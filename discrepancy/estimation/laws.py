@@ -38,12 +38,12 @@ class LawForce:
     by_position: FloatArray
     by_speed: FloatArray
 
-    def plus(self, other: "LawForce") -> "LawForce":
+    def plus(self, other_force: "LawForce") -> "LawForce":
         """Return the sum with the force of other laws at the same port."""
         return LawForce(
-            self.force + other.force,
-            self.by_position + other.by_position,
-            self.by_speed + other.by_speed,
+            self.force + other_force.force,
+            self.by_position + other_force.by_position,
+            self.by_speed + other_force.by_speed,
         )
 
 

@@ -54,9 +54,9 @@ def rank_by_missing_force(
     search : ForceSearch
         The search for the missing force in all samples.
     effects : sequence of Effect
-        The effects.
+        The effects that may be missing in the model.
     on_progress : callable
-        The function that takes a line on what is compared.
+        The function to which progress is reported, as a line of text.
     """
     thinned_search = search_in_thinned_records(search)
     if thinned_search is None:
@@ -64,9 +64,9 @@ def rank_by_missing_force(
         return refine_hypotheses(search, ranked, len(effects), on_progress)
     ranked = _rank_in_thinned_records(thinned_search, effects, on_progress)
     hypotheses = [search.hypothesis_of_all_ports]
-    for leading in _leading_hypotheses(thinned_search, ranked, len(effects)):
-        on_progress(f"estimating {leading.candidate.description} in all samples")
-        hypothesis = estimate_in_all_samples(search, leading)
+    for leading_hypothesis in _leading_hypotheses(thinned_search, ranked, len(effects)):
+        on_progress(f"estimating {leading_hypothesis.candidate.description} in all samples")
+        hypothesis = estimate_in_all_samples(search, leading_hypothesis)
         if hypothesis is not None:
             hypotheses.append(hypothesis)
     return sorted(hypotheses, key=lambda hypothesis: -search.score(hypothesis, len(effects)))
@@ -104,9 +104,9 @@ def _rank_in_thinned_records(
     search : ForceSearch
         The search in thinned records.
     effects : sequence of Effect
-        The effects.
+        The effects that may be missing in the model.
     on_progress : callable
-        The function that takes a line on what is compared.
+        The function to which progress is reported, as a line of text.
     """
 
     def score(hypothesis: ForceHypothesis) -> float:
@@ -114,21 +114,21 @@ def _rank_in_thinned_records(
 
     singles = search.rank_hypotheses(effects, on_progress, largest_set=1)
     hypotheses = refine_hypotheses(search, singles, len(effects), on_progress)
-    best = hypotheses[0]
+    best_hypothesis = hypotheses[0]
     for followed_count in FOLLOWED_COUNTS[1:]:
-        if not best.candidate.terms:
+        if not best_hypothesis.candidate.terms:
             break
-        extended = search.extend_hypothesis(best, effects, followed_count, on_progress)
+        extended = search.extend_hypothesis(best_hypothesis, effects, followed_count, on_progress)
         refined = []
         for hypothesis in extended[:MOST_REFINED_SETS]:
             on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-            estimated = estimate_extended_hypothesis(search, hypothesis, best)
-            refined.append(hypothesis if estimated is None else estimated)
+            estimated_hypothesis = estimate_extended_hypothesis(search, hypothesis, best_hypothesis)
+            refined.append(hypothesis if estimated_hypothesis is None else estimated_hypothesis)
         hypotheses += refined
-        best_of_sets = max(refined, key=score, default=best)
-        if score(best_of_sets) <= score(best):
+        best_of_sets = max(refined, key=score, default=best_hypothesis)
+        if score(best_of_sets) <= score(best_hypothesis):
             break
-        best = best_of_sets
+        best_hypothesis = best_of_sets
     return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
@@ -152,18 +152,22 @@ def _leading_hypotheses(
     with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
     if not with_effects:
         return []
-    best = with_effects[0]
-    least_score = search.score(best, effect_count) - LEADING_RANGE
-    leading = [
+    best_hypothesis = with_effects[0]
+    least_score = search.score(best_hypothesis, effect_count) - LEADING_RANGE
+    leading_hypotheses = [
         hypothesis
         for hypothesis in with_effects[:MOST_LEADING]
         if search.score(hypothesis, effect_count) > least_score
     ]
     for hypothesis in with_effects:
-        has_same_effects = hypothesis.candidate.identifiers == best.candidate.identifiers
-        if has_same_effects and hypothesis not in leading and len(leading) < MOST_LEADING:
-            leading.append(hypothesis)
-    return leading
+        has_same_effects = hypothesis.candidate.identifiers == best_hypothesis.candidate.identifiers
+        if (
+            has_same_effects
+            and hypothesis not in leading_hypotheses
+            and len(leading_hypotheses) < MOST_LEADING
+        ):
+            leading_hypotheses.append(hypothesis)
+    return leading_hypotheses
 
 
 def estimate_in_all_samples(
@@ -185,9 +189,11 @@ def estimate_in_all_samples(
     """
     thinned_trials = hypothesis.linear_trials.trials
     shared_count = search.problem.shared.unknown_count
-    shared = thinned_trials[0].linearisation_point[:shared_count]
-    local = [trial.linearisation_point[shared_count:] for trial in thinned_trials]
-    trials = search.column_builder.trials_about(search.point_of_unknowns(shared, local))
+    shared_values = thinned_trials[0].linearisation_point[:shared_count]
+    local_of_trials = [trial.linearisation_point[shared_count:] for trial in thinned_trials]
+    trials = search.column_builder.trials_about(
+        search.point_of_unknowns(shared_values, local_of_trials)
+    )
     laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
     trajectories = []
     for thinned_trial, trial, motion, own_unknowns in zip(

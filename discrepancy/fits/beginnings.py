@@ -35,7 +35,7 @@ def refit_from_first_readings(
     problem : Problem
         The campaign and model that were fitted.
     fit : CandidateFit
-        The fit to improve.
+        The fit that is improved.
     iterations : int
         The largest number of steps.
     local_only : bool

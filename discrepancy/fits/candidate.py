@@ -179,7 +179,7 @@ class Candidate:
         Parameters
         ----------
         scaled_values : (E,) array
-            The scaled effect parameters.
+            The E parameters of the effects, on the scale on which their priors are standard normal.
         step : (E,) array
             The step of these variables.
         """
@@ -309,9 +309,9 @@ class FitState:
 
 def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
     """Return a copy of the values in which one of them is larger by a step."""
-    changed = values.copy()
-    changed[index] += step
-    return changed
+    stepped_values = values.copy()
+    stepped_values[index] += step
+    return stepped_values
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,8 +93,8 @@ class CandidateFit(FitState):
     @property
     def effect_covariance(self) -> FloatArray:
         """The covariance (E, E) of the scaled effect parameters."""
-        first = len(self.covariance) - self.candidate.parameter_count
-        return self.covariance[first:, first:]
+        first_parameter = len(self.covariance) - self.candidate.parameter_count
+        return self.covariance[first_parameter:, first_parameter:]
 
     @property
     def chi_square(self) -> float:
@@ -118,7 +118,7 @@ def fit(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     candidate : Candidate
         The effects whose parameters are fitted.
     start : Point
@@ -261,7 +261,7 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     point : Point
         The values of all unknowns.
     responses : sequence of (N, C) array
@@ -289,7 +289,7 @@ class _Descent:
     Attributes
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     candidate : Candidate
         The effects that are fitted.
     local_only : bool
@@ -387,19 +387,19 @@ class _Descent:
         predicted_decrease = 0.5 * float(equations.gradient @ step)
         return self._split_step(step), predicted_decrease
 
-    def _is_held_at_bound(self, shared: FloatArray, downhill: FloatArray) -> BoolArray:
+    def _is_held_at_bound(self, shared_values: FloatArray, downhill: FloatArray) -> BoolArray:
         """Return which shared unknowns (Q,) are at an end of their range and would leave it.
 
         Parameters
         ----------
-        shared : (Q,) array
-            The scaled shared unknowns.
+        shared_values : (Q,) array
+            The scaled values of the Q unknowns that all trials share.
         downhill : (Q,) array
             The direction in which the objective decreases.
         """
         low, high = self.problem.shared.bounds
-        is_held_low = (shared <= low) & (downhill < 0.0)
-        is_held_high = (shared >= high) & (downhill > 0.0)
+        is_held_low = (shared_values <= low) & (downhill < 0.0)
+        is_held_high = (shared_values >= high) & (downhill > 0.0)
         return np.asarray(is_held_low | is_held_high)
 
     def _split_step(self, step: FloatArray) -> Point:
@@ -497,7 +497,7 @@ def fit_free_shape(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     canonical_fit : CandidateFit
         The fit in which all shapes have their canonical values.
     term_index : int
@@ -512,10 +512,13 @@ def fit_free_shape(
     term, values = terms_with_values[term_index]
     if not term.effect.shape:
         return None
-    canonical = [
+    canonical_values = [
         parameter.prior.standard_normal(parameter.canonical) for parameter in term.effect.shape
     ]
-    terms_with_values[term_index] = (replace(term, free_shape=True), np.append(values, canonical))
+    terms_with_values[term_index] = (
+        replace(term, free_shape=True),
+        np.append(values, canonical_values),
+    )
     terms, effect_values = zip(*terms_with_values, strict=True)
     start = replace(canonical_fit.point, effect=np.concatenate(effect_values))
     return try_fit(problem, Candidate(terms), start)

@@ -188,7 +188,7 @@ class LocalUnknowns:
         Parameters
         ----------
         trial : Trial
-            The trial.
+            The trial with its readings, inputs and sample times.
         parameters : (P,) array
             The calibrated parameters.
         u : (L,) array
@@ -198,8 +198,8 @@ class LocalUnknowns:
             self.scale * u, self.ends_by_kind
         )
         rows, width = self.initial_shape
-        initial = np.zeros((rows, 2))
-        initial[:, :width] = initial_entries.reshape(rows, width)
+        initial_states = np.zeros((rows, 2))
+        initial_states[:, :width] = initial_entries.reshape(rows, width)
         offset = np.zeros(len(trial.inputs))
         offset[self.offset_inputs] = input_constants
         health = trial.health[:1] if trial.is_dynamic else trial.health
@@ -211,7 +211,7 @@ class LocalUnknowns:
             )
         # the sum is 0 without an unknown time zero, and its only entry otherwise
         times = (0.0, float(time_zero.sum()))
-        return Conditions(parameters, initial, times, health, tuple(offset.tolist()))
+        return Conditions(parameters, initial_states, times, health, tuple(offset.tolist()))
 
 
 def shared_unknowns(
@@ -275,7 +275,7 @@ def local_unknowns(
     campaign : Campaign
         The campaign of the trial.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     deviation : (C,) array
         The noise deviation of each channel, which scales a zero with a flat prior.
     model : Model
@@ -305,7 +305,9 @@ def local_unknowns(
         initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
         initial_scale = FREE_STATE_DEVIATION * np.pad(sizes, (0, len(sizes) % 2))
     # constants of inputs
-    offset_deviations = np.array([recorded.offset_deviation for recorded in trial.inputs])
+    offset_deviations = np.array(
+        [recorded_input.offset_deviation for recorded_input in trial.inputs]
+    )
     offset_inputs = np.flatnonzero(offset_deviations > 0.0)
     # health, region by region, as its derivatives are taken
     health_deviation = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
@@ -339,7 +341,7 @@ class TrialData:
     Attributes
     ----------
     trial : Trial
-        The trial as measured.
+        The trial with its clock as measured.
     deviation : (C,) array
         The noise standard deviation s0 of each column [unit of the channel]. If the column is
         whitened, it is that of the whitened samples.
@@ -374,13 +376,13 @@ class TrialData:
             The values over s0, after the whitening filter if the noise of the column is coloured;
             0 for samples that are not compared.
         """
-        scaled = columns / self.deviation
+        standardised = columns / self.deviation
         for number, noise in enumerate(self.noise_models):
             if noise.can_whiten(self.trial.whitening_interval):
-                scaled[..., number] = noise.whiten(
-                    scaled[..., number], self.trial.whitening_interval
+                standardised[..., number] = noise.whiten(
+                    standardised[..., number], self.trial.whitening_interval
                 )
-        return np.asarray(scaled * self.weight)
+        return np.asarray(standardised * self.weight)
 
     @classmethod
     def prepare(
@@ -397,7 +399,7 @@ class TrialData:
         campaign : Campaign
             The campaign of the trial.
         trial : Trial
-            The trial.
+            The trial with its readings, inputs and sample times.
         models_by_channel : mapping of str to NoiseModel
             The noise model of each channel.
         model : Model

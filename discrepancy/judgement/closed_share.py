@@ -46,9 +46,12 @@ def residuals_with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> R
     reference : ResidualSet
         The residuals of the same trials by another hypothesis.
     """
-    noise = {fitted.trial.name: fitted.noise_deviation for fitted in reference.trials}
+    noise = {
+        fitted_trial.trial.name: fitted_trial.noise_deviation for fitted_trial in reference.trials
+    }
     trials = [
-        replace(fitted, noise_deviation=noise[fitted.trial.name]) for fitted in residuals.trials
+        replace(fitted_trial, noise_deviation=noise[fitted_trial.trial.name])
+        for fitted_trial in residuals.trials
     ]
     return replace(residuals, trials=tuple(trials))
 
@@ -104,10 +107,10 @@ def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
     block_sums = []
     for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
         noise = without_effect.noise_deviation
-        used = without_effect.used & with_effect.used
-        squares_before = np.where(used, without_effect.residual / noise, 0.0) ** 2
-        squares_after = np.where(used, with_effect.residual / noise, 0.0) ** 2
-        samples = np.arange(len(used))
+        is_used = without_effect.used & with_effect.used
+        squares_before = np.where(is_used, without_effect.residual / noise, 0.0) ** 2
+        squares_after = np.where(is_used, with_effect.residual / noise, 0.0) ** 2
+        samples = np.arange(len(is_used))
         for block in np.array_split(samples, _block_count(without_effect)):
             sums = (float(squares_before[block].sum()), float(squares_after[block].sum()))
             block_sums.append(sums)
@@ -115,14 +118,14 @@ def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
     return SquaredErrors(sums_before, sums_after)
 
 
-def _block_count(fitted: FittedTrial) -> int:
+def _block_count(fitted_trial: FittedTrial) -> int:
     """Return the number of blocks of a trial for the bootstrap.
 
     A static trial is one block, as its rows are different loads and no repetition of each other.
     """
-    if not fitted.trial.is_dynamic:
+    if not fitted_trial.trial.is_dynamic:
         return 1
-    return min(BLOCKS_OF_TRIAL, max(1, len(fitted.used) // SHORTEST_BLOCK))
+    return min(BLOCKS_OF_TRIAL, max(1, len(fitted_trial.used) // SHORTEST_BLOCK))
 
 
 def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
@@ -131,19 +134,19 @@ def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
     Parameters
     ----------
     before, after : ResidualSet
-        All trials of a campaign without and with the hypothesis. The share is that of the held-out
-        trials if there are any, else that of the fitted ones.
+        All trials of a campaign without and with the hypothesis. The share is computed in the
+        held-out trials if there are any, else in the fitted trials.
     """
-    trials = "fitted"
+    trial_role = "fitted"
     if before.held_out is not None and after.held_out is not None:
-        trials = "held-out"
+        trial_role = "held-out"
         before = before.held_out
         after = after.held_out
     errors = squared_errors(before, after)
     if not errors.before.sum() > 0.0:
         return None
     low, high = errors.interval()
-    return ClosedShare(errors.share, low, high, trials, len(before.trials))
+    return ClosedShare(errors.share, low, high, trial_role, len(before.trials))
 
 
 def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
@@ -151,8 +154,8 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
     rms: dict[str, float] = {}
     for name in residuals.channel_names:
         squares = []
-        for fitted, column, used in channel_fits(residuals.trials, name):
-            squares.append(fitted.residual[used, column] ** 2)
+        for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
+            squares.append(fitted_trial.residual[is_used, column] ** 2)
         all_squares = np.concatenate(squares)
         if all_squares.size:
             rms[name] = float(np.sqrt(all_squares.mean()))
@@ -162,12 +165,12 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
 # ---------------------------------------------------------------- words
 
 
-def percent_with_interval(closed: ClosedShare) -> str:
+def percent_with_interval(share: ClosedShare) -> str:
     """Return a share in percent with its interval, if it has one, as in "93.1 % (91 to 95)"."""
     interval = ""
-    if isfinite(closed.low) and isfinite(closed.high):
-        interval = f" ({_percent_text(closed.low)} to {_percent_text(closed.high)})"
-    return f"{_percent_text(closed.value)} %{interval}"
+    if isfinite(share.low) and isfinite(share.high):
+        interval = f" ({_percent_text(share.low)} to {_percent_text(share.high)})"
+    return f"{_percent_text(share.value)} %{interval}"
 
 
 def _percent_text(share: float) -> str:
@@ -178,12 +181,12 @@ def _percent_text(share: float) -> str:
     return f"{percent:.3g}"
 
 
-def compared_trials_text(closed: ClosedShare) -> str:
+def compared_trials_text(share: ClosedShare) -> str:
     """Return in words the trials that a share refers to."""
-    role = "not fitted" if closed.trials == "held-out" else "fitted"
-    if closed.trial_count == 1:
+    role = "not fitted" if share.trials == "held-out" else "fitted"
+    if share.trial_count == 1:
         return f"one trial that was {role}"
-    return f"{counted(closed.trial_count, 'trial')} that were {role}"
+    return f"{counted(share.trial_count, 'trial')} that were {role}"
 
 
 def rms_errors_text(
@@ -194,7 +197,7 @@ def rms_errors_text(
     Parameters
     ----------
     channels : mapping of str to Channel
-        The channels by name.
+        The channels of the campaign by name.
     before, after : mapping of str to float
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
@@ -209,16 +212,16 @@ def rms_errors_text(
         change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
         change = f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
         channel_texts.append(f"{name} {change}")
-    remaining = len(names) - CHANNELS_MENTIONED
-    if remaining > 0:
-        channel_texts.append(f"{remaining} more in the report")
+    unmentioned_count = len(names) - CHANNELS_MENTIONED
+    if unmentioned_count > 0:
+        channel_texts.append(f"{unmentioned_count} more in the report")
     return ", ".join(channel_texts)
 
 
 def _recorded_noise_or_fallback(channel: Channel, fallback: float) -> float:
     """Return the recorded noise deviation of a channel, or a fallback without a record; never 0."""
-    recorded = channel.noise.standard_deviation if channel.noise is not None else 0.0
-    return recorded or fallback or 1.0
+    recorded_deviation = channel.noise.standard_deviation if channel.noise is not None else 0.0
+    return recorded_deviation or fallback or 1.0
 
 
 def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) -> str:
@@ -227,17 +230,17 @@ def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) 
     Parameters
     ----------
     channels : mapping of str to Channel
-        The channels by name.
+        The channels of the campaign by name.
     errors : ErrorComparison
         The errors without and with the hypothesis; they must have a share.
     """
-    closed = errors.closed
-    assert closed is not None
+    share = errors.closed
+    assert share is not None
     rms_errors = rms_errors_text(channels, errors.rms_before, errors.rms_after)
-    trials = compared_trials_text(closed)
-    if closed.has_grown:
+    trials = compared_trials_text(share)
+    if share.has_grown:
         return f"it makes the error in {trials} larger (rms of {rms_errors})"
     return (
-        f"it explains {percent_with_interval(closed)} of the mean square error in {trials} "
+        f"it explains {percent_with_interval(share)} of the mean square error in {trials} "
         f"(rms of {rms_errors})"
     )

@@ -112,7 +112,7 @@ def mutual_information(
     problem : Problem
         The campaign and model of the fits.
     proposal : Proposal
-        The new trial.
+        The proposal with the new trial.
     fits : sequence of CandidateFit
         The fit of each of the H hypotheses, the most probable first.
     weights : (H,) array
@@ -339,7 +339,7 @@ class _ChangedTrial(NamedTuple):
     Attributes
     ----------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     value : float
         The new value of a length, place or mass, as the description prints it; 0 if the load, the
         release or the temperature is changed.
@@ -360,9 +360,9 @@ def _changed_trial(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial : Trial
-        The trial to vary.
+        The trial that is varied.
     change : str
         The kind of change: `change` of a [[proposal]] table in `sentences.toml`.
     amount : float

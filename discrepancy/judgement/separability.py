@@ -42,7 +42,7 @@ class Detectability:
     Attributes
     ----------
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     reason : str
         The reason why the campaign cannot test it; empty if it can.
     place : str
@@ -107,7 +107,7 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
     Parameters
     ----------
     campaign : Campaign
-        The campaign as measured.
+        The campaign with its readings as measured.
     model : Model
         The model as it is.
     setting : Setting
@@ -152,10 +152,10 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
     if not any(has_free_initial_state(data.trial) for data in problem.trials):
         return start
     # parameters are fitted, too: with a wrong frequency the initial motion would fade out
-    fitted = fit(problem, Candidate(), start).point
+    fitted_point = fit(problem, Candidate(), start).point
     local_unknowns = []
     for data, fitted_unknowns, prior_unknowns in zip(
-        problem.trials, fitted.local, start.local, strict=True
+        problem.trials, fitted_point.local, start.local, strict=True
     ):
         is_free = has_free_initial_state(data.trial)
         local_unknowns.append(fitted_unknowns if is_free else prior_unknowns)
@@ -180,7 +180,7 @@ def compute_separability(
     setting : Setting
         The scales by which the catalogue states its priors.
     effects : sequence of Effect
-        The catalogue.
+        The effects of the catalogue.
     """
     problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
@@ -257,20 +257,23 @@ def _reference_change(
     Parameters
     ----------
     screen : Screen
-        The fit without effect.
+        The fit without effect, about which changes are linear.
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
     references = _changes_at_prior_median(screen, effect) or options
     if not references:
         return None
-    best = max(references, key=lambda change: change.squared_size)
-    if best.squared_size < DETECTION_DISTANCE:  # its median place may be where nothing is measured
+    largest_change = max(references, key=lambda change: change.squared_size)
+    # the median of a place along the span may be where nothing is measured
+    if largest_change.squared_size < DETECTION_DISTANCE:
         at_reference = [change for change in options if _has_reference_magnitude(change)]
-        best = max([best, *at_reference], key=lambda change: change.squared_size)
-    return best
+        largest_change = max(
+            [largest_change, *at_reference], key=lambda change: change.squared_size
+        )
+    return largest_change
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
@@ -292,7 +295,7 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
 
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
-    """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
+    """Return whether a change has magnitudes as in `_changes_at_prior_median`."""
     for parameter, scaled_value in zip(change.term.parameters, change.effect_values, strict=True):
         if parameter.magnitude and abs(scaled_value) not in (0.0, 1.0):
             return False
@@ -308,9 +311,9 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     Parameters
     ----------
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     change : ScreenedChange
-        Its reference change.
+        The change of the readings by the effect at its reference magnitude.
     distance : float
         The squared distance of that change from the model [sigma^2].
     """
@@ -350,20 +353,22 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     for i, effect in enumerate(effects):
         reference = effect.reference
         small_reference = small_changes[i][0]
-        for j, other in enumerate(effects):
+        for j, other_effect in enumerate(effects):
             if i == j:
                 continue
             small_changes_of_other = [small.change for small in small_changes[j]]
             first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
-            least_distance = min(_squared_distance(screen, reference, other.options), first_order)
+            least_distance = min(
+                _squared_distance(screen, reference, other_effect.options), first_order
+            )
             distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
     return distance
 
 
 def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]:
-    """Return the changes of an effect, each with a magnitude at which it is linear."""
+    """Return the changes of an effect, made so small that they are linear in its magnitude."""
     small_changes = []
     for option in effect.options:
         change, factor = screen.shrink_change(option)
@@ -385,7 +390,7 @@ def _squared_distance(
     screen : Screen
         The fit whose inner product measures distances.
     target : ScreenedChange
-        The change.
+        The change whose distance is computed.
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
@@ -399,18 +404,18 @@ def _squared_distance(
             return 0.0
         return abs(float(target.vector * sign @ option.vector)) / sqrt(option.squared_size)
 
-    nearest = max(options, key=cosine)
-    if nearest.squared_size <= 0.0:
+    nearest_change = max(options, key=cosine)
+    if nearest_change.squared_size <= 0.0:
         return target.squared_size
     # spanning changes: the nearest option, and its differences by the parameters, over ten times
     # the step of derivatives
-    changes = [nearest.vector]
-    for index in range(len(nearest.effect_values)):
-        stepped = nearest.effect_values.copy()
+    changes = [nearest_change.vector]
+    for index in range(len(nearest_change.effect_values)):
+        stepped = nearest_change.effect_values.copy()
         stepped[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change_by_effect(nearest.term, stepped)
-            changes.append(change.vector - nearest.vector)
+            change = screen.change_by_effect(nearest_change.term, stepped)
+            changes.append(change.vector - nearest_change.vector)
     # least squares by normal equations, scaled to unit length; a small multiple of the identity is
     # added because changes by several parameters may be nearly parallel
     spanning_changes = np.stack(changes)

@@ -125,16 +125,16 @@ class SimulationComparison(Comparison[CandidateFit]):
         It is that under the wider noise; None if the candidate cannot be fitted.
         """
         no_effect = self.search.no_effect
-        fitted = self.search.exact_fits.get(candidate.key)
-        if fitted is None:
+        exact_fit = self.search.exact_fits.get(candidate.key)
+        if exact_fit is None:
             start = Point(no_effect.point.shared, no_effect.point.local, effect)
-            fitted = try_fit(self.problem, candidate, start)
-        return None if fitted is None else self._fit_under_wide_noise(fitted)
+            exact_fit = try_fit(self.problem, candidate, start)
+        return None if exact_fit is None else self._fit_under_wide_noise(exact_fit)
 
-    def _fit_under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
+    def _fit_under_wide_noise(self, exact_fit: CandidateFit) -> CandidateFit | None:
         """Return the fit of a hypothesis under the wider noise; None if it cannot be fitted."""
         wide_problem = self.search.wide_problem or self.problem
-        return refit_under_wide_noise(self.problem, wide_problem, fitted)
+        return refit_under_wide_noise(self.problem, wide_problem, exact_fit)
 
     def add_free_shape_families(self) -> None:
         """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
@@ -142,40 +142,42 @@ class SimulationComparison(Comparison[CandidateFit]):
         The best law and those that are easily mistaken for it are fitted with a free shape. A fit
         is added if its evidence is above that of the best law by more than `LEAST_SHAPE_GAIN`.
         """
-        best = self.search.best()
-        if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
+        best_fit = self.search.best()
+        if len(best_fit.candidate.terms) != 1 or not self.acts_on_structure(
+            best_fit.candidate.terms[0]
+        ):
             return
         compared = dict(self.search.wide_fits)
-        for single in self._single_laws_like(best):
-            free_shape_fit = fit_free_shape(self.problem, single, 0)
+        for single_fit in self._single_laws_like(best_fit):
+            free_shape_fit = fit_free_shape(self.problem, single_fit, 0)
             wide_free_shape_fit = (
                 None if free_shape_fit is None else self._fit_under_wide_noise(free_shape_fit)
             )
             if wide_free_shape_fit is None:
                 continue
-            self._free_shape_fits[single.candidate.key] = wide_free_shape_fit
-            if wide_free_shape_fit.log_evidence > best.log_evidence + LEAST_SHAPE_GAIN:
+            self._free_shape_fits[single_fit.candidate.key] = wide_free_shape_fit
+            if wide_free_shape_fit.log_evidence > best_fit.log_evidence + LEAST_SHAPE_GAIN:
                 compared[wide_free_shape_fit.candidate.key] = wide_free_shape_fit
         self.search.wide_fits = compared
 
-    def _single_laws_like(self, best: CandidateFit) -> list[CandidateFit]:
+    def _single_laws_like(self, best_fit: CandidateFit) -> list[CandidateFit]:
         """Return the best single law of each family and place that is easily mistaken for the best.
 
         The best law itself is one of them, if it has a shape parameter.
         """
-        (best_term,) = best.candidate.terms
+        (best_term,) = best_fit.candidate.terms
         singles: dict[tuple[str, str], CandidateFit] = {}
         fits = (*self.search.rough_fits.values(), *self.search.exact_fits.values())
-        for fitted in fits:
-            if len(fitted.candidate.terms) != 1:
+        for other_fit in fits:
+            if len(other_fit.candidate.terms) != 1:
                 continue
-            (term,) = fitted.candidate.terms
+            (term,) = other_fit.candidate.terms
             has_shape_to_free = bool(term.effect.shape) and not term.free_shape
             if not has_shape_to_free or not self.acts_on_structure(term):
                 continue
             if term == best_term or are_related(term.effect, best_term.effect):
                 key = (term.effect.family, term.place)
-                singles[key] = max(singles.get(key, fitted), fitted, key=self.search.score)
+                singles[key] = max(singles.get(key, other_fit), other_fit, key=self.search.score)
         return list(singles.values())
 
     def fit_with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
@@ -227,7 +229,7 @@ class SimulationComparison(Comparison[CandidateFit]):
 
 def _trials_in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTrial]:
     """Return the trials that were held out, or those that were not."""
-    return [fitted for fitted in trials if fitted.trial.held_out is held_out]
+    return [fitted_trial for fitted_trial in trials if fitted_trial.trial.held_out is held_out]
 
 
 def _rms_beyond_noise(sums: FloatArray, noise_sums: FloatArray) -> float:

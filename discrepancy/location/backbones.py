@@ -96,10 +96,10 @@ def backbones(
     is_ringing = np.ones(start.size, dtype=bool)
     poles = (1j - 0.02) * start  # first guess: a damping ratio of 2 %
     points: list[list[BackbonePoint]] = [[] for _ in start]
-    for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
-        samples = slice(first, first + width)
+    for first_sample in range(0, time.size - width + 1, max(1, round(0.5 * width))):
+        samples = slice(first_sample, first_sample + width)
         window = DampedCosines(time[samples], signal[samples], averaging_width)
-        window_time = time[samples] - time[first]
+        window_time = time[samples] - time[first_sample]
         while is_ringing.any():
             solution = window.fit(poles[is_ringing])
             modes = np.flatnonzero(is_ringing).tolist()
@@ -115,7 +115,7 @@ def backbones(
         if not is_ringing.any():
             break
         for mode, point in zip(modes, points_of_window, strict=True):
-            points[mode].append(point._replace(time=float(time[first]) + point.time))
+            points[mode].append(point._replace(time=float(time[first_sample]) + point.time))
         # start values for the next window: these poles, with a damping ratio of at least 1e-4
         fitted_poles = solution.pole
         largest_real_part = -1e-4 * fitted_poles.imag
@@ -170,7 +170,7 @@ def _points_of_window(
     time : (N,) ndarray
         Times in the window [s].
     solution : DampedCosineFit
-        Fit of the window.
+        The damped cosine that was fitted in the window.
     noise_deviation : float or None
         Standard deviation of the noise; that of the window's residuals if None.
     """

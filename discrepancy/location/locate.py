@@ -107,24 +107,27 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     FitError
         If no trial was fitted.
     """
-    fitted = residuals.fitted
-    if fitted is None:
+    fitted_residuals = residuals.fitted
+    if fitted_residuals is None:
         raise FitError(
             "Nothing can be located: every trial is held out, and at least one fitted is needed."
         )
-    fitted = without_coloured_records(fitted)
-    white = fitted.whitened_residuals(np.random.default_rng(seed))
-    coloured = coloured_noise_remarks(fitted)
-    tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
+    fitted_residuals = without_coloured_records(fitted_residuals)
+    white_residuals = fitted_residuals.whitened_residuals(np.random.default_rng(seed))
+    coloured = coloured_noise_remarks(fitted_residuals)
+    tests = (
+        variance_test(fitted_residuals),
+        *serial_tests(fitted_residuals, white_residuals, tuple(coloured)),
+    )
     rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(
         replace(test, rejected=is_rejected)
         for test, is_rejected in zip(tests, rejected, strict=True)
     )
-    findings = _disagreements(fitted, white) if any(rejected) else []
-    cells = residual_map(fitted, white, MAP_RATE)
-    remarks = [*coloured.values(), *_noise_remarks(fitted)]
-    has_samples = any(trial.used.any() for trial in fitted.trials)
+    findings = _disagreements(fitted_residuals, white_residuals) if any(rejected) else []
+    cells = residual_map(fitted_residuals, white_residuals, MAP_RATE)
+    remarks = [*coloured.values(), *_noise_remarks(fitted_residuals)]
+    has_samples = any(trial.used.any() for trial in fitted_residuals.trials)
     if has_samples and all(cell.axis == "frequency" for cell in cells):
         remarks.append(
             "The model is so far off that beside the noise no cell of the map can be judged."
@@ -138,14 +141,16 @@ def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[
     Parameters
     ----------
     residuals : ResidualSet
-        The fitted trials.
+        The residuals of the fitted trials.
     white : sequence of (N, C) ndarray
         White residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
     for kind in group_by_kind(residuals, white):
         # the share of a finding is a fraction of the excess in its own kind of trial
-        excess_of_kind = sum(max(excess_over_noise([fitted]), 0.0) for fitted in kind.trials)
+        excess_of_kind = sum(
+            max(excess_over_noise([fitted_trial]), 0.0) for fitted_trial in kind.trials
+        )
         patterns = singular_patterns(residuals, kind)
         dependence = _main_dependence(kind, patterns)
         findings_of_kind = patterns if dependence is None else [dependence, *patterns]
@@ -158,12 +163,12 @@ def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     """Return the remarks on missing noise records, and on residuals smaller than the noise."""
     remarks = []
-    unknown = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
-    if unknown:
+    unrecorded_channels = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
+    if unrecorded_channels:
         remarks.append(
-            f"No noise record for {', '.join(unknown)}: nothing absolute can be said about the "
-            "size of these residuals; give pre-trigger samples, repeats or a standard deviation "
-            "with its degrees of freedom."
+            f"No noise record for {', '.join(unrecorded_channels)}: nothing absolute can be said "
+            "about the size of these residuals; give pre-trigger samples, repeats or a standard "
+            "deviation with its degrees of freedom."
         )
     for names in noise_groups(residuals).values():
         square, freedom = mean_square_ratio(residuals, names)
@@ -194,11 +199,11 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
         The remark, or nothing if there is no outlier.
     """
     counts: dict[str, int] = {}
-    for fitted in residuals.trials:
-        if not fitted.trial.is_dynamic:
+    for fitted_trial in residuals.trials:
+        if not fitted_trial.trial.is_dynamic:
             continue
-        for column, name in enumerate(fitted.trial.channels):
-            count = _count_isolated_outliers(np.abs(fitted.standardised[:, column]))
+        for column, name in enumerate(fitted_trial.trial.channels):
+            count = _count_isolated_outliers(np.abs(fitted_trial.standardised[:, column]))
             counts[name] = counts.get(name, 0) + count
     phrases = [f"{name} ({count})" for name, count in counts.items() if count]
     if not phrases:
@@ -240,7 +245,7 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
     Parameters
     ----------
     kind : TrialsOfKind
-        The trials.
+        The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
         Their patterns over the channels.
     """
@@ -296,7 +301,7 @@ def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -
     Parameters
     ----------
     kind : TrialsOfKind
-        The trials.
+        The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
         Their patterns over the channels.
     """

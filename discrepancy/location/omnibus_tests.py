@@ -125,23 +125,25 @@ def _variance_tests_of_records(
     Records whose residuals have fewer than `LEAST_FREEDOM` degrees of freedom are left out.
     """
     noise_freedom = residuals.degrees_of_freedom(channels[0])
-    for fitted in residuals.trials:
-        single_trial = replace(residuals, trials=(fitted,))
+    for fitted_trial in residuals.trials:
+        single_trial = replace(residuals, trials=(fitted_trial,))
         for name in channels:
             square, freedom = mean_square_ratio(single_trial, (name,))
             if freedom >= LEAST_FREEDOM:
                 p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
-                yield _RecordVariance(f"{fitted.trial.name}, {name}", p_value)
+                yield _RecordVariance(f"{fitted_trial.trial.name}, {name}", p_value)
 
 
 def _split_by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
     """Return the set split by the kind of its trials; nothing if there is only one kind."""
-    kinds = list(dict.fromkeys(fitted.trial.kind for fitted in residuals.trials))
+    kinds = list(dict.fromkeys(fitted_trial.trial.kind for fitted_trial in residuals.trials))
     if len(kinds) < 2:
         return ()
     subsets = []
     for kind in kinds:
-        trials = tuple(fitted for fitted in residuals.trials if fitted.trial.kind is kind)
+        trials = tuple(
+            fitted_trial for fitted_trial in residuals.trials if fitted_trial.trial.kind is kind
+        )
         subsets.append(replace(residuals, trials=trials))
     return tuple(subsets)
 
@@ -157,7 +159,7 @@ def serial_tests(
     Parameters
     ----------
     residuals : ResidualSet
-        The set.
+        The residuals of all trials, with the channels.
     white : sequence of (N, C) ndarray
         White residuals of each trial, from its method `whitened_residuals`.
     coloured : sequence of str

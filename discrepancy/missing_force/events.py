@@ -88,13 +88,13 @@ class EventSearch(EventTrials):
         ]
 
     def fit_forces(
-        self, initial: ForcePair, paths: Sequence[BoolArray], evaluations: int
+        self, initial_forces: ForcePair, paths: Sequence[BoolArray], evaluations: int
     ) -> tuple[ForcePair, float]:
         """Return the most probable forces for given events, by a simplex search.
 
         Parameters
         ----------
-        initial : (Process, Process)
+        initial_forces : (Process, Process)
             The forces to begin with: that of events, and that throughout.
         paths : sequence of (N,) array of bool
             The events: whether the force is on at each sample, for each trial.
@@ -111,7 +111,7 @@ class EventSearch(EventTrials):
         prior_medians = np.tile((self.process.standard_deviation, self.process.correlation_time), 2)
         initial_values = [
             value
-            for force in initial
+            for force in initial_forces
             for value in (force.standard_deviation, force.correlation_time)
         ]
         initial_logarithms = np.log(np.array(initial_values) / prior_medians)
@@ -261,18 +261,20 @@ def find_events(
     steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
     event_force = Process(event_deviation, process.correlation_time, may_jump=True)
     steady_force = replace(process, standard_deviation=steady_deviation)
-    best = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
+    best_events = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
     for _ in range(MOST_ROUNDS):
-        next_events = _search_round(search, best.forces, best.paths, LATER_EVALUATIONS)
-        if next_events.score < best.score + LEAST_GAIN:
+        next_events = _search_round(
+            search, best_events.forces, best_events.paths, LATER_EVALUATIONS
+        )
+        if next_events.score < best_events.score + LEAST_GAIN:
             break
-        best = next_events
+        best_events = next_events
     if stride > 1:
-        best = _refine_to_all_samples(best, stride)
+        best_events = _refine_to_all_samples(best_events, stride)
         steady = _refine_to_all_samples(steady, stride)
-    has_changes = any(len(change_samples(on)) for on in best.paths)
-    if has_changes and best.score > max(least_score, steady.score):
-        return best
+    has_changes = any(len(change_samples(on)) for on in best_events.paths)
+    if has_changes and best_events.score > max(least_score, steady.score):
+        return best_events
     return steady
 
 
@@ -343,7 +345,7 @@ def _search_round(
     Parameters
     ----------
     search : EventSearch
-        The search.
+        The search for events, with its trials.
     forces : (Process, Process)
         The force of events, and the force throughout.
     paths : sequence of (N,) array of bool

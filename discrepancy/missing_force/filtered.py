@@ -116,7 +116,7 @@ class ForceFilter:
     Attributes
     ----------
     trial : PortedTrial
-        The trial.
+        The trial as a linear system with ports.
     processes : sequence of (int, Process)
         The missing forces, each with the number of its port. Several may act at one port.
     """
@@ -126,7 +126,7 @@ class ForceFilter:
 
     @cached_property
     def state_units(self) -> FloatArray:
-        """The typical size (n,) of each state of the structure, by which the filter divides it.
+        """The typical size (n,) of each state of the structure; the filter divides the state by it.
 
         Let the missing force, which the model lacks, vary at the highest natural frequency omega
         with an amplitude of one standard deviation, and let it cause the acceleration a. The size
@@ -165,7 +165,7 @@ class ForceFilter:
 
     @cached_property
     def white_noise_scale(self) -> FloatArray:
-        """The standard deviation (C,) of each channel's noise divided by that of its white part.
+        """The standard deviation (C,) of each channel's noise over the deviation of its white part.
 
         The filter counts readings in deviations of the white part, while `PortedTrial` counts them
         in deviations of the whole noise: this is the factor between both.
@@ -337,9 +337,9 @@ class ForceFilter:
             noises=record_filter.noises,
             step_of_sample=step_of_sample,
             output_rows=record_filter.output_rows,
-            used=record_filter.used,
+            is_used=record_filter.used,
             columns=record_filter.columns,
-            first=0,
+            first_sample=0,
             covariance=initial_state.covariance,
             mean=initial_state.mean,
             query_samples=next_samples,
@@ -474,14 +474,14 @@ class Regression:
     half_log_determinant: float
 
     def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
-        """Return values and evidence of a model with only some of the unknowns; others are zero.
+        """Solve the linear model for some of its unknowns, with all other unknowns at zero.
 
         Parameters
         ----------
         unknowns : sequence of int
             The numbers of these unknowns.
         precision : (len(unknowns),) array
-            Their prior precisions.
+            The prior precision of each of these unknowns.
         """
         rows = np.array([0, *(1 + k for k in unknowns)])
         products = self.products[np.ix_(rows, rows)]

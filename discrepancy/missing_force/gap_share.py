@@ -31,7 +31,7 @@ class GapShare:
     held_out : bool
         Whether the trials were held out.
     trial_count : int
-        The number of trials.
+        The number of trials that were compared.
     remaining_rms, total_rms : float
         The rms of the missing force with and without the law, at the port of the law or where most
         force is missing [N, N m or the port's flow]; or that of the gap between readings and
@@ -78,9 +78,9 @@ class GapShare:
             times_drawn @ self.noise_squares,
         )
 
-    def is_larger_than(self, other: "GapShare") -> bool:
+    def is_larger_than(self, other_share: "GapShare") -> bool:
         """Return whether this share is significantly larger than another one (level 5 %)."""
-        difference = self.bootstrap_draws() - other.bootstrap_draws()
+        difference = self.bootstrap_draws() - other_share.bootstrap_draws()
         return bool(np.quantile(difference, 0.05) > 0.0)
 
     @property

@@ -120,9 +120,9 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         on_progress : callable
-            The function that takes a line on what is compared, and how much remains.
+            The function to which progress is reported, as a line of text.
         largest_set : int, optional
             The largest number of effects in a set; by default that of `FOLLOWED_COUNTS`.
         """
@@ -130,7 +130,7 @@ class ForceSearch(MissingForces):
         hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.hypothesis_of_all_ports}
         beam = [self.hypothesis_of_all_ports]
         for followed_count in FOLLOWED_COUNTS[:largest_set]:
-            best = self._sort_by_score(hypotheses, effect_count)[0]
+            best_hypothesis = self._sort_by_score(hypotheses, effect_count)[0]
             extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
                 self._fit_promising_effects(
@@ -138,7 +138,9 @@ class ForceSearch(MissingForces):
                 )
             hypotheses |= extended_hypotheses
             ranked = self._sort_by_score(extended_hypotheses, effect_count)
-            if not ranked or self.score(ranked[0], effect_count) <= self.score(best, effect_count):
+            if not ranked or self.score(ranked[0], effect_count) <= self.score(
+                best_hypothesis, effect_count
+            ):
                 break
             beam = ranked[:BEAM_WIDTH]
         return self._sort_by_score(hypotheses, effect_count)
@@ -157,11 +159,11 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         followed_count : int
             The number of effects that are fitted.
         on_progress : callable
-            The function that takes a line on what is compared.
+            The function to which progress is reported, as a line of text.
         """
         extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
         self._fit_promising_effects(base, effects, followed_count, extended_hypotheses, on_progress)
@@ -175,20 +177,20 @@ class ForceSearch(MissingForces):
         extended_hypotheses: dict[CandidateKey, ForceHypothesis],
         on_progress: Callable[[str], None],
     ) -> None:
-        """Fit the most promising effects, each added to a base, and store the hypotheses.
+        """Add each of the most promising effects to a hypothesis, fit the result, and store it.
 
         Parameters
         ----------
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         followed_count : int
             The number of effects that are fitted.
         extended_hypotheses : dict of CandidateKey to ForceHypothesis
             The hypotheses with one more effect, to which results are added.
         on_progress : callable
-            The function that takes a line on what is compared.
+            The function to which progress is reported, as a line of text.
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         on_progress(f"comparing all effects{base_in_words} with the missing force")
@@ -207,8 +209,10 @@ class ForceSearch(MissingForces):
                 if hypothesis is not None:
                     fitted_hypotheses.append(hypothesis)
             if fitted_hypotheses:
-                best = max(fitted_hypotheses, key=lambda hypothesis: hypothesis.log_evidence)
-                extended_hypotheses[candidate.key] = best
+                best_hypothesis = max(
+                    fitted_hypotheses, key=lambda hypothesis: hypothesis.log_evidence
+                )
+                extended_hypotheses[candidate.key] = best_hypothesis
 
     def score(self, hypothesis: ForceHypothesis, effect_count: int) -> float:
         """Return the log of evidence times prior of a hypothesis [nat].
@@ -216,7 +220,7 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         effect_count : int
             The number of effects that are compared.
         """
@@ -248,7 +252,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         tried_effects = self._try_effects(base, effects)
         weighed_columns = self._weigh_columns(base, tried_effects)
@@ -280,7 +284,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added, with the motion along which effects act.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         tried_effects = []
         for term in self._terms_to_add(base, effects):
@@ -300,9 +304,9 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis.
+            The hypothesis to which an effect may be added.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
         for effect in effects:
@@ -346,7 +350,7 @@ class ForceSearch(MissingForces):
             ),
         )
         base_count = len(base.linear_trials.prior_precision)
-        best: dict[int, _WeighedColumn] = {}
+        best_columns: dict[int, _WeighedColumn] = {}
         for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
             normal_equations = with_columns.regression(
                 scale_processes(base.processes, size_factor, time_factor)
@@ -356,11 +360,14 @@ class ForceSearch(MissingForces):
                 unknowns = [*range(base_count), base_count + index]
                 solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
                 factor = float(solution.mean[-1])
-                is_better = index not in best or best[index].log_evidence < solution.log_evidence
+                is_better = (
+                    index not in best_columns
+                    or best_columns[index].log_evidence < solution.log_evidence
+                )
                 has_possible_sign = factor > 0.0 or tried.term.may_be_negative
                 if is_better and np.isfinite(solution.log_evidence) and has_possible_sign:
-                    best[index] = _WeighedColumn(solution.log_evidence, factor)
-        return best
+                    best_columns[index] = _WeighedColumn(solution.log_evidence, factor)
+        return best_columns
 
     def _prior_precisions(
         self, base: ForceHypothesis, columns: Sequence[EffectColumn]
@@ -376,7 +383,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis with the gap.
         columns : sequence of EffectColumn
-            The columns.
+            The columns whose factors are unknown.
         """
         gap_of_readings = _rms([trial.residual for trial in base.linear_trials.trials])
         gap_of_forces = _rms([force for motion in base.motions for force in motion.forces.values()])
@@ -407,7 +414,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis with the motion and the missing forces of the first step.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters to begin with.
 
@@ -476,11 +483,11 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions : sequence of TrialMotion
             The motion of each trial along which the effects act.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters about which the effects are linear.
 
@@ -538,7 +545,7 @@ def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) ->
     Parameters
     ----------
     hypothesis : ForceHypothesis
-        The hypothesis.
+        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
     step : (E,) array
         The step from its effect parameters to the solution.
     """

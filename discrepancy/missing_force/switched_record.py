@@ -126,9 +126,9 @@ class SwitchedRecord:
         event_state = len(trial.system.generator)
         # between two samples there are `substeps` steps, at whose ends nothing is read
         lengths, step_of_sample = trial.intervals
-        used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
-        used[::substeps] = trial.used
-        columns = np.zeros((*used.shape, len(trials.columns[trial_index])))
+        is_used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
+        is_used[::substeps] = trial.used
+        columns = np.zeros((*is_used.shape, len(trials.columns[trial_index])))
         columns[::substeps] = np.moveaxis(
             trials.columns[trial_index] * force_filter.white_noise_scale, 0, -1
         )
@@ -140,7 +140,7 @@ class SwitchedRecord:
         self.length_count = len(lengths)
         transitions, noises = switched_step_matrices(state_space, event_state, lengths / substeps)
         self.record_filter = RecordFilter(
-            transitions, noises, state_space.output_rows, used, columns
+            transitions, noises, state_space.output_rows, is_used, columns
         )
         off, on = initial_covariances(state_space, event_state)
         self._state_with_force_off = self.record_filter.initial_state(off)
@@ -307,7 +307,7 @@ class SwitchedRecord:
         sample of one change depends on the others.
         """
         for _ in range(3):
-            previous = on.copy()
+            on_before = on.copy()
             for change_index, old_sample in enumerate(change_samples(on)):
                 samples, log_evidence = self.evidence_of_change_samples(on, change_index)
                 new_sample = samples[np.argmax(log_evidence)]
@@ -317,7 +317,7 @@ class SwitchedRecord:
                     on[new_sample:old_sample] = on[old_sample]
                 else:
                     on[old_sample:new_sample] = on[old_sample - 1]
-            if np.array_equal(on, previous):
+            if np.array_equal(on, on_before):
                 break
         return on
 
@@ -339,7 +339,7 @@ class SwitchedRecord:
         Returns
         -------
         samples : (B,) array of int
-            The samples, ascending.
+            The samples at which the force may change, in ascending order.
         log_evidence : (B,) array
             The log evidence of all trials with the change at each of them [nat].
         """
@@ -351,9 +351,9 @@ class SwitchedRecord:
         earliest_path[previous_change:next_change] = on[change]
         samples = np.zeros(0, dtype=np.int64)
         log_evidence = np.zeros(0)
-        first, last = previous_change + 1, next_change - 1
+        first_sample, last_sample = previous_change + 1, next_change - 1
         while True:
-            grid = np.linspace(first, last, COMPARED_SAMPLES).round().astype(np.int64)
+            grid = np.linspace(first_sample, last_sample, COMPARED_SAMPLES).round().astype(np.int64)
             new_samples = np.setdiff1d(grid, samples)
             if not len(new_samples):
                 return samples, log_evidence
@@ -366,8 +366,8 @@ class SwitchedRecord:
             samples, log_evidence = samples[order], log_evidence[order]
             # the next grid: one compared sample beyond the probable ones on either side
             probable = np.flatnonzero(log_evidence >= log_evidence.max() - EVIDENCE_RANGE)
-            first = samples[max(probable[0] - 1, 0)]
-            last = samples[min(probable[-1] + 1, len(samples) - 1)]
+            first_sample = samples[max(probable[0] - 1, 0)]
+            last_sample = samples[min(probable[-1] + 1, len(samples) - 1)]
 
 
 def switched_step_matrices(
@@ -423,10 +423,10 @@ def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray
 
 def zero_state(matrix: FloatArray, index: int) -> FloatArray:
     """Return a matrix (n, n) with the row and the column of one state set to zero."""
-    changed = matrix.copy()
-    changed[index] = 0.0
-    changed[:, index] = 0.0
-    return changed
+    result = matrix.copy()
+    result[index] = 0.0
+    result[:, index] = 0.0
+    return result
 
 
 def change_samples(on: BoolArray) -> IntArray:

@@ -387,8 +387,8 @@ class Search(FittedCandidates):
         leading_fit = max(singles, key=self.score)
         if self._is_in_optimum_of_estimate(leading_fit):
             return
-        (leading,) = leading_fit.candidate.terms
-        for hypothesis in canonical_relatives(leading, self.force_hypotheses):
+        (leading_term,) = leading_fit.candidate.terms
+        for hypothesis in canonical_relatives(leading_term, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
             start = force_search.point_with_effects(hypothesis)
@@ -409,7 +409,7 @@ class Search(FittedCandidates):
         Parameters
         ----------
         fit : CandidateFit
-            The simulation.
+            The fit of the hypothesis by simulations.
         """
         if self._has_large_residuals(fit):
             return False
@@ -427,9 +427,11 @@ class Search(FittedCandidates):
             if len(current.candidate.terms) > 1 and self._is_far_from_truth(current):
                 break  # a third effect is added only if two effects nearly explain the data
             current_score = self.score(current)
-            present = {term.effect.identifier for term in current.candidate.terms}
-            others = [effect for effect in self.effects if effect.identifier not in present]
-            rough = self.fit_one_more_effect(current, others)
+            present_identifiers = {term.effect.identifier for term in current.candidate.terms}
+            other_effects = [
+                effect for effect in self.effects if effect.identifier not in present_identifiers
+            ]
+            rough = self.fit_one_more_effect(current, other_effects)
             exact = self.fit_best_exactly(rough, current_score - SEARCH.largest_longer_set_deficit)
             if not exact or self.score(exact[0]) <= current_score:
                 break
@@ -441,18 +443,20 @@ class Search(FittedCandidates):
         Of each set, only the fit at one place is kept after few steps, and these may have chosen a
         wrong place.
         """
-        best = self.best()
-        while len(best.candidate.terms) > 1 and self.is_unexplained():
-            objective_limit = best.objective + SEARCH.largest_rough_deficit
-            for candidate in sets_at_other_places(best.candidate, self.problem.setting):
+        best_fit = self.best()
+        while len(best_fit.candidate.terms) > 1 and self.is_unexplained():
+            objective_limit = best_fit.objective + SEARCH.largest_rough_deficit
+            for candidate in sets_at_other_places(best_fit.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
-                fit = try_fit(self.problem, candidate, best.point, objective_limit=objective_limit)
+                fit = try_fit(
+                    self.problem, candidate, best_fit.point, objective_limit=objective_limit
+                )
                 if fit is not None:
                     self.record_fit(fit, exact=True)
-            if self.best() is best:
+            if self.best() is best_fit:
                 break
-            best = self.best()
+            best_fit = self.best()
 
     def drop_effects(self) -> None:
         """Drop one effect at a time from the best set, as long as the score rises.
@@ -460,20 +464,22 @@ class Search(FittedCandidates):
         An effect may have become superfluous: it was added before the right one was found, or while
         the right one was at a wrong place.
         """
-        best = self.best()
-        while len(best.candidate.terms) > 1:
-            objective_limit = best.objective + SEARCH.largest_rough_deficit
-            numbers = range(len(best.candidate.terms))
+        best_fit = self.best()
+        while len(best_fit.candidate.terms) > 1:
+            objective_limit = best_fit.objective + SEARCH.largest_rough_deficit
+            numbers = range(len(best_fit.candidate.terms))
             for dropped in numbers:
-                remaining = [number for number in numbers if number != dropped]
-                candidate, effect = best.candidate.subset_of_terms(remaining, best.effect)
-                start = replace(best.point, effect=effect)
+                remaining_numbers = [number for number in numbers if number != dropped]
+                candidate, effect = best_fit.candidate.subset_of_terms(
+                    remaining_numbers, best_fit.effect
+                )
+                start = replace(best_fit.point, effect=effect)
                 fit = try_fit(self.problem, candidate, start, objective_limit=objective_limit)
                 if fit is not None:
                     self.record_fit(fit, exact=True)
-            if self.best() is best:
+            if self.best() is best_fit:
                 break
-            best = self.best()
+            best_fit = self.best()
 
     def fit_free_shapes(self) -> None:
         """Fit the best single effects with free shapes, and record those that explain the data.

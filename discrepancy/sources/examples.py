@@ -50,9 +50,9 @@ class ExamplePlan:
     channels : tuple of Channel
         Channels, with the noise of their sensors; with ring-downs their noise records hold samples.
     force : float
-        Largest static force [N].
+        The largest static force [N].
     release : float
-        Largest release displacement [m].
+        The largest displacement before a release [m].
     load_factors : tuple of float
         Load factors of the flights [1].
     duration, interval : float
@@ -145,7 +145,7 @@ def plan_from_scales(
     Parameters
     ----------
     model : Model
-        The model.
+        The model that predicts the readings.
     outputs : tuple of str
         Outputs that are measured, each by a channel of the same name.
     load_place : str or tuple of float
@@ -228,7 +228,7 @@ def example_campaign(
     kind : str
         "static", "ringdown", "flight", "laboratory" or "complete".
     seed : int
-        Entropy of the `SeedSequence`.
+        The entropy of the `SeedSequence` from which all random draws come.
     plan : ExamplePlan, optional
         What is measured; `wing_plan()` by default.
     patch : ModelPatch, optional
@@ -249,8 +249,10 @@ def example_campaign(
         patch = ModelPatch()
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     kinds = _KINDS[kind]
-    measured = {name for trial_kind in kinds for name in plan.names(trial_kind)}
-    channels = {channel.name: channel for channel in plan.channels if channel.name in measured}
+    measured_channels = {name for trial_kind in kinds for name in plan.names(trial_kind)}
+    channels = {
+        channel.name: channel for channel in plan.channels if channel.name in measured_channels
+    }
     gains = {}
     for name, channel in channels.items():
         gains[name] = 1.0 + _finite_or_zero(channel.gain_deviation) * generator.normal()
@@ -274,11 +276,11 @@ def _with_samples_at_rest(
     Parameters
     ----------
     channel : Channel
-        The channel.
+        The channel with its quantity and noise record.
     plan : ExamplePlan
         The plan, for the sampling interval.
     generator : Generator
-        Source of the noise.
+        The source of the random noise.
     """
     if channel.noise is None:
         return channel
@@ -398,9 +400,9 @@ def _simulate_readings(
     campaign : Campaign
         The campaign with its channels.
     trial : Trial
-        The trial without readings.
+        The trial, whose readings are still empty.
     gains : mapping of str to float
-        Gain of each channel.
+        The gain of each channel, by its name.
     generator : Generator
         Source of the errors of release and zeros, and of noise.
     """

@@ -46,11 +46,11 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) ->
     Parameters
     ----------
     rig : str
-        One of `RIGS`.
+        The name of the rig, one of `RIGS`.
     data : Path
         Folder of the published records.
     folder : Path
-        Folder of the campaign.
+        The folder of the campaign.
     **options
         Options of the function in `RIGS`.
 
@@ -92,13 +92,13 @@ def _read_numbers(
     Parameters
     ----------
     file : Path
-        The table.
+        The path of the table.
     columns : sequence of str
         Names of the columns, in order; an increasing "time" first if there is one.
     separator : str or None
         Character between cells; None for blanks.
     skipped : int
-        Lines before the numbers.
+        The number of lines before the first line of numbers.
 
     Raises
     ------

@@ -25,7 +25,7 @@ class PlotWindow(NamedTuple):
     time : (N,) ndarray
         Times since the first sample [s].
     signal : (N,) ndarray
-        Strain signal [V].
+        The signal of the strain gauge [V].
     """
 
     time: FloatArray
@@ -197,7 +197,7 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
     Parameters
     ----------
     windows : sequence of PlotWindow
-        The trials.
+        The windows of the recording that become trials.
 
     Returns
     -------

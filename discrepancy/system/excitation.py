@@ -19,7 +19,7 @@ class Load(NamedTuple):
     direction : (N,) ndarray
         The load on the unknowns for a value of one.
     history : LoadHistory
-        Its values over time.
+        The values of the load over time.
     derivative : int
         How many times the history is differentiated in time.
     """
@@ -76,7 +76,7 @@ class Excitation:
     sample_times : (S,) ndarray
         Times at which the samples show the motion [s].
     loads : sequence of Load
-        The forces and flows.
+        The forces and flows that act on the system.
     prescribed_motions : mapping of str to RecordedHistory
         Prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
     begins : Start
@@ -125,7 +125,7 @@ class Excitation:
         Parameters
         ----------
         time : (T,) array
-            Times [s].
+            The times of the samples [s].
         basis : (N, B) array
             Columns that the loads are multiplied by: shapes, or the identity.
 

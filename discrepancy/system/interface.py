@@ -31,7 +31,7 @@ class Model(ABC):
     Attributes
     ----------
     name : str
-        Name for people.
+        The name of the model in messages and reports.
     parameters : tuple of ParameterPrior
         Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
@@ -45,7 +45,7 @@ class Model(ABC):
     patch : ModelPatch
         Primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
-        Damage regions.
+        The names of the damage regions.
     kinds : frozenset of TrialKind
         Kinds of trials that it can simulate.
     load_places : tuple of str, optional
@@ -117,7 +117,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Inputs and sample times.
+            The trial, of which only the inputs and the sample times are used.
         outputs : tuple of (str, Quantity)
             Outputs that the model has, and the quantity wanted of each.
         patch : ModelPatch
@@ -138,7 +138,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            A dynamic trial.
+            The dynamic trial.
         conditions : Conditions
             Parameters, initial state, clock and health.
         parts : int
@@ -208,17 +208,17 @@ class Model(ABC):
 
     def check_outputs(self, outputs: Outputs) -> None:
         """Refuse outputs that do not exist, or that a channel of its quantity cannot measure."""
-        for output, measured in outputs:
+        for output, measured_kind in outputs:
             quantity = self.output_quantity(output)
             if quantity is None:
                 raise ModelError(
                     f"{capital(self.quoted_name)} has no output {output!r}; it has "
                     f"{', '.join(self.outputs_with_quantities)}."
                 )
-            if not measured.can_measure(quantity):
+            if not measured_kind.can_measure(quantity):
                 raise ModelError(
                     f"The output {output!r} of {self.quoted_name} is a {quantity.value}, but a "
-                    f"channel measures {measured.value}."
+                    f"channel measures {measured_kind.value}."
                 )
 
     def _check_primitives(self, patch: ModelPatch) -> None:
@@ -239,9 +239,9 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Trial that names regions.
+            The trial, which names the regions of its losses.
         health : (N, K) array
-            Losses of these regions.
+            The stiffness losses of these K regions at N samples.
 
         Raises
         ------
@@ -271,7 +271,7 @@ class Model(ABC):
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and standard deviation of each parameter.
 
-        They are those of the campaign; the model's, if the campaign does not state them.
+        The campaign states them; if it does not, they are those of the model.
         """
         campaign_parameters = campaign.parameters
         return [
@@ -313,7 +313,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Inputs and sample times.
+            The trial, of which only the inputs and the sample times are used.
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         patch : ModelPatch
@@ -358,7 +358,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            A dynamic trial.
+            The dynamic trial.
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         parameters : (P,) array

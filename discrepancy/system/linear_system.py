@@ -40,7 +40,7 @@ class Modes(NamedTuple):
     angular_frequency : (M,) ndarray
         Angular frequencies [rad/s], rising; zero for rigid motions and states.
     shapes : (N, M) ndarray
-        Mass-normalised shapes.
+        The mass-normalised shapes of M modes, in N degrees of freedom.
     displacement_count : int
         Number of the coordinates that are displacements.
     """
@@ -212,7 +212,7 @@ class LinearSystem:
         Returns
         -------
         squares : (K,) ndarray
-            Squared angular frequencies [1/s^2].
+            The squared angular frequencies of the K modes [1/s^2].
         shapes : (n, K) ndarray
             Mode shapes with a modal mass of 1.
         """
@@ -327,7 +327,7 @@ class LinearSystem:
 
         Drives accelerate the modes by inertia: with u = modes + shapes of drives times a(t), the
         mass times these shapes and the accelerations goes to the right-hand side. The force on a
-        drive is the one that gives it the prescribed acceleration.
+        drive is the force that gives the drive its prescribed acceleration.
         """
         forces = excitation.loads_at(time, self.shapes_with_drives)
         if excitation.prescribed_motions:

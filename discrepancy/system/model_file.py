@@ -94,9 +94,9 @@ class DescribedModel(Model):
     Parameters
     ----------
     description : ModelDescription
-        Content of the file.
+        The content of the file `modelDescription.xml`.
     quantities : mapping of str to Quantity
-        What each output is.
+        The physical quantity of each output, by its name.
     """
 
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:

@@ -46,7 +46,7 @@ def scales_of_moving_structure(
     largest : LargestMotion
         Largest displacement, speed and load in the trials.
     duration : float
-        Longest dynamic record [s].
+        The duration of the longest dynamic record [s].
     """
     elastic = system.angular_frequency[system.angular_frequency > 0.0]
     moves = largest.displacement > 0.0
@@ -109,20 +109,22 @@ class PortScaleEstimator:
         self.turns = np.zeros(count, bool)
         self.follows_drives = np.ones(count, bool)
 
-    def add_displacements(self, displacements: FloatArray, *, fitted: bool) -> None:
+    def add_displacements(self, displacements: FloatArray, *, is_fitted: bool) -> None:
         """Add displacements of the structure at rest, or those from which it is released.
 
         Parameters
         ----------
         displacements : (L, N) array
             Displacements of all unknowns, one row for each load level [m].
-        fitted : bool
+        is_fitted : bool
             Whether the trial is fitted (dynamic and not held out).
         """
         largest = np.max(np.abs(displacements @ self.rows.T), axis=0)
-        self._add_largest(largest, 0.0 * largest, fitted=fitted)  # at rest all speeds are zero
+        self._add_largest(
+            largest, 0.0 * largest, is_fitted=is_fitted
+        )  # at rest all speeds are zero
 
-    def add_motion(self, motion: Motion, measured_force: float, *, fitted: bool) -> FloatArray:
+    def add_motion(self, motion: Motion, measured_force: float, *, is_fitted: bool) -> FloatArray:
         """Add a motion of the structure, and return the loads in it.
 
         Parameters
@@ -131,7 +133,7 @@ class PortScaleEstimator:
             Motion in a dynamic trial of T samples.
         measured_force : float
             Largest force that a channel measured in it [N].
-        fitted : bool
+        is_fitted : bool
             Whether the trial is fitted.
 
         Returns
@@ -142,7 +144,7 @@ class PortScaleEstimator:
         position, speed = motion.displacements_and_speeds_at(self.rows)
         largest_position = np.max(np.abs(position), axis=0, initial=0.0)
         largest_speed = np.max(np.abs(speed), axis=0, initial=0.0)
-        self._add_largest(largest_position, largest_speed, fitted=fitted)
+        self._add_largest(largest_position, largest_speed, is_fitted=is_fitted)
         least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speed), axis=0)
         self.turns |= (np.min(speed, axis=0) < -least_speed) & (np.max(speed, axis=0) > least_speed)
         # inertia, damping and loads (N unknowns)
@@ -175,11 +177,13 @@ class PortScaleEstimator:
         self.follows_drives &= mobility == 0.0
         return loads
 
-    def _add_largest(self, displacement: FloatArray, speed: FloatArray, *, fitted: bool) -> None:
+    def _add_largest(
+        self, displacements: FloatArray, speeds: FloatArray, *, is_fitted: bool
+    ) -> None:
         """Add the largest displacements and speeds (P,) of a trial."""
-        self.fitted_displacement = np.maximum(self.fitted_displacement, displacement * fitted)
-        self.largest_displacement = np.maximum(self.largest_displacement, displacement)
-        self.largest_speed = np.maximum(self.largest_speed, speed)
+        self.fitted_displacement = np.maximum(self.fitted_displacement, displacements * is_fitted)
+        self.largest_displacement = np.maximum(self.largest_displacement, displacements)
+        self.largest_speed = np.maximum(self.largest_speed, speeds)
 
     def port_scales(
         self, static_stiffness: Sequence[float], *, only_driven: bool
@@ -221,7 +225,7 @@ class PortScaleEstimator:
         Parameters
         ----------
         port_index : int
-            Number of the port.
+            The number of the port.
         static_stiffness : float
             Its static stiffness [N/m or N m/rad]; zero if it has to be computed from the modes.
         force : float

@@ -89,7 +89,7 @@ class PortedSystem:
     Attributes
     ----------
     generator : (n, n) ndarray
-        A [1/s].
+        The matrix A of the state equation [1/s].
     ports : tuple of str
         Names of the P ports.
     actions : (P, n) ndarray
@@ -97,7 +97,7 @@ class PortedSystem:
     positions, speeds : (P, n) ndarray
         Rows of the ports' positions and speeds. A port of a state has the state as its speed.
     outputs : (C, n) ndarray
-        Rows of the outputs.
+        The rows that give the C outputs from the n states.
     through : (P, C) ndarray
         e of each port: a unit force there lowers the outputs by e at once.
     """

@@ -48,7 +48,7 @@ class ControlLoop:
     section : ControllerSection
         The controller in the file.
     proportional, derivative, integral : float
-        Gains.
+        The gains on the error, on its rate and on its integral.
     measured : (4, N) ndarray
         Rows of the measured quantity, in the form of `OutputEquation.rows`.
     direction : (N,) ndarray
@@ -90,14 +90,14 @@ class ControlLoop:
         if section.reference is None or section.reference not in inputs:
             return []
         reference = inputs[section.reference]
-        recorded = reference.recorded
-        if recorded.quantity is not section.quantity:
+        recorded_input = reference.recorded
+        if recorded_input.quantity is not section.quantity:
             raise ModelError(
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
-                f"{trial.name!r} records its reference {recorded.name!r} as "
-                f"{recorded.quantity.value}."
+                f"{trial.name!r} records its reference {recorded_input.name!r} as "
+                f"{recorded_input.quantity.value}."
             )
-        history = RecordedHistory(trial.time, reference.values, recorded.hold)
+        history = RecordedHistory(trial.time, reference.values, recorded_input.hold)
         loads = [Load(self.proportional * self.direction + self.error_integral, history)]
         if self.derivative != 0.0 and section.derivative_of == "error":
             if history.hold is Hold.ZERO_ORDER:
@@ -122,7 +122,7 @@ class Rig:
     matrices : mapping of str to (N, N) ndarray
         Matrices by kind, and their parts by name.
     loops : mapping of str to ControlLoop
-        Controllers by name.
+        The controllers by their names.
     """
 
     factors: Mapping[str, float]
@@ -160,7 +160,7 @@ def build_rig(
     Parameters
     ----------
     description : LumpedDescription
-        The file's content.
+        The content of the model file.
     factors : mapping of str to float
         Factors of the terms by name, from the values of the parameters.
     state : SystemState
@@ -211,7 +211,7 @@ def _apply_patch(
     Parameters
     ----------
     patch : ModelPatch
-        Structural primitives.
+        The change of the structure.
     description : LumpedDescription
         The file's content, for the lever of the root.
     places : sequence of PlaceSection
@@ -268,14 +268,14 @@ def _control_loops(
     for section in description.controller:
         gains = []
         for gain in GAINS:
-            scaled = factors.get(f"{section.name}.{gain}", 1.0) * getattr(section, gain)
-            gains.append(factors.get(section.name, 1.0) * scaled)
+            scaled_gain = factors.get(f"{section.name}.{gain}", 1.0) * getattr(section, gain)
+            gains.append(factors.get(section.name, 1.0) * scaled_gain)
         proportional, derivative, integral = gains
         error_integral = np.zeros(unknown_count)
         if section.integral:
             error_integral[next_integral] = 1.0
             next_integral += 1
-        measured = OutputEquation.from_row(
+        measured_output = OutputEquation.from_row(
             description.pad_to_all_unknowns(section.vector),
             displacement_derivative=section.quantity.order,
             state_count=unknown_count - displacement_count,
@@ -285,7 +285,7 @@ def _control_loops(
             proportional=proportional,
             derivative=derivative,
             integral=integral,
-            measured=measured.rows,
+            measured=measured_output.rows,
             direction=description.pad_to_all_unknowns(section.acts),
             error_integral=error_integral,
         )

@@ -87,9 +87,9 @@ class SystemModel(Model):
         Parameters
         ----------
         place : str or (float, float)
-            Load place.
+            The place at which the load acts.
         state : SystemState
-            State of the system.
+            The state of the system.
         change : ModelPatch
             Load primitives that move the place.
         """
@@ -158,7 +158,7 @@ class SystemModel(Model):
     # ------------------------------------------------------------ trials
 
     def laws_at_ports(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
-        """Return the laws at the ports, those of the model and those of a patch."""
+        """Return all laws that act at the ports: the model's own laws and the laws of a patch."""
         forces = self.forces_at_ports(self.built_in_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 
@@ -170,11 +170,11 @@ class SystemModel(Model):
         Parameters
         ----------
         trial : Trial
-            Any trial.
+            A trial of any kind.
         conditions : Conditions
             Parameters, initial state, clock and health.
         patch : ModelPatch
-            All primitives that act.
+            The change of the model, with all primitives that act.
         """
         temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
@@ -188,7 +188,7 @@ class SystemModel(Model):
     def excitation(self, case: PatchedTrial) -> Excitation:
         """Return the excitation of a trial: its loads and prescribed motions, or its release."""
         trial = case.trial
-        initial = case.conditions.initial
+        initial_state = case.conditions.initial
         excitation = Excitation(
             trial.time, case.conditions.motion_times(trial.time), begins=trial.begins
         )
@@ -200,14 +200,14 @@ class SystemModel(Model):
                 )
             row = self.force_row(trial.load_place, case.state)
             return replace(
-                excitation, release=ReleasePoint(row, require_release(trial)), initial=initial
+                excitation, release=ReleasePoint(row, require_release(trial)), initial=initial_state
             )
         loads, prescribed_motions = self.loads_and_motions(case)
         return replace(
             excitation,
             loads=loads,
             prescribed_motions=prescribed_motions,
-            initial=initial.ravel(),
+            initial=initial_state.ravel(),
         )
 
     def excited_system(self, case: PatchedTrial) -> ExcitedSystem:
@@ -429,7 +429,7 @@ class SystemModel(Model):
         estimator : PortScaleEstimator
             Collects the motions of the ports; changed in place.
         campaign : Campaign
-            The campaign.
+            The campaign: its trials, channels and noise records.
         is_held : bool
             Whether springs hold the structure. Only then static trials and ring-downs are added, by
             their displacements at rest.
@@ -441,7 +441,7 @@ class SystemModel(Model):
             if _is_moved_by_inputs(trial):
                 motion = self._motion_under_inputs(campaign, trial)
                 measured_force = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                loads = estimator.add_motion(motion, measured_force, is_fitted=is_fitted)
                 # from modal coordinates (N, M + P) to the displacements of the structure
                 shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
                 largest = LargestMotion(
@@ -451,7 +451,7 @@ class SystemModel(Model):
                 )
             elif is_held:
                 case = self.patched_trial(trial, Conditions(parameters))
-                estimator.add_displacements(self._static_displacements(case), fitted=is_fitted)
+                estimator.add_displacements(self._static_displacements(case), is_fitted=is_fitted)
         return largest
 
     def _scales_of_held_structure(

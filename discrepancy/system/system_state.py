@@ -28,7 +28,7 @@ class SystemState(NamedTuple):
     drives : tuple of str
         Inputs whose motion is prescribed.
     controlled : bool
-        Whether the controllers act.
+        Whether the controllers of the rig act.
     """
 
     parameters: tuple[float, ...]

@@ -39,7 +39,7 @@ class RecordedHistory:
     Attributes
     ----------
     time, values : (N,) ndarray
-        The samples [s], [SI].
+        The times of the samples [s], and the values at these times [SI].
     hold : Hold, optional
         The course between the samples, linear by default. A load keeps its first value before the
         first sample and its last value after the last one.
@@ -64,10 +64,10 @@ class RecordedHistory:
     @cached_property
     def _spline(self) -> PPoly:
         """The spline through the load, or through the displacement of a prescribed motion."""
-        recorded: PPoly = CubicSpline(self.time, self.values)
+        spline: PPoly = CubicSpline(self.time, self.values)
         if self.motion_order:
-            return recorded.antiderivative(self.motion_order)
-        return recorded
+            return spline.antiderivative(self.motion_order)
+        return spline
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times [s], or a time derivative of them.
@@ -77,7 +77,7 @@ class RecordedHistory:
         Parameters
         ----------
         time : (N,) ndarray
-            Times [s].
+            The times of the samples [s].
         derivative : int
             Order of the time derivative. Without a smooth course it is 0 or 1.
         """

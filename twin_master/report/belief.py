@@ -123,9 +123,9 @@ def draw_step_map(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
-        The run.
+        The run, as read from its folder.
     values : (T, n) array
         The values; those of one step form a column of the map.
     first_number : int
@@ -187,7 +187,7 @@ def _draw_state_map(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
         The run of a state with two factors.
     values : (S,) array

@@ -83,7 +83,7 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     count : int
         The largest number of sensors.
     """
@@ -125,7 +125,7 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     now : int
         The row of the present step in the run's arrays, from 0 to T - 1.
     sensors : sequence of int, optional
@@ -204,15 +204,15 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
-        The run.
+        The run, as read from its folder.
     now : int
         The row of the present step.
     course : Course
         The estimates of the past, of the present step, and the predictions.
     truth : (T,) array or None
-        The true values.
+        The true value in each step; None if it is not known.
     """
     steps = run.first_step + np.arange(len(course.mean))
     _draw_part(axes, steps, course, slice(now + 1), color=style.PAST, label="past")
@@ -352,7 +352,7 @@ def _draw_sensor(sensor: int, axes: Axes, run: Run, now: int) -> str:
 
 
 def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
-    """Draw readings as dots and lost ones as crosses at the bottom.
+    """Draw readings as dots, and lost readings as crosses at the bottom.
 
     Readings after the step in row `now`, which the twin did not have yet, are hollow dots.
     """

@@ -124,7 +124,7 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
 
 
 def _present_row(run: Run, now: int | None) -> int:
-    """Return the row of the step with the number `now`; by default that of `default_now`.
+    """Return the row of the step with the number `now`, or else with `default_now`.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def render_page(
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure
@@ -223,7 +223,7 @@ class _Pictures:
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which the section is added.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure

@@ -64,7 +64,7 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     Parameters
     ----------
     policy : BeliefPolicy
-        The policy.
+        The policy that chooses the control for a belief.
     model : GraphicalModel
         The model of the states.
     """

@@ -141,9 +141,9 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     planform : Planform
-        The wing.
+        The planform of the wing.
     residual : (G,) array
         The residuals of the last observations, in standard deviations; NaN where one was lost.
     """
@@ -237,9 +237,9 @@ class StructurePicture(NamedTuple):
     Attributes
     ----------
     figure : Figure
-        The picture.
+        The figure that is drawn in.
     largest : float
-        The largest displacement [m].
+        The largest displacement of a node [m].
     scale : float
         The factor by which displacements are drawn larger than they are.
     """

@@ -38,11 +38,11 @@ def _add_table(
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which the section is added.
     name : str
         The name of its title and caption in `words.toml`.
     columns : sequence of PageColumn
-        The headings.
+        The columns of the table, with their headings.
     rows : iterable of sequence of str
         The cells. They may come from files of users: line breaks and repeated blanks become one
         blank.
@@ -226,11 +226,11 @@ class _Monitor(NamedTuple):
     Attributes
     ----------
     title : str
-        The name in words.
+        The name of the quantity in words.
     values : (T,) array
         The values in the printed unit; NaN in steps without one.
     unit : str
-        The printed unit.
+        The unit as it is printed.
     """
 
     title: str
