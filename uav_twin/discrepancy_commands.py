@@ -431,20 +431,24 @@ def check(
     from discrepancy.workflow import check_and_prepare
 
     catalogue = load_catalogue(effects or ())
-    chosen = choose_model(model).model
-    data, faults = check_and_prepare(read_campaign(campaign), chosen)
+    chosen_model = choose_model(model).model
+    prepared_campaign, faults = check_and_prepare(read_campaign(campaign), chosen_model)
     separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
-            setting = Setting(data, chosen, chosen.scales(data))
-            separability = compute_separability(data, chosen, setting, catalogue)
+            setting = Setting(
+                prepared_campaign, chosen_model, chosen_model.scales(prepared_campaign)
+            )
+            separability = compute_separability(prepared_campaign, chosen_model, setting, catalogue)
     if json:
-        terminal.print_json(_check_record(data, chosen.name, faults, separability))
+        terminal.print_json(
+            _check_record(prepared_campaign, chosen_model.name, faults, separability)
+        )
     else:
-        _print_check(data, chosen, catalogue, faults, separability)
+        _print_check(prepared_campaign, chosen_model, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
-            "Mend the faults first: conclusions from these data would be wrong."
+            "Correct the faults above first: conclusions from these data would be wrong."
         )
 
 

@@ -298,7 +298,7 @@ def _build_wing(
         calibrated_wing = load_calibration(calibration)
         wing_design = calibrated_wing.wing_design
         tailored = tailoring(calibrated_wing)
-    packed = pack_wing(
+    packed_fmu = pack_wing(
         wing_design,
         target,
         kind=kind,
@@ -312,7 +312,7 @@ def _build_wing(
     )
     if calibration is not None:
         terminal.say(f"Calibrated for {calibrated_wing.asset}.")
-    print_packed_fmu(packed)
+    print_packed_fmu(packed_fmu)
 
 
 def info(

@@ -127,8 +127,8 @@ def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
     else:
         fell_back = f"{_subject(run)} {_changes_of_control(run)}; the first change came"
     delay = fallback.delay
-    time = f"{_one_or_count(delay, run.step_word)} after" if delay else "when"
-    return f"{fell_back} {time} {switch.factor} had reached {switch.level}"
+    time_text = f"{_one_or_count(delay, run.step_word)} after" if delay else "when"
+    return f"{fell_back} {time_text} {switch.factor} had reached {switch.level}"
 
 
 def _control_clause(run: Run) -> str:
@@ -169,17 +169,17 @@ def _belief_sentence(run: Run) -> str:
 
     If no state of the model explains the observations, the sentence says so instead.
     """
-    unexplained = run.get("notice/none_of_these")
-    if unexplained is not None and not is_state_believed(unexplained[-1]):
+    probability_of_none = run.get("notice/none_of_these")
+    if probability_of_none is not None and not is_state_believed(probability_of_none[-1]):
         return (
             f"At the end no state is believed: no state of the model explains the "
-            f"{run.sensors.word}s (probability {unexplained[-1]:.3g})."
+            f"{run.sensors.word}s (probability {probability_of_none[-1]:.3g})."
         )
     estimates = [_state_estimate(run, index) for index in range(len(run.factors))]
     if len(estimates) > _MOST_FACTORS:
-        remaining = len(estimates) - _MOST_FACTORS
+        other_count = len(estimates) - _MOST_FACTORS
         estimates = estimates[:_MOST_FACTORS]
-        estimates.append(f"{counted(remaining, 'other state')} as the figures below show")
+        estimates.append(f"{counted(other_count, 'other state')} as the figures below show")
     sentence = (
         f"At the end the twin puts {listing(estimates)}; "
         "in brackets two standard deviations either side"
@@ -224,9 +224,9 @@ def _state_estimate(run: Run, index: int) -> str:
 
 def _parameter_clause(quantity: LearntQuantity) -> str:
     """Return the clause on the learnt parameter: mean, two standard deviations, and true value."""
-    last = moments_of(quantity.posterior[-1])
-    mean = float(last.mean)
-    two_deviations = 2 * float(last.standard_deviation)
+    last_moments = moments_of(quantity.posterior[-1])
+    mean = float(last_moments.mean)
+    two_deviations = 2 * float(last_moments.standard_deviation)
     values = f"{mean:.3f} ({mean - two_deviations:.3f} to {mean + two_deviations:.3f}"
     if quantity.truth is not None:
         values += f", truth {float(quantity.truth):.4g}"

@@ -300,10 +300,10 @@ class Run:
             return ()
         quantities = []
         ending = f"_prior_{MOMENTS[0]}"  # each learnt quantity has one variable with this ending
-        for variable, stored in self.tree["learnt"].data_vars.items():
+        for variable, stored_array in self.tree["learnt"].data_vars.items():
             if str(variable).endswith(ending):
                 name = str(variable).removesuffix(ending)
-                quantities.append(self._learnt_quantity(name, str(stored.attrs["units"])))
+                quantities.append(self._learnt_quantity(name, str(stored_array.attrs["units"])))
         return tuple(quantities)
 
     def _learnt_quantity(self, name: str, stored_unit: str) -> LearntQuantity:
