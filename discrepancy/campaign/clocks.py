@@ -388,9 +388,9 @@ def _fill_between_samples(
         values = CubicSpline(sample_times, samples)(seconds)
     else:
         values = np.interp(seconds, sample_times, samples)
-    sampled = set(positions)
+    is_sampled = set(positions)
     for index in range(len(seconds)):
-        if index not in sampled:
+        if index not in is_sampled:
             cells[index] = f"{values[index]:.15g}"
 
 

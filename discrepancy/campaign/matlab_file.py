@@ -70,11 +70,11 @@ def read_matlab(path: Path) -> MatlabTable:
     cells = [_cells(column) for column in table.values()]
     row_count = max(map(len, cells))
     # shorter columns end with empty cells
-    padded = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
+    padded_columns = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
     remark = f"rows 1 to {row_count} of {counted(len(table), 'vector')}"
     if passed_over:
         remark += f"; left out: {listing(map(repr, passed_over))}"
-    return MatlabTable(tuple(table), padded, remark)
+    return MatlabTable(tuple(table), padded_columns, remark)
 
 
 def _variables(path: Path) -> Iterator[tuple[str, object]]:

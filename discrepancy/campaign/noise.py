@@ -89,11 +89,11 @@ class NoiseModel:
         if not self.can_whiten(interval):
             return columns
         filter_taps = np.r_[1.0, -self.autoregression]
-        white = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
+        white_residuals = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
         sample_count = columns.shape[-1]
         for sample, weights in enumerate(self._start_up_weights[:sample_count]):
-            white[..., sample] = columns[..., : sample + 1] @ weights
-        return white
+            white_residuals[..., sample] = columns[..., : sample + 1] @ weights
+        return white_residuals
 
     @cached_property
     def _start_up_weights(self) -> tuple[FloatArray, ...]:

@@ -336,12 +336,12 @@ def holm_rejections(p_values: Sequence[float], level: float) -> tuple[bool, ...]
     """
     values = np.asarray(p_values, dtype=float)
     tested = np.flatnonzero(np.isfinite(values))
-    rejected = np.zeros(values.size, dtype=bool)
+    is_rejected = np.zeros(values.size, dtype=bool)
     for rank, index in enumerate(tested[np.argsort(values[tested])]):
         if values[index] > level / (tested.size - rank):
             break
-        rejected[index] = True
-    return tuple(bool(value) for value in rejected)
+        is_rejected[index] = True
+    return tuple(bool(value) for value in is_rejected)
 
 
 def benjamini_yekutieli(p_values: FloatArray, rate: float) -> BoolArray:

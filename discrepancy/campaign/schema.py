@@ -214,8 +214,8 @@ class TrialSection(records.TrialKeys):
 
 def _first_repeated(names: Iterable[str]) -> str | None:
     """Return the alphabetically first name that occurs more than once; None if there is none."""
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    return min(repeated, default=None)
+    repeated_names = [name for name, count in Counter(names).items() if count > 1]
+    return min(repeated_names, default=None)
 
 
 class CampaignSection(Section):

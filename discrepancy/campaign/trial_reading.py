@@ -382,9 +382,9 @@ def _check_range(
     values: FloatArray, table: TextTable, column: str, expected_range: str, *, largest: float
 ) -> None:
     """Refuse values (N,) of a column below zero or above the largest that is allowed."""
-    outside = np.flatnonzero((values < 0.0) | (values > largest))
-    if outside.size:
-        row = int(outside[0])
+    rows_outside = np.flatnonzero((values < 0.0) | (values > largest))
+    if rows_outside.size:
+        row = int(rows_outside[0])
         raise CampaignFileError(
             f"{table.name}, line {table.lines[row]}: {column} is {expected_range}, and "
             f"{values[row]:g} came."

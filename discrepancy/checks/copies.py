@@ -147,7 +147,7 @@ def _describe_copy(
     if np.array_equal(x, y):
         return f"digit for digit{delay}"
     # scale by least squares
-    centred = x - x.mean()
-    scale = float(centred @ (y - y.mean()) / (centred @ centred))
+    centred_original = x - x.mean()
+    scale = float(centred_original @ (y - y.mean()) / (centred_original @ centred_original))
     unexplained_deviation = float(np.std(y - scale * x))
     return f"times {scale:.6g}{delay}" if unexplained_deviation < COPIED_SHARE * noise else ""

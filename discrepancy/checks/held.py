@@ -69,8 +69,8 @@ def runs_of_true(flags: BoolArray) -> IntArray:
     (R, 2) ndarray of int
         Index of the first entry of each run, and the index after its last entry.
     """
-    padded = np.concatenate(([False], flags, [False])).astype(np.int8)
-    edges = np.flatnonzero(np.diff(padded))
+    padded_flags = np.concatenate(([False], flags, [False])).astype(np.int8)
+    edges = np.flatnonzero(np.diff(padded_flags))
     return np.stack((edges[::2], edges[1::2]), axis=1)
 
 
@@ -163,11 +163,11 @@ def stuck_spans(
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
     long_runs = bounds_of_runs[lengths >= LEAST_RUN_LENGTH].tolist()
-    distinct = np.unique(values)
-    if len(distinct) < 3 or not long_runs:
+    distinct_values = np.unique(values)
+    if len(distinct_values) < 3 or not long_runs:
         return []
     # runs at an extreme value are clipped, which is another fault
-    extremes = (distinct[0], distinct[-1])
+    extremes = (distinct_values[0], distinct_values[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
     quantum = _quantum_in_time(values)
     if min(noise, estimate_roughness(values)) > _NOISE_IN_QUANTA * quantum:
@@ -270,10 +270,10 @@ def _other_movement(
     ]
     usual_range = np.median(ranges, axis=0)
     range_in_run = np.ptp(other_records[start:stop], axis=0)
-    moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
-    another_moves = bool(np.any(moves))
-    rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
-    return _OtherMovement(another_moves, not another_moves and bool(np.any(rests)))
+    record_moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
+    another_moves = bool(np.any(record_moves))
+    record_rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
+    return _OtherMovement(another_moves, not another_moves and bool(np.any(record_rests)))
 
 
 def _quantum_in_time(values: FloatArray) -> float:

@@ -159,19 +159,19 @@ def sample_outliers(
 
     # readings within the noise are no outliers
     noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
-    suspects, cleaned = _find_suspects(record, polynomial, rounding, noise_limit)
+    is_suspect, cleaned_record = _find_suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours
-    residual = polynomial.residual(cleaned)
+    residual = polynomial.residual(cleaned_record)
     weight_of_sample = polynomial.weight_of_sample(count)
-    deviation = np.abs((record - cleaned) * weight_of_sample + residual)
+    deviation = np.abs((record - cleaned_record) * weight_of_sample + residual)
     is_beyond_noise = deviation > noise_limit
     is_beyond_scatter = deviation > OUTLIER_DEVIATIONS * _comparison_deviation(residual, rounding)
-    outliers = is_used & suspects & is_beyond_noise & is_beyond_scatter
+    outliers = is_used & is_suspect & is_beyond_noise & is_beyond_scatter
     # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
     is_event = np.convolve(is_crowded, np.ones(5), mode="same") > 0
-    isolated: BoolArray = outliers & ~is_event
-    return isolated
+    isolated_outliers: BoolArray = outliers & ~is_event
+    return isolated_outliers
 
 
 def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
@@ -205,18 +205,18 @@ def _find_suspects(
 
     Returns
     -------
-    suspects : (N,) ndarray of bool
+    is_suspect : (N,) ndarray of bool
         Samples with a significant residual that are not at an event such as a kink.
-    cleaned : (N,) ndarray
+    cleaned_record : (N,) ndarray
         The record with the predictions in place of these samples.
     """
     count = len(record)
-    suspects = np.zeros(count, dtype=bool)
-    events = np.zeros(count, dtype=bool)
-    cleaned = record.copy()
+    is_suspect = np.zeros(count, dtype=bool)
+    is_at_event = np.zeros(count, dtype=bool)
+    cleaned_record = record.copy()
     edge = _EDGE_SAMPLES if polynomial.degree == LOW_DEGREE else polynomial.width
     for _ in range(_MOST_PASSES):
-        residual = polynomial.residual(cleaned)
+        residual = polynomial.residual(cleaned_record)
         ratio = np.abs(residual) / _comparison_deviation(residual, rounding)
         ratio[:edge] = 0.0
         ratio[-edge:] = 0.0
@@ -224,17 +224,17 @@ def _find_suspects(
         is_worst = ratio == maximum_filter1d(ratio, neighbourhood, mode="constant")
         is_beyond_noise = np.abs(residual) > noise_limit
         is_significant = (ratio > OUTLIER_DEVIATIONS) & is_beyond_noise & is_worst
-        new_indices = np.flatnonzero(is_significant & ~suspects & ~events)
+        new_indices = np.flatnonzero(is_significant & ~is_suspect & ~is_at_event)
         if not new_indices.size:
             break
         at_event = np.array([_is_event(residual, int(index), polynomial) for index in new_indices])
-        events[new_indices[at_event]] = True
+        is_at_event[new_indices[at_event]] = True
         new_suspects = new_indices[~at_event]
-        suspects[new_suspects] = True
+        is_suspect[new_suspects] = True
         # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
-        cleaned[new_suspects] -= correction[new_suspects]
-    return suspects, cleaned
+        cleaned_record[new_suspects] -= correction[new_suspects]
+    return is_suspect, cleaned_record
 
 
 def wrong_end_readings(
@@ -262,18 +262,20 @@ def wrong_end_readings(
     (N, C) ndarray of bool
         True for a wrong reading.
     """
-    wrong = np.zeros(residual.shape, dtype=bool)
+    is_wrong = np.zeros(residual.shape, dtype=bool)
     noise = np.broadcast_to(noise, residual.shape[1:])
     for column in range(residual.shape[1]):
         rows = np.flatnonzero(is_used[:, column])
         if len(rows) >= 8 * _EDGE_SAMPLES:
-            is_wrong = _wrong_ends_of_channel(residual[rows, column], float(noise[column]))
-            wrong[rows, column] = is_wrong
+            is_wrong_in_channel = _wrong_ends_of_channel(
+                residual[rows, column], float(noise[column])
+            )
+            is_wrong[rows, column] = is_wrong_in_channel
     for end in _ENDS:
-        channels_at_end = np.count_nonzero(wrong[end].any(axis=0))
+        channels_at_end = np.count_nonzero(is_wrong[end].any(axis=0))
         if channels_at_end > 1:
-            wrong[end] = False
-    return wrong
+            is_wrong[end] = False
+    return is_wrong
 
 
 def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
@@ -290,20 +292,22 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     noise : float
         Standard deviation of the noise; 0 if it is not known.
     """
-    padded = np.pad(residual, 2, constant_values=np.nan)
-    neighbours = sliding_window_view(padded, 5)[:, _NEIGHBOURS]
+    padded_residual = np.pad(residual, 2, constant_values=np.nan)
+    neighbours = sliding_window_view(padded_residual, 5)[:, _NEIGHBOURS]
     deviation = residual - np.nanmedian(neighbours, axis=1)
     exceeds_neighbours = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
     # the scatter near each end, where the motion may be fastest
     deviations_near_ends = (deviation[: 4 * _HALF_WINDOW], deviation[-4 * _HALF_WINDOW :])
-    wrong = np.zeros(len(residual), dtype=bool)
+    is_wrong = np.zeros(len(residual), dtype=bool)
     for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
         scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
         scale = max(scatter, noise, 1e-300)
-        is_wrong = exceeds_neighbours[end] & (np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale)
-        if is_wrong.sum() == 1:
-            wrong[end] = is_wrong
-    return wrong
+        is_wrong_at_end = exceeds_neighbours[end] & (
+            np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale
+        )
+        if is_wrong_at_end.sum() == 1:
+            is_wrong[end] = is_wrong_at_end
+    return is_wrong
 
 
 def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> bool:
@@ -329,9 +333,9 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
         :, first_of_pattern : first_of_pattern + high - low
     ]
     # sum of squares that a pattern p explains by least squares: (p . r)^2 / p . p
-    explained = (patterns @ residual[low:high]) ** 2 / np.sum(patterns**2, axis=1)
+    explained_squares = (patterns @ residual[low:high]) ** 2 / np.sum(patterns**2, axis=1)
     # the first pattern is the single wrong reading
-    return int(np.argmax(explained)) > 0
+    return int(np.argmax(explained_squares)) > 0
 
 
 def _robust_scatter(residual: FloatArray) -> float:
@@ -339,13 +343,13 @@ def _robust_scatter(residual: FloatArray) -> float:
     return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])))
 
 
-def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
+def _comparison_deviation(residual: FloatArray, least_deviation: float) -> FloatArray:
     """Return the robust standard deviation (N,) that each residual (N,) is compared with.
 
     It is that of the whole record or that of the samples around it, whichever is larger, and at
-    least `least`.
+    least `least_deviation`.
     """
-    scatter_of_record = max(_robust_scatter(residual), least, 1e-300)
+    scatter_of_record = max(_robust_scatter(residual), least_deviation, 1e-300)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])
     if len(inner_magnitudes) <= 2 * _HALF_WINDOW:
         return np.full(len(residual), scatter_of_record)

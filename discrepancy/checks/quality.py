@@ -122,11 +122,11 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
 
     It is infinite if no record is long enough.
     """
-    least = np.inf
+    least_roughness = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
-            least = min(least, estimate_roughness(values) / trial.noise_factor)
-    return least
+            least_roughness = min(least_roughness, estimate_roughness(values) / trial.noise_factor)
+    return least_roughness
 
 
 # ---------------------------------------------------------------- records

@@ -254,9 +254,12 @@ def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int
     """
     pair = [first_index, second_index]
     exchanged = [second_index, first_index]
-    before = misfits[pair, pair]
-    after = misfits[pair, exchanged]
-    return bool(np.all(after < 0.5 * before) and np.sum(before - after) > 30.0)
+    misfits_before = misfits[pair, pair]
+    misfits_after = misfits[pair, exchanged]
+    return bool(
+        np.all(misfits_after < 0.5 * misfits_before)
+        and np.sum(misfits_before - misfits_after) > 30.0
+    )
 
 
 def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel]) -> FloatArray:
@@ -318,9 +321,11 @@ def _misfit(
         residual = readings - predicted_readings
         if channel.offset_deviation > 0.0:
             residual = residual - np.median(residual)
-        least = 0.2 * _LEAST_RELATIVE_ERROR * float(np.max(np.abs(predicted_readings), initial=0.0))
+        least_deviation = (
+            0.2 * _LEAST_RELATIVE_ERROR * float(np.max(np.abs(predicted_readings), initial=0.0))
+        )
         deviation = np.maximum(
-            np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(predicted_readings)), least
+            np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(predicted_readings)), least_deviation
         )
     # bounded, so that readings of any size stay comparable
     standardised = np.minimum(np.abs(residual / np.maximum(deviation, 1e-300)), 1e9)

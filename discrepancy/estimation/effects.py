@@ -95,15 +95,23 @@ class EffectLaws:
             self._add_derivatives(
                 derivatives,
                 len(shared_values) + k,
-                above=replace(arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE)),
-                below=replace(arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE)),
+                arguments_above=replace(
+                    arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE)
+                ),
+                arguments_below=replace(
+                    arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE)
+                ),
             )
         for k in self.unknowns_of_model_laws:
             self._add_derivatives(
                 derivatives,
                 k,
-                above=replace(arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE)),
-                below=replace(arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE)),
+                arguments_above=replace(
+                    arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE)
+                ),
+                arguments_below=replace(
+                    arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE)
+                ),
             )
         return {
             port: LinearisedForce(force_at_port, derivatives[port])
@@ -114,8 +122,8 @@ class EffectLaws:
         self,
         derivatives: Mapping[int, dict[int, FloatArray]],
         unknown_index: int,
-        above: LawArguments,
-        below: LawArguments,
+        arguments_above: LawArguments,
+        arguments_below: LawArguments,
     ) -> None:
         """Add the derivatives of the forces at ports by one unknown, unless they are zero.
 
@@ -125,11 +133,11 @@ class EffectLaws:
             The derivatives by port and unknown, to which those by the unknown are added.
         unknown_index : int
             The number of the unknown.
-        above, below : LawArguments
+        arguments_above, arguments_below : LawArguments
             The arguments with the unknown `HALF_DIFFERENCE` above and below its value.
         """
-        forces_above = self._checked_forces(above)
-        forces_below = self._checked_forces(below)
+        forces_above = self._checked_forces(arguments_above)
+        forces_below = self._checked_forces(arguments_below)
         for port, derivatives_at_port in derivatives.items():
             if port in forces_above and port in forces_below:
                 rise = forces_above[port].force - forces_below[port].force
@@ -194,9 +202,11 @@ class EffectLaws:
             if not has_law:
                 change = change + change_by_effect(term, values)
                 for k in range(len(values)):
-                    above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
-                    below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
-                    derivatives[first_unknown + k] = (above - below) / (2.0 * HALF_DIFFERENCE)
+                    change_above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
+                    change_below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
+                    derivatives[first_unknown + k] = (change_above - change_below) / (
+                        2.0 * HALF_DIFFERENCE
+                    )
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
 

@@ -92,14 +92,14 @@ class MotionEstimator(GaussNewton):
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        current = start
+        current_start = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            estimate = self.iterate(laws, current, speed_window, MOST_PASSING_ITERATIONS)
+            estimate = self.iterate(laws, current_start, speed_window, MOST_PASSING_ITERATIONS)
             if estimate is None:
                 return None
-            current = start_from_estimate(estimate)
-        return self._lower_missing_forces(laws, current, SPEED_WINDOWS[-1])
+            current_start = start_from_estimate(estimate)
+        return self._lower_missing_forces(laws, current_start, SPEED_WINDOWS[-1])
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
@@ -167,10 +167,15 @@ class MotionEstimator(GaussNewton):
             The estimate with a wider window.
         """
         for speed_window in NARROWEST_WINDOWS:
-            narrower = self._lower_missing_forces(laws, start_from_estimate(estimate), speed_window)
-            if narrower is None or narrower.log_evidence < estimate.log_evidence + LEAST_RISE:
+            narrower_estimate = self._lower_missing_forces(
+                laws, start_from_estimate(estimate), speed_window
+            )
+            if (
+                narrower_estimate is None
+                or narrower_estimate.log_evidence < estimate.log_evidence + LEAST_RISE
+            ):
                 break
-            estimate = narrower
+            estimate = narrower_estimate
         return estimate
 
     def _lower_missing_forces(
@@ -262,12 +267,12 @@ class MotionEstimator(GaussNewton):
                     break
         if largest_evidence < first_evidence + LEAST_RISE:
             return estimate
-        tuned = self.iterate(
+        tuned_estimate = self.iterate(
             laws, replace(start, processes=processes), estimate.speed_window, most_iterations
         )
-        if tuned is None or tuned.log_evidence <= estimate.log_evidence:
+        if tuned_estimate is None or tuned_estimate.log_evidence <= estimate.log_evidence:
             return estimate
-        return tuned
+        return tuned_estimate
 
     def _try_factor(
         self,

@@ -283,17 +283,17 @@ class GaussNewton:
             The last estimate; None if the laws are not possible along the first trajectories, or if
             the first evidence is not finite.
         """
-        current = start
+        current_start = start
         last_evidence = -inf
         estimate: MotionEstimate | None = None
         stagnant_iterations = 0
         largest_evidence = -inf
         for _ in range(most_iterations):
-            linearisation = self.linearise(laws, current, speed_window)
+            linearisation = self.linearise(laws, current_start, speed_window)
             if linearisation is None:
                 return estimate
             new_estimate = self._estimate_of_linearisation(
-                linearisation, current, last_evidence, speed_window
+                linearisation, current_start, last_evidence, speed_window
             )
             if new_estimate is None:
                 return estimate
@@ -306,10 +306,10 @@ class GaussNewton:
             if estimate.converged or stagnant_iterations == MOST_STAGNANT_ITERATIONS:
                 return estimate
             last_evidence = estimate.log_evidence
-            next_start = self._take_step(laws, current, estimate, linearisation, speed_window)
+            next_start = self._take_step(laws, current_start, estimate, linearisation, speed_window)
             if next_start is None:
                 return estimate
-            current = next_start
+            current_start = next_start
         return estimate
 
     def _estimate_of_linearisation(
@@ -426,7 +426,7 @@ class GaussNewton:
     def _take_step(
         self,
         laws: HypothesisLaws,
-        current: EstimatorStart,
+        current_start: EstimatorStart,
         estimate: MotionEstimate,
         linearisation: Linearisation,
         speed_window: float,
@@ -442,12 +442,12 @@ class GaussNewton:
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
-        current : EstimatorStart
+        current_start : EstimatorStart
             The values and trajectories before the step.
         estimate : MotionEstimate
             The values and trajectories at the end of the whole step.
         linearisation : Linearisation
-            The trials, linear about `current`.
+            The trials, linear about `current_start`.
         speed_window : float
             The half width of the window of speeds over which laws of the speed are averaged,
             divided by the rms speed.
@@ -458,7 +458,7 @@ class GaussNewton:
             The next start; None if the laws are not possible after any of the fractions.
         """
         # no unknown of an effect moves by more than `LONGEST_STEP`
-        change = estimate.effect - current.effect
+        change = estimate.effect - current_start.effect
         longest_change = float(np.max(np.abs(change), initial=0.0))
         largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
         next_start: EstimatorStart | None = None
@@ -467,20 +467,23 @@ class GaussNewton:
             trajectories = tuple(
                 trajectory.interpolate(smoothed_trial.trajectory, fraction_taken)
                 for trajectory, smoothed_trial in zip(
-                    current.trajectories, estimate.trials, strict=True
+                    current_start.trajectories, estimate.trials, strict=True
                 )
             )
-            stepped = EstimatorStart(
-                effect=current.effect + fraction_taken * change,
-                shared=current.shared + fraction_taken * (estimate.shared - current.shared),
+            stepped_start = EstimatorStart(
+                effect=current_start.effect + fraction_taken * change,
+                shared=current_start.shared
+                + fraction_taken * (estimate.shared - current_start.shared),
                 trajectories=trajectories,
-                processes=current.processes,
+                processes=current_start.processes,
             )
             # admissible if the error is at most one; None if the laws are not possible there
-            error = self._linearisation_error(laws, current, stepped, linearisation, speed_window)
+            error = self._linearisation_error(
+                laws, current_start, stepped_start, linearisation, speed_window
+            )
             if error is None:
                 continue
-            next_start = stepped
+            next_start = stepped_start
             if error <= 1.0:
                 break
         return next_start
@@ -488,8 +491,8 @@ class GaussNewton:
     def _linearisation_error(
         self,
         laws: HypothesisLaws,
-        current: EstimatorStart,
-        stepped: EstimatorStart,
+        current_start: EstimatorStart,
+        stepped_start: EstimatorStart,
         linearisation: Linearisation,
         speed_window: float,
     ) -> float | None:
@@ -499,10 +502,10 @@ class GaussNewton:
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
-        current, stepped : EstimatorStart
+        current_start, stepped_start : EstimatorStart
             The values and trajectories before and after a step.
         linearisation : Linearisation
-            The trials, linear about `current`.
+            The trials, linear about `current_start`.
         speed_window : float
             The half width of the window of speeds over which laws of the speed are averaged,
             divided by the rms speed.
@@ -514,16 +517,19 @@ class GaussNewton:
             step.
         """
         unknowns_change = np.concatenate(
-            (stepped.shared - current.shared, stepped.effect - current.effect)
+            (
+                stepped_start.shared - current_start.shared,
+                stepped_start.effect - current_start.effect,
+            )
         )
         largest_deviation = max(
-            process.standard_deviation for process in stepped.processes.values()
+            process.standard_deviation for process in stepped_start.processes.values()
         )
         largest_ratio = 0.0
         for trial_index, trial in enumerate(linearisation.trials):
-            trajectory = stepped.trajectories[trial_index]
+            trajectory = stepped_start.trajectories[trial_index]
             true_forces = laws.forces_along_trajectory(
-                stepped.law_arguments(trial_index, speed_window)
+                stepped_start.law_arguments(trial_index, speed_window)
             )
             if true_forces is None:
                 return None

@@ -513,15 +513,15 @@ class LinearisedTrial:
         the covariance of the readings: the product of their variances, each given those before it.
         """
         record = self.filtered_record
-        whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
-        whitened = whitened.reshape(-1, self.weight_count)
+        whitened_columns = record.innovations / np.sqrt(record.variances)[:, :, None]
+        whitened_columns = whitened_columns.reshape(-1, self.weight_count)
         # the columns of `_observations` are minus the derivatives of the readings: change the sign
-        whitened[:, 1:] *= -1.0
+        whitened_columns[:, 1:] *= -1.0
         is_used = self.trial.used
         half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[is_used]))
         # readings were multiplied by `white_noise_scale`, and their deviations with them
         half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * is_used))
-        return whitened.T @ whitened, half_log_determinant
+        return whitened_columns.T @ whitened_columns, half_log_determinant
 
     def smooth(self, unknowns: FloatArray) -> "SmoothedTrial":
         """Return the smoothed trajectory and forces of the trial, given all readings.

@@ -60,11 +60,11 @@ def rank_by_missing_force(
     """
     thinned_search = search_in_thinned_records(search)
     if thinned_search is None:
-        ranked = search.rank_hypotheses(effects, on_progress)
-        return refine_hypotheses(search, ranked, len(effects), on_progress)
-    ranked = _rank_in_thinned_records(thinned_search, effects, on_progress)
+        ranked_hypotheses = search.rank_hypotheses(effects, on_progress)
+        return refine_hypotheses(search, ranked_hypotheses, len(effects), on_progress)
+    ranked_hypotheses = _rank_in_thinned_records(thinned_search, effects, on_progress)
     hypotheses = [search.hypothesis_of_all_ports]
-    for leading_hypothesis in _leading_hypotheses(thinned_search, ranked, len(effects)):
+    for leading_hypothesis in _leading_hypotheses(thinned_search, ranked_hypotheses, len(effects)):
         on_progress(f"estimating {leading_hypothesis.candidate.description} in all samples")
         hypothesis = estimate_in_all_samples(search, leading_hypothesis)
         if hypothesis is not None:
@@ -112,20 +112,24 @@ def _rank_in_thinned_records(
     def score(hypothesis: ForceHypothesis) -> float:
         return search.score(hypothesis, len(effects))
 
-    singles = search.rank_hypotheses(effects, on_progress, largest_set=1)
-    hypotheses = refine_hypotheses(search, singles, len(effects), on_progress)
+    single_effects = search.rank_hypotheses(effects, on_progress, largest_set=1)
+    hypotheses = refine_hypotheses(search, single_effects, len(effects), on_progress)
     best_hypothesis = hypotheses[0]
     for followed_count in FOLLOWED_COUNTS[1:]:
         if not best_hypothesis.candidate.terms:
             break
-        extended = search.extend_hypothesis(best_hypothesis, effects, followed_count, on_progress)
-        refined = []
-        for hypothesis in extended[:MOST_REFINED_SETS]:
+        extended_hypotheses = search.extend_hypothesis(
+            best_hypothesis, effects, followed_count, on_progress
+        )
+        refined_hypotheses = []
+        for hypothesis in extended_hypotheses[:MOST_REFINED_SETS]:
             on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
             estimated_hypothesis = estimate_extended_hypothesis(search, hypothesis, best_hypothesis)
-            refined.append(hypothesis if estimated_hypothesis is None else estimated_hypothesis)
-        hypotheses += refined
-        best_of_sets = max(refined, key=score, default=best_hypothesis)
+            refined_hypotheses.append(
+                hypothesis if estimated_hypothesis is None else estimated_hypothesis
+            )
+        hypotheses += refined_hypotheses
+        best_of_sets = max(refined_hypotheses, key=score, default=best_hypothesis)
         if score(best_of_sets) <= score(best_hypothesis):
             break
         best_hypothesis = best_of_sets
@@ -133,7 +137,7 @@ def _rank_in_thinned_records(
 
 
 def _leading_hypotheses(
-    search: ForceSearch, ranked: Sequence[ForceHypothesis], effect_count: int
+    search: ForceSearch, ranked_hypotheses: Sequence[ForceHypothesis], effect_count: int
 ) -> list[ForceHypothesis]:
     """Return the hypotheses with effects that are estimated in all samples, the best first.
 
@@ -144,12 +148,12 @@ def _leading_hypotheses(
     ----------
     search : ForceSearch
         The search in thinned records.
-    ranked : sequence of ForceHypothesis
+    ranked_hypotheses : sequence of ForceHypothesis
         Its hypotheses, the most probable first.
     effect_count : int
         The number of effects that were compared.
     """
-    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    with_effects = [hypothesis for hypothesis in ranked_hypotheses if hypothesis.candidate.terms]
     if not with_effects:
         return []
     best_hypothesis = with_effects[0]

@@ -38,7 +38,7 @@ linearised again."""
 
 def refine_hypotheses(
     search: ForceSearch,
-    ranked: Sequence[ForceHypothesis],
+    ranked_hypotheses: Sequence[ForceHypothesis],
     effect_count: int,
     on_progress: Callable[[str], None] = lambda message: None,
 ) -> list[ForceHypothesis]:
@@ -53,7 +53,7 @@ def refine_hypotheses(
     ----------
     search : ForceSearch
         The search for the missing force.
-    ranked : sequence of ForceHypothesis
+    ranked_hypotheses : sequence of ForceHypothesis
         The hypotheses as the search has fitted them, the most probable first.
     effect_count : int
         The number of effects that were compared. The prior probability of a set of effects is
@@ -70,12 +70,12 @@ def refine_hypotheses(
     def score(hypothesis: ForceHypothesis) -> float:
         return search.score(hypothesis, effect_count)
 
-    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    with_effects = [hypothesis for hypothesis in ranked_hypotheses if hypothesis.candidate.terms]
     nearly_best = []
     for hypothesis in with_effects:
         if score(hypothesis) > score(with_effects[0]) - REFINED_WITHIN:
             nearly_best.append(hypothesis)
-    hypotheses = list(ranked)
+    hypotheses = list(ranked_hypotheses)
     for hypothesis in nearly_best[:MOST_REFINED]:
         on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
         estimated_hypothesis = estimate_hypothesis(search, hypothesis)

@@ -468,12 +468,12 @@ def _move_point(
     problem: Problem, candidate: Candidate, point: Point, step: Point, fraction: float
 ) -> Point:
     """Return the point after a fraction of a step, clipped to the ranges of the unknowns."""
-    stepped = Point(
+    stepped_point = Point(
         shared=point.shared + fraction * step.shared,
         local=tuple(u + fraction * du for u, du in zip(point.local, step.local, strict=True)),
         effect=candidate.add_step(point.effect, fraction * step.effect),
     )
-    return _within_bounds(problem, stepped)
+    return _within_bounds(problem, stepped_point)
 
 
 def _within_bounds(problem: Problem, point: Point) -> Point:

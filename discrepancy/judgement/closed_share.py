@@ -87,25 +87,27 @@ class SquaredErrors:
         times_drawn = generator.multinomial(
             block_count, np.full(block_count, 1.0 / block_count), BOOTSTRAP_DRAWS
         )
-        before = times_drawn @ self.before
-        after = times_drawn @ self.after
+        sums_before = times_drawn @ self.before
+        sums_after = times_drawn @ self.after
         # a draw of blocks without any error has no share
-        has_error = before > 0.0
-        shares = 1.0 - after[has_error] / before[has_error]
+        has_error = sums_before > 0.0
+        shares = 1.0 - sums_after[has_error] / sums_before[has_error]
         low, high = np.quantile(shares, (0.05, 0.95))
         return float(low), float(high)
 
 
-def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
+def squared_errors(residuals_before: ResidualSet, residuals_after: ResidualSet) -> SquaredErrors:
     """Return the sums of squares of residuals without and with a hypothesis, over the same noise.
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials without and with the hypothesis.
     """
     block_sums = []
-    for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
+    for without_effect, with_effect in zip(
+        residuals_before.trials, residuals_after.trials, strict=True
+    ):
         noise = without_effect.noise_deviation
         is_used = without_effect.used & with_effect.used
         squares_before = np.where(is_used, without_effect.residual / noise, 0.0) ** 2
@@ -128,25 +130,25 @@ def _block_count(fitted_trial: FittedTrial) -> int:
     return min(BLOCKS_OF_TRIAL, max(1, len(fitted_trial.used) // SHORTEST_BLOCK))
 
 
-def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
+def closed_share(residuals_before: ResidualSet, residuals_after: ResidualSet) -> ClosedShare | None:
     """Return the share of the mean square error that a hypothesis removes; None without an error.
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         All trials of a campaign without and with the hypothesis. The share is computed in the
         held-out trials if there are any, else in the fitted trials.
     """
     trial_role = "fitted"
-    if before.held_out is not None and after.held_out is not None:
+    if residuals_before.held_out is not None and residuals_after.held_out is not None:
         trial_role = "held-out"
-        before = before.held_out
-        after = after.held_out
-    errors = squared_errors(before, after)
+        residuals_before = residuals_before.held_out
+        residuals_after = residuals_after.held_out
+    errors = squared_errors(residuals_before, residuals_after)
     if not errors.before.sum() > 0.0:
         return None
     low, high = errors.interval()
-    return ClosedShare(errors.share, low, high, trial_role, len(before.trials))
+    return ClosedShare(errors.share, low, high, trial_role, len(residuals_before.trials))
 
 
 def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
@@ -190,7 +192,7 @@ def compared_trials_text(share: ClosedShare) -> str:
 
 
 def rms_errors_text(
-    channels: Mapping[str, Channel], before: Mapping[str, float], after: Mapping[str, float]
+    channels: Mapping[str, Channel], rms_before: Mapping[str, float], rms_after: Mapping[str, float]
 ) -> str:
     """Return rms errors before and after in the units of their channels, as in "x 3.6 to 0.95 mm".
 
@@ -198,18 +200,20 @@ def rms_errors_text(
     ----------
     channels : mapping of str to Channel
         The channels of the campaign by name.
-    before, after : mapping of str to float
+    rms_before, rms_after : mapping of str to float
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
     # the largest error over its noise first
     names = sorted(
-        before,
-        key=lambda name: -before[name] / _recorded_noise_or_fallback(channels[name], before[name]),
+        rms_before,
+        key=lambda name: (
+            -rms_before[name] / _recorded_noise_or_fallback(channels[name], rms_before[name])
+        ),
     )
     channel_texts = []
     for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
-        change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
+        change = f"{factor * rms_before[name]:.3g} to {factor * rms_after.get(name, nan):.3g}"
         change = f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
         channel_texts.append(f"{name} {change}")
     unmentioned_count = len(names) - CHANNELS_MENTIONED

@@ -365,7 +365,7 @@ def _group_sentence(
 def _unexplained_outcome(
     comparison: Comparison[HypothesisT],
     simulation_verdict: Verdict,
-    considered: HypothesisT | None = None,
+    considered_hypothesis: HypothesisT | None = None,
     reason: str = "",
 ) -> VerdictOutcome:
     """Return the verdict that there is an unexplained gap.
@@ -379,7 +379,7 @@ def _unexplained_outcome(
         The comparison of all hypotheses.
     simulation_verdict : Verdict
         The verdict on the simulations.
-    considered : HypothesisT, optional
+    considered_hypothesis : HypothesisT, optional
         The hypothesis that was considered for a name; if left out, the one that explains the
         largest share of the gap is mentioned.
     reason : str
@@ -387,23 +387,31 @@ def _unexplained_outcome(
         or else that its probability is too low.
     """
     gap_sentences = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
-    mentioned = _hypothesis_explaining_most(comparison) if considered is None else considered
+    mentioned_hypothesis = (
+        _hypothesis_explaining_most(comparison)
+        if considered_hypothesis is None
+        else considered_hypothesis
+    )
     judged_hypothesis = None
     resembles: tuple[str, ...] = ()
-    if mentioned is None or not _explains_mentioned_share(comparison, mentioned):
+    if mentioned_hypothesis is None or not _explains_mentioned_share(
+        comparison, mentioned_hypothesis
+    ):
         sentence = f"{gap_sentences} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(mentioned):
-        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned)}"
+    elif comparison.enlarges_error(mentioned_hypothesis):
+        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned_hypothesis)}"
     else:
-        reason = reason or comparison.objection_to_naming(mentioned)
-        if considered is not None and not reason:
-            probability = comparison.probability(mentioned)
+        reason = reason or comparison.objection_to_naming(mentioned_hypothesis)
+        if considered_hypothesis is not None and not reason:
+            probability = comparison.probability(mentioned_hypothesis)
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        sentence = f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned, reason)}"
-        judged_hypothesis = mentioned
-        resembles = names_without_free_shape(mentioned.candidate.identifiers)
+        sentence = (
+            f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned_hypothesis, reason)}"
+        )
+        judged_hypothesis = mentioned_hypothesis
+        resembles = names_without_free_shape(mentioned_hypothesis.candidate.identifiers)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,

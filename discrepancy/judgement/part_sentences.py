@@ -66,11 +66,11 @@ def unproved_addition_sentence(
     )
     if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
         return ""
-    added = []
+    added_effects = []
     for effect in named_effects(comparison.problem, larger_hypothesis):
         if (effect.family, effect.place) not in families:
-            added.append(effect)
+            added_effects.append(effect)
     return (
-        f" {capital(effects_text(added))} may be there beside it, but is not proved: it gains less "
-        "evidence than it costs."
+        f" {capital(effects_text(added_effects))} may be there beside it, but is not proved: it "
+        "gains less evidence than it costs."
     )

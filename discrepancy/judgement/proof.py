@@ -79,8 +79,10 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         log_density(fitted_trial)[fitted_trial.used] for fitted_trial in residuals.trials
     ]
     chi_square = chi_square_of(residuals)
-    whitened = residuals.whitened_residuals(np.random.default_rng(seed))
-    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(whitened)]
+    white_residuals = residuals.whitened_residuals(np.random.default_rng(seed))
+    p_values = [
+        ljung_box(series.values).p_value for series in residuals.dynamic_series(white_residuals)
+    ]
     bin_counts, _ = np.histogram(stats.norm.cdf(used_standardised), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
@@ -177,11 +179,11 @@ def correlation_time(series: FloatArray) -> float:
     7, 473-483): sums of neighbouring pairs are added while they are positive.
     """
     count = series.size
-    centred = series - series.mean()
-    sum_of_squares = float(centred @ centred)
+    centred_series = series - series.mean()
+    sum_of_squares = float(centred_series @ centred_series)
     if count < 4 or sum_of_squares == 0.0:
         return 1.0
-    autocorrelation = lag_products(centred, count - 1)[0] / sum_of_squares
+    autocorrelation = lag_products(centred_series, count - 1)[0] / sum_of_squares
     pair_sums = autocorrelation[0 : count - 1 : 2] + autocorrelation[1:count:2]
     nonpositive = np.flatnonzero(pair_sums <= 0.0)
     # autocorrelation[0] = 1, so that 1 + 2 (sum over k >= 1) = 2 (sum over k >= 0) - 1
@@ -228,7 +230,7 @@ def _uniformity_p_value(
     return float(stats.chi2.sf(statistic, PIT_BINS - 1))
 
 
-def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
+def score_gain(residuals_before: ResidualSet, residuals_after: ResidualSet) -> tuple[float, float]:
     """Return the gain of the mean predictive log density per sample, and its standard error [nat].
 
     Trials are the units: the error is that of a ratio over clusters. With fewer than five trials it
@@ -237,13 +239,15 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials without and with the effect.
     """
     trial_sums = []
     trial_counts = []
     variance_within = 0.0
-    for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
+    for without_effect, with_effect in zip(
+        residuals_before.trials, residuals_after.trials, strict=True
+    ):
         is_used = without_effect.used
         # densities are in units of the noise deviation, which differs for channels without a record
         noise_ratio = np.log(without_effect.noise_deviation / with_effect.noise_deviation)
@@ -285,12 +289,12 @@ def _variance_of_sum(series: FloatArray) -> float:
 # ---------------------------------------------------------------- the test on held-out trials
 
 
-def check_held_out(after: ResidualSet) -> Gate:
+def check_held_out(residuals_after: ResidualSet) -> Gate:
     """Test whether a hypothesis predicts the held-out trials.
 
     Parameters
     ----------
-    after : ResidualSet
+    residuals_after : ResidualSet
         All trials with their predictions by the hypothesis.
 
     Returns
@@ -300,17 +304,17 @@ def check_held_out(after: ResidualSet) -> Gate:
         deviations above what is expected, or the coverage of 90 % intervals is outside `COVERAGE`.
         `passed` is None without a held-out trial or without a noise record.
     """
-    if after.held_out is None:
+    if residuals_after.held_out is None:
         return _held_out_gate(None, nan, "No trial was held out.")
-    held_out_scores = compute_scores(after.held_out)
-    excess = chi_square_of(after.held_out).excess
+    held_out_scores = compute_scores(residuals_after.held_out)
+    excess = chi_square_of(residuals_after.held_out).excess
     if not isfinite(excess):
         return _held_out_gate(None, nan, "No noise record to judge them by.")
     if excess > HELD_OUT_DEVIATIONS:
         reason = f"On held-out trials χ² per sample is {chi_square_text(held_out_scores)}."
         return _held_out_gate(False, excess, reason)
-    least, largest = COVERAGE
-    is_covered = least <= held_out_scores.coverage_90 <= largest
+    least_coverage, largest_coverage = COVERAGE
+    is_covered = least_coverage <= held_out_scores.coverage_90 <= largest_coverage
     if held_out_scores.sample_count >= LEAST_SAMPLES_FOR_COVERAGE and not is_covered:
         percent = 100.0 * held_out_scores.coverage_90
         reason = f"90 % intervals hold {percent:.0f} % of the samples of held-out trials."
@@ -335,20 +339,24 @@ def chi_square_text(trial_scores: Scores) -> str:
 # ---------------------------------------------------------------- proof of a verdict
 
 
-def compare_errors(before: ResidualSet, after: ResidualSet) -> ErrorComparison:
+def compare_errors(residuals_before: ResidualSet, residuals_after: ResidualSet) -> ErrorComparison:
     """Return the errors of the deciding trials without and with a hypothesis.
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the hypothesis.
     """
-    share, reason = _closed_share_or_reason(before, after)
+    share, reason = _closed_share_or_reason(residuals_before, residuals_after)
     return ErrorComparison(
         closed=share,
         closed_reason=reason,
-        rms_before=rms_by_channel(before.held_out or before.fitted or before),
-        rms_after=rms_by_channel(after.held_out or after.fitted or after),
+        rms_before=rms_by_channel(
+            residuals_before.held_out or residuals_before.fitted or residuals_before
+        ),
+        rms_after=rms_by_channel(
+            residuals_after.held_out or residuals_after.fitted or residuals_after
+        ),
     )
 
 
@@ -359,13 +367,13 @@ def errors_of_fit(search: FittedCandidates, fit: CandidateFit) -> ErrorCompariso
     """
     key = (fit, search.problem.refinement)
     if key not in search.errors_by_fit:
-        before = search.residuals(search.no_effect)
-        search.errors_by_fit[key] = compare_errors(before, search.residuals(fit))
+        residuals_before = search.residuals(search.no_effect)
+        search.errors_by_fit[key] = compare_errors(residuals_before, search.residuals(fit))
     return search.errors_by_fit[key]
 
 
 def _closed_share_or_reason(
-    before: ResidualSet, after: ResidualSet
+    residuals_before: ResidualSet, residuals_after: ResidualSet
 ) -> tuple[ClosedShare | None, str]:
     """Return the share of the mean square error that a hypothesis removes, or None and the reason.
 
@@ -375,7 +383,7 @@ def _closed_share_or_reason(
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the hypothesis.
 
     Returns
@@ -385,13 +393,13 @@ def _closed_share_or_reason(
     reason : str
         The reason why there is no share, or why it is that of fitted trials; else empty.
     """
-    share = closed_share(before, after)
+    share = closed_share(residuals_before, residuals_after)
     if share is None:
         return None, "The model as it was leaves no error at all."
     if share.trials != "held-out":
         return share, "No trial was held out."
-    chi_square_before = _chi_square_by_diagonal(before.held_out or before)
-    chi_square_after = _chi_square_by_diagonal(after.held_out or after)
+    chi_square_before = _chi_square_by_diagonal(residuals_before.held_out or residuals_before)
+    chi_square_after = _chi_square_by_diagonal(residuals_after.held_out or residuals_after)
     has_no_gap_before = chi_square_before.excess_over_noise < LEAST_EXCESS_DEVIATIONS
     if has_no_gap_before and chi_square_after.excess_over_noise <= HELD_OUT_DEVIATIONS:
         chi_square = f"χ² per sample {chi_square_before.per_sample:.3g}, 1 for noise alone"
@@ -409,8 +417,8 @@ def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
 
 
 def prove_effects(
-    before: ResidualSet,
-    after: ResidualSet,
+    residuals_before: ResidualSet,
+    residuals_after: ResidualSet,
     *,
     errors: ErrorComparison | None = None,
     effects: tuple[str, ...] = (),
@@ -420,7 +428,7 @@ def prove_effects(
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the effect.
     errors : ErrorComparison, optional
         Their errors, if they are known already, as the sentence of a verdict states them.
@@ -435,17 +443,17 @@ def prove_effects(
         If no sample of the fitted or of the held-out trials is used.
     """
     # the same noise deviation for both, so that errors and scores can be compared
-    after = residuals_with_noise_of(after, before)
-    held_out_before = _held_out_scores(before, seed)
-    held_out_after = _held_out_scores(after, seed)
-    fitted_before = compute_scores(before.fitted or before, seed=seed)
-    fitted_after = compute_scores(after.fitted or after, seed=seed)
-    errors = errors or compare_errors(before, after)
+    residuals_after = residuals_with_noise_of(residuals_after, residuals_before)
+    held_out_before = _held_out_scores(residuals_before, seed)
+    held_out_after = _held_out_scores(residuals_after, seed)
+    fitted_before = compute_scores(residuals_before.fitted or residuals_before, seed=seed)
+    fitted_after = compute_scores(residuals_after.fitted or residuals_after, seed=seed)
+    errors = errors or compare_errors(residuals_before, residuals_after)
     gain = nan
     gain_error = nan
-    if before.held_out is not None and after.held_out is not None:
-        gain, gain_error = score_gain(before.held_out, after.held_out)
-    decisive_trials = after.held_out or after.fitted or after
+    if residuals_before.held_out is not None and residuals_after.held_out is not None:
+        gain, gain_error = score_gain(residuals_before.held_out, residuals_after.held_out)
+    decisive_trials = residuals_after.held_out or residuals_after.fitted or residuals_after
     return Proof(
         held_out_before=held_out_before,
         held_out_after=held_out_after,

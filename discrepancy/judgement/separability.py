@@ -186,7 +186,7 @@ def compute_separability(
     start = prior_point_with_initial_states(problem)
     screen = Screen(problem, fit(problem, Candidate(), start, iterations=1))
     detectability: list[Detectability] = []
-    visible: list[_VisibleEffect] = []
+    visible_effects: list[_VisibleEffect] = []
     for effect in effects:
         reason = effect.unavailable(setting)
         if reason is not None:
@@ -206,9 +206,11 @@ def compute_separability(
         )
         detectability.append(_detectability(effect, reference, distance))
         if reference.squared_size > VISIBILITY_DISTANCE:
-            visible.append(_VisibleEffect(effect.identifier, reference, [reference, *grid_changes]))
-    identifiers = tuple(effect.identifier for effect in visible)
-    distance_matrix = _distances(screen, visible)
+            visible_effects.append(
+                _VisibleEffect(effect.identifier, reference, [reference, *grid_changes])
+            )
+    identifiers = tuple(effect.identifier for effect in visible_effects)
+    distance_matrix = _distances(screen, visible_effects)
     groups = _confusion_groups(identifiers, distance_matrix)
     return Separability(tuple(detectability), identifiers, distance_matrix, groups)
 
@@ -319,17 +321,19 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     """
     for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.effect_values[index])))
-            detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
+            typical_value = abs(parameter.prior.value(float(change.effect_values[index])))
+            least_detectable_value = (
+                typical_value * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
+            )
             return Detectability(
                 effect=effect,
                 reason="",
                 place=change.term.place,
                 distance=distance,
                 parameter=parameter.name,
-                detectable=detectable,
+                detectable=least_detectable_value,
                 unit=parameter.unit,
-                typical=typical,
+                typical=typical_value,
             )
     return Detectability(effect, "", change.term.place, distance)
 
@@ -356,7 +360,7 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
         for j, other_effect in enumerate(effects):
             if i == j:
                 continue
-            small_changes_of_other = [small.change for small in small_changes[j]]
+            small_changes_of_other = [small_change.change for small_change in small_changes[j]]
             first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
@@ -411,10 +415,10 @@ def _squared_distance(
     # the step of derivatives
     changes = [nearest_change.vector]
     for index in range(len(nearest_change.effect_values)):
-        stepped = nearest_change.effect_values.copy()
-        stepped[index] += 10.0 * PARAMETER_STEP
+        stepped_values = nearest_change.effect_values.copy()
+        stepped_values[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change_by_effect(nearest_change.term, stepped)
+            change = screen.change_by_effect(nearest_change.term, stepped_values)
             changes.append(change.vector - nearest_change.vector)
     # least squares by normal equations, scaled to unit length; a small multiple of the identity is
     # added because changes by several parameters may be nearly parallel
@@ -423,8 +427,8 @@ def _squared_distance(
     lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     gram = gram / np.outer(lengths, lengths) + 1e-6 * np.eye(len(gram))
     overlaps = (spanning_changes * sign) @ target.vector / lengths
-    explained = float(overlaps @ np.linalg.solve(gram, overlaps))
-    return max(target.squared_size - explained, 0.0)
+    explained_squares = float(overlaps @ np.linalg.solve(gram, overlaps))
+    return max(target.squared_size - explained_squares, 0.0)
 
 
 def _confusion_groups(
@@ -452,11 +456,11 @@ def usable_effects(effects: Sequence[Effect], setting: Setting) -> tuple[Effect,
     DiscrepancyError
         If no effect can be tested.
     """
-    usable = tuple(effect for effect in effects if effect.unavailable(setting) is None)
-    if not usable:
+    usable_catalogue = tuple(effect for effect in effects if effect.unavailable(setting) is None)
+    if not usable_catalogue:
         raise DiscrepancyError(
             "No effect of the catalogue can be tested with this campaign and model: the campaign "
             "needs static, ring-down, forced or flight trials whose channels are outputs of the "
             "model."
         )
-    return usable
+    return usable_catalogue

@@ -75,8 +75,8 @@ class SimulationComparison(Comparison[CandidateFit]):
         trials_before = _trials_in_role(without_effect, held_out=held_out)
         trials_after = _trials_in_role(with_effect, held_out=held_out)
         block_sums: list[list[float]] = []
-        for before, after in zip(trials_before, trials_after, strict=True):
-            block_sums += self._block_sums(before, after)
+        for trial_before, trial_after in zip(trials_before, trials_after, strict=True):
+            block_sums += self._block_sums(trial_before, trial_after)
         sums_before, sums_after, noise_sums = np.array(block_sums).T
         return GapShare(
             squares_before=sums_before,
@@ -90,7 +90,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             is_tested=True,
         )
 
-    def _block_sums(self, before: FittedTrial, after: FittedTrial) -> list[list[float]]:
+    def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[list[float]]:
         """Return sums over each block of a trial without and with a hypothesis.
 
         Returns
@@ -99,14 +99,14 @@ class SimulationComparison(Comparison[CandidateFit]):
             For each block the sums of squared residuals over the noise variance, without and with
             the hypothesis, and the number of used samples, which is the expected sum of the noise.
         """
-        noise = before.noise_deviation * [
-            self._noise_scales[name] for name in before.trial.channels
+        noise = trial_before.noise_deviation * [
+            self._noise_scales[name] for name in trial_before.trial.channels
         ]
-        squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
-        squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
-        sample_count = len(before.used)
+        squares_before = np.where(trial_before.used, trial_before.residual / noise, 0.0) ** 2
+        squares_after = np.where(trial_after.used, trial_after.residual / noise, 0.0) ** 2
+        sample_count = len(trial_before.used)
         block_count = 1
-        if before.trial.is_dynamic:
+        if trial_before.trial.is_dynamic:
             block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
         sums_of_blocks = []
         for block in np.array_split(np.arange(sample_count), block_count):
@@ -114,7 +114,7 @@ class SimulationComparison(Comparison[CandidateFit]):
                 [
                     float(squares_before[block].sum()),
                     float(squares_after[block].sum()),
-                    float(before.used[block].sum()),
+                    float(trial_before.used[block].sum()),
                 ]
             )
         return sums_of_blocks
@@ -166,7 +166,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         The best law itself is one of them, if it has a shape parameter.
         """
         (best_term,) = best_fit.candidate.terms
-        singles: dict[tuple[str, str], CandidateFit] = {}
+        single_fits: dict[tuple[str, str], CandidateFit] = {}
         fits = (*self.search.rough_fits.values(), *self.search.exact_fits.values())
         for other_fit in fits:
             if len(other_fit.candidate.terms) != 1:
@@ -177,8 +177,10 @@ class SimulationComparison(Comparison[CandidateFit]):
                 continue
             if term == best_term or are_related(term.effect, best_term.effect):
                 key = (term.effect.family, term.place)
-                singles[key] = max(singles.get(key, other_fit), other_fit, key=self.search.score)
-        return list(singles.values())
+                single_fits[key] = max(
+                    single_fits.get(key, other_fit), other_fit, key=self.search.score
+                )
+        return list(single_fits.values())
 
     def fit_with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
         """Return the fit of a single law with its shape free; None if there is none."""

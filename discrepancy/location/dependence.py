@@ -60,8 +60,8 @@ def modal_motion(
         w. Its modulus is the amplitude of the mode at each time.
     """
     count = len(values)
-    mirrored = np.concatenate([values[:0:-1], values, values[-2::-1]])
-    spectrum = np.fft.fft(mirrored, axis=0)
+    mirrored_motion = np.concatenate([values[:0:-1], values, values[-2::-1]])
+    spectrum = np.fft.fft(mirrored_motion, axis=0)
     ordinate_frequencies = np.fft.fftfreq(len(spectrum), interval)[:, np.newaxis]
     spectra_of_modes = []
     for low, high in mode_bands(frequencies):
@@ -72,7 +72,9 @@ def modal_motion(
 
 
 def mode_shares(
-    trials: Sequence[FittedTrial], white: Sequence[FloatArray], frequencies: Sequence[float]
+    trials: Sequence[FittedTrial],
+    white_residuals: Sequence[FloatArray],
+    frequencies: Sequence[float],
 ) -> FloatArray:
     """Return the fraction (M,) of the excess variance in the frequency band of each mode.
 
@@ -82,14 +84,14 @@ def mode_shares(
     ----------
     trials : sequence of FittedTrial
         The dynamic trials with their predictions and residuals.
-    white : sequence of (N, C) ndarray
+    white_residuals : sequence of (N, C) ndarray
         The white residuals of each trial.
     frequencies : sequence of float
         Frequencies of the M modes [Hz], lowest first.
     """
     excess_of_modes = np.zeros(len(frequencies))
     total_excess = 0.0
-    for fitted_trial, values in zip(trials, white, strict=True):
+    for fitted_trial, values in zip(trials, white_residuals, strict=True):
         # An ordinate of the periodogram is one on average for white noise of unit variance, and
         # stands for two terms of the sum of squares: a cosine and a sine.
         surplus = sum(2.0 * (periodogram(series) - 1.0) for series in values.T)
@@ -112,11 +114,11 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     has at least four periods in the record, because a wrong zero or a slow decay looks like a peak
     at lower frequencies.
     """
-    longest = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
-    count = len(longest.time)
+    longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
+    count = len(longest_trial.time)
     power = np.zeros((count - 1) // 2)
     for fitted_trial in trials:
-        interval_ratio = fitted_trial.trial.interval / longest.interval
+        interval_ratio = fitted_trial.trial.interval / longest_trial.interval
         if len(fitted_trial.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
         values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)
@@ -124,15 +126,15 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
         taper = np.hanning(2 * count)[count:, np.newaxis]
         spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted_trial.noise_deviation**2
         power += spectra[1 : power.size + 1].sum(axis=1)
-    frequencies = np.arange(1, power.size + 1) / (count * longest.interval)
+    frequencies = np.arange(1, power.size + 1) / (count * longest_trial.interval)
     peaks = []
     for index in range(3, power.size - 1):  # index 3 is four periods in the record
         frequency = float(frequencies[index])
         is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
         if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
             peaks.append((float(power[index]), frequency))
-    highest = sorted(peaks, reverse=True)[:4]
-    return tuple(sorted(frequency for _, frequency in highest))
+    highest_peaks = sorted(peaks, reverse=True)[:4]
+    return tuple(sorted(frequency for _, frequency in highest_peaks))
 
 
 _HAT_COUNT = 9
@@ -310,7 +312,7 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         if abs(fitted_trial.trial.interval / interval - 1.0) < 1e-6
     ]
     frequencies = np.fft.rfftfreq(4 * length, interval)
-    strongest: SpectralLine | None = None
+    strongest_line: SpectralLine | None = None
     greatest_power = 0.0
     choices = 0
     for folds in (0.0, 1.0, 3.0, 10.0, 30.0):
@@ -318,8 +320,8 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         power = np.zeros(frequencies.size)
         for fitted_trial in evenly_sampled:
             weight = np.exp(-decay * interval * np.arange(len(fitted_trial.trial.time)))
-            weighted = np.nan_to_num(fitted_trial.standardised) * weight[:, np.newaxis]
-            spectra = np.abs(np.fft.rfft(weighted, 4 * length, axis=0)) ** 2
+            weighted_residuals = np.nan_to_num(fitted_trial.standardised) * weight[:, np.newaxis]
+            spectra = np.abs(np.fft.rfft(weighted_residuals, 4 * length, axis=0)) ** 2
             # A cosine and a sine under this weight each have about half the squared norm of the
             # weight, so that the explained sum of squares is 2 |spectrum|^2 / |weight|^2.
             power += 2.0 * spectra.sum(axis=1) / (weight @ weight)
@@ -329,8 +331,8 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         # a decaying line must explain at least 5 % more than the best so far
         if power[index] > 1.05 * greatest_power:
             greatest_power = float(power[index])
-            strongest = SpectralLine(float(frequencies[index]), decay, choices)
-    return None if strongest is None else strongest._replace(choice_count=choices)
+            strongest_line = SpectralLine(float(frequencies[index]), decay, choices)
+    return None if strongest_line is None else strongest_line._replace(choice_count=choices)
 
 
 def dependence_bases(
@@ -434,11 +436,13 @@ class _UsedSamples:
             if name in names
         ]
         width = max(widths, default=1)
-        stacked = []
+        stacked_features = []
         for features_of_trial, rows in zip(self._features, self.rows, strict=True):
             zeros = np.zeros((int(rows.sum()), width))
-            stacked.append(np.hstack([features_of_trial.get(name, zeros) for name in names]))
-        return np.vstack(stacked)
+            stacked_features.append(
+                np.hstack([features_of_trial.get(name, zeros) for name in names])
+            )
+        return np.vstack(stacked_features)
 
 
 def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:

@@ -114,39 +114,41 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
         )
     fitted_residuals = without_coloured_records(fitted_residuals)
     white_residuals = fitted_residuals.whitened_residuals(np.random.default_rng(seed))
-    coloured = coloured_noise_remarks(fitted_residuals)
+    coloured_remarks = coloured_noise_remarks(fitted_residuals)
     tests = (
         variance_test(fitted_residuals),
-        *serial_tests(fitted_residuals, white_residuals, tuple(coloured)),
+        *serial_tests(fitted_residuals, white_residuals, tuple(coloured_remarks)),
     )
-    rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
+    rejections = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(
         replace(test, rejected=is_rejected)
-        for test, is_rejected in zip(tests, rejected, strict=True)
+        for test, is_rejected in zip(tests, rejections, strict=True)
     )
-    findings = _disagreements(fitted_residuals, white_residuals) if any(rejected) else []
+    findings = _disagreements(fitted_residuals, white_residuals) if any(rejections) else []
     cells = residual_map(fitted_residuals, white_residuals, MAP_RATE)
-    remarks = [*coloured.values(), *_noise_remarks(fitted_residuals)]
+    remarks = [*coloured_remarks.values(), *_noise_remarks(fitted_residuals)]
     has_samples = any(trial.used.any() for trial in fitted_residuals.trials)
     if has_samples and all(cell.axis == "frequency" for cell in cells):
         remarks.append(
             "The model is so far off that beside the noise no cell of the map can be judged."
         )
-    return Location(any(rejected), tests, cells, tuple(findings), tuple(remarks))
+    return Location(any(rejections), tests, cells, tuple(findings), tuple(remarks))
 
 
-def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disagreement]:
+def _disagreements(
+    residuals: ResidualSet, white_residuals: Sequence[FloatArray]
+) -> list[Disagreement]:
     """Return the findings in all kinds of trials, sorted by the excess variance that they explain.
 
     Parameters
     ----------
     residuals : ResidualSet
         The residuals of the fitted trials.
-    white : sequence of (N, C) ndarray
+    white_residuals : sequence of (N, C) ndarray
         White residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
-    for kind in group_by_kind(residuals, white):
+    for kind in group_by_kind(residuals, white_residuals):
         # the share of a finding is a fraction of the excess in its own kind of trial
         excess_of_kind = sum(
             max(excess_over_noise([fitted_trial]), 0.0) for fitted_trial in kind.trials

@@ -310,7 +310,7 @@ class Cell:
 
 
 def residual_map(
-    residuals: ResidualSet, white: tuple[FloatArray, ...], rate: float = 0.05
+    residuals: ResidualSet, white_residuals: tuple[FloatArray, ...], rate: float = 0.05
 ) -> tuple[Cell, ...]:
     """Return the cells of all trials and channels, and mark those that are significant.
 
@@ -321,14 +321,14 @@ def residual_map(
     ----------
     residuals : ResidualSet
         The residuals of the fitted trials.
-    white : tuple of (N, C) ndarray
+    white_residuals : tuple of (N, C) ndarray
         White residuals of each trial, from its method `whitened_residuals`, for the bins of
         frequency.
     rate : float
         The false discovery rate that is accepted.
     """
     cells: list[Cell] = []
-    for fitted_trial, values in zip(residuals.trials, white, strict=True):
+    for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
         cells += _cells_of_trial(residuals, fitted_trial, values)
     p_values = np.array([cell.p_value for cell in cells])
     are_discoveries = benjamini_yekutieli(p_values, rate)
@@ -339,7 +339,7 @@ def residual_map(
 
 
 def _cells_of_trial(
-    residuals: ResidualSet, fitted_trial: FittedTrial, white: FloatArray
+    residuals: ResidualSet, fitted_trial: FittedTrial, white_residuals: FloatArray
 ) -> Iterator[Cell]:
     """Yield the cells of a trial: its whole records, and their bins.
 
@@ -349,7 +349,7 @@ def _cells_of_trial(
         The set, for the noise records.
     fitted_trial : FittedTrial
         The trial with its prediction and residuals.
-    white : (N, C) ndarray
+    white_residuals : (N, C) ndarray
         White residuals of the trial.
     """
     trial = fitted_trial.trial
@@ -384,7 +384,9 @@ def _cells_of_trial(
                     yield tested_cell
             yield from _variance_cells(fitted_trial, column, span.used, cell, noise_freedom)
         if trial.is_dynamic and is_used.all():
-            yield from _frequency_cells(white[:, column], trial.interval, template, noise_freedom)
+            yield from _frequency_cells(
+                white_residuals[:, column], trial.interval, template, noise_freedom
+            )
 
 
 class _Span(NamedTuple):
@@ -420,8 +422,8 @@ def _spans(fitted_trial: FittedTrial, column: int) -> Iterator[_Span]:
         if fitted_trial.rates is not None:
             amplitude = motion_envelope(fitted_trial, column)
             if amplitude.any():
-                least = max(amplitude.min(), 1e-4 * amplitude.max())
-                edges = np.geomspace(least, amplitude.max(), BIN_COUNT + 1)
+                least_amplitude = max(amplitude.min(), 1e-4 * amplitude.max())
+                edges = np.geomspace(least_amplitude, amplitude.max(), BIN_COUNT + 1)
                 yield from _spans_of_bins("amplitude", amplitude, edges, is_used)
     else:
         edges = np.linspace(trial.load.min(), trial.load.max(), LOAD_BIN_COUNT + 1)

@@ -149,7 +149,9 @@ def _split_by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
 
 
 def serial_tests(
-    residuals: ResidualSet, white: Sequence[FloatArray], coloured: Sequence[str] = ()
+    residuals: ResidualSet,
+    white_residuals: Sequence[FloatArray],
+    coloured_channels: Sequence[str] = (),
 ) -> tuple[OmnibusTest, ...]:
     """Test the residuals of all dynamic trials for correlation in time and for spectral lines.
 
@@ -160,16 +162,16 @@ def serial_tests(
     ----------
     residuals : ResidualSet
         The residuals of all trials, with the channels.
-    white : sequence of (N, C) ndarray
+    white_residuals : sequence of (N, C) ndarray
         White residuals of each trial, from its method `whitened_residuals`.
-    coloured : sequence of str
+    coloured_channels : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """
     portmanteau_tests: list[_RecordTest] = []
     periodogram_tests: list[_RecordTest] = []
     line_tests: list[_RecordTest] = []
-    for series in residuals.dynamic_series(white):
-        if series.channel in coloured:
+    for series in residuals.dynamic_series(white_residuals):
+        if series.channel in coloured_channels:
             continue
         trial = series.fitted_trial.trial
         record = f"{trial.name}, {series.channel}"

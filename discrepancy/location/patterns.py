@@ -95,18 +95,20 @@ class TrialsOfKind(NamedTuple):
         return Disagreement(self.name, subject, dependence, share, p_value, sentence)
 
 
-def group_by_kind(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[TrialsOfKind]:
+def group_by_kind(
+    residuals: ResidualSet, white_residuals: Sequence[FloatArray]
+) -> list[TrialsOfKind]:
     """Return the trials grouped by kind and channels; the residuals of a group form one matrix.
 
     Parameters
     ----------
     residuals : ResidualSet
         The residuals of all trials, with the channels.
-    white : sequence of (N, C) ndarray
+    white_residuals : sequence of (N, C) ndarray
         White residuals of each trial.
     """
     groups: dict[tuple[str, tuple[str, ...]], TrialsOfKind] = {}
-    for fitted_trial, values in zip(residuals.trials, white, strict=True):
+    for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
         kind = fitted_trial.trial.kind.value.replace("ringdown", "ring-down")
         key = (kind, fitted_trial.trial.channels)
         if key not in groups:
@@ -242,8 +244,8 @@ def _interpret_pattern(
             agreements.append((float((weights @ pattern) ** 2 / norms), meaning))
     best_agreement, best_meaning = max(agreements, key=lambda candidate: candidate[0])
     if best_agreement < LEAST_AGREEMENT:
-        strongest = np.argsort(-np.abs(weights))[:3]
-        names = ", ".join(channels[index] for index in strongest)
+        strongest_channels = np.argsort(-np.abs(weights))[:3]
+        names = ", ".join(channels[index] for index in strongest_channels)
         return _PatternMeaning("mixed", f"A pattern of its own, strongest on {names},")
     competing_subjects = set()
     for agreement, meaning in agreements:

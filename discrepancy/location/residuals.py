@@ -228,21 +228,23 @@ class ResidualSet:
         """
         draw = generator.standard_normal(self._parameter_count())
         held_out_draw = self._held_out_draw(draw)
-        white = []
+        white_residuals = []
         for fitted_trial in self.trials:
             noise = generator.standard_normal(fitted_trial.residual.shape)
             residual = np.nan_to_num(fitted_trial.standardised)
             if fitted_trial.sensitivity is None:
-                absorbed = np.clip(1.0 - fitted_trial.expected_variance, 0.0, 1.0)
-                restored_noise = np.sqrt(absorbed) * generator.standard_normal(residual.shape)
+                absorbed_variance = np.clip(1.0 - fitted_trial.expected_variance, 0.0, 1.0)
+                restored_noise = np.sqrt(absorbed_variance) * generator.standard_normal(
+                    residual.shape
+                )
                 residual = residual + restored_noise
                 residual = residual / np.sqrt(np.maximum(fitted_trial.expected_variance, 1.0))
             elif fitted_trial.trial.held_out:
                 residual = residual - fitted_trial.sensitivity @ held_out_draw
             else:
                 residual = residual + fitted_trial.sensitivity @ draw
-            white.append(np.where(fitted_trial.used, residual, noise))
-        return tuple(white)
+            white_residuals.append(np.where(fitted_trial.used, residual, noise))
+        return tuple(white_residuals)
 
     def _parameter_count(self) -> int:
         """Return the number P of parameters in the sensitivities; 0 if no trial has them."""
@@ -251,15 +253,15 @@ class ResidualSet:
                 return int(fitted_trial.sensitivity.shape[2])
         return 0
 
-    def dynamic_series(self, white: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
+    def dynamic_series(self, white_residuals: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
         """Yield the white residuals of each dynamic record that is long enough for serial tests.
 
         Parameters
         ----------
-        white : sequence of (N, C) ndarray
+        white_residuals : sequence of (N, C) ndarray
             White residuals of each trial, from the method `whitened_residuals`.
         """
-        for fitted_trial, values in zip(self.trials, white, strict=True):
+        for fitted_trial, values in zip(self.trials, white_residuals, strict=True):
             if not fitted_trial.trial.is_dynamic or len(values) < SHORTEST_SERIES:
                 continue
             for column, name in enumerate(fitted_trial.trial.channels):

@@ -19,7 +19,7 @@ def smoother_corrections(
     step_of_sample: IntArray,
     output_rows: FloatArray,
     is_used: BoolArray,
-    whitened: FloatArray,
+    whitened_innovations: FloatArray,
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -39,7 +39,7 @@ def smoother_corrections(
         The readings for a unit of each state.
     is_used : (N, c) ndarray of bool
         Whether each reading is compared with the model.
-    whitened, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
+    whitened_innovations, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
         The results of `filter_forward` for all samples of one column: innovations divided by their
         deviations, gains, and variances of the innovations.
 
@@ -64,7 +64,7 @@ def smoother_corrections(
             if is_used[k, c]:
                 row = output_rows[c]
                 gain = gains[k, c]
-                scaled_innovation = whitened[k, c, 0] / np.sqrt(variances[k, c])
+                scaled_innovation = whitened_innovations[k, c, 0] / np.sqrt(variances[k, c])
                 correction = correction + row * (scaled_innovation - gain @ correction)
                 information_gain = information @ gain
                 innovation_information = gain @ information_gain + 1.0 / variances[k, c]

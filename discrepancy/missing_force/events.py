@@ -284,28 +284,30 @@ def events_throughout(linear_trials: LinearTrials, port: int, process: Process) 
     return Events(EventSearch(linear_trials, port, process), (process, process), always, -np.inf)
 
 
-def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
+def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
     """Return events that were found in every `stride`-th sample, with changes among all samples.
 
     Parameters
     ----------
-    coarse : Events
+    coarse_events : Events
         The events, with paths over the samples that were used.
     stride : int
         The step between these samples.
     """
-    search = EventSearch(coarse.search.linear_trials, coarse.search.port, coarse.search.process)
+    search = EventSearch(
+        coarse_events.search.linear_trials, coarse_events.search.port, coarse_events.search.process
+    )
     paths = [
         np.repeat(on, stride)[: len(trial.time)]
-        for on, trial in zip(coarse.paths, search.trials, strict=True)
+        for on, trial in zip(coarse_events.paths, search.trials, strict=True)
     ]
-    events_in_all_samples = Events(search, coarse.forces, paths, -np.inf)
+    events_in_all_samples = Events(search, coarse_events.forces, paths, -np.inf)
     # `events_in_all_samples` refers to `paths`, which is changed here: the changes of each trial
     # are placed given the refined paths of the trials before it
     for trial_index in range(len(paths)):
         record = events_in_all_samples.switched_record(trial_index, 1)
         paths[trial_index] = record.place_changes(paths[trial_index])
-    log_evidence = float(search.log_evidence(search.products(coarse.forces, paths)))
+    log_evidence = float(search.log_evidence(search.products(coarse_events.forces, paths)))
     return replace(events_in_all_samples, score=log_evidence - price_of_changes(paths))
 
 

@@ -332,7 +332,7 @@ class ForceFilter:
         # calls it the state before sample k + 1.
         next_samples = np.arange(1, len(readings) + 1)
         # forwards in time
-        covariances, means, whitened, _, gains, variances = filter_forward(
+        covariances, means, whitened_innovations, _, gains, variances = filter_forward(
             transitions=record_filter.transitions,
             noises=record_filter.noises,
             step_of_sample=step_of_sample,
@@ -350,7 +350,7 @@ class ForceFilter:
             step_of_sample,
             record_filter.output_rows,
             record_filter.used,
-            whitened,
+            whitened_innovations,
             gains,
             variances,
         )

@@ -90,22 +90,25 @@ class GapShare:
         return float(low), float(high)
 
 
-def _share_of(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
+def _share_of(
+    squares_before: FloatArray, squares_after: FloatArray, noise: FloatArray
+) -> FloatArray:
     """Return the share of a gap that a hypothesis explains, element by element.
 
-    The share is 1 - (after - noise) / (before - noise), with after - noise at least zero. It is
-    zero if `before` is not larger than `noise`, as there is then no gap that could be explained.
+    The share is 1 - (squares_after - noise) / (squares_before - noise), with a numerator of at
+    least zero. It is zero if `squares_before` is not larger than `noise`, as there is then no gap
+    that could be explained.
 
     Parameters
     ----------
-    before, after : array
+    squares_before, squares_after : array
         The sums of squares of the gap without and with the hypothesis.
     noise : array
         The sums of squares that noise alone gives.
     """
-    gap_squares = before - noise
+    gap_squares = squares_before - noise
     remaining_ratio = np.divide(
-        np.maximum(after - noise, 0.0),
+        np.maximum(squares_after - noise, 0.0),
         gap_squares,
         out=np.ones_like(gap_squares),
         where=gap_squares > 0.0,

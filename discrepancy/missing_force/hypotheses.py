@@ -461,12 +461,12 @@ class ColumnBuilder:
         """
         shared_values, local_values = self._linearisation_point(trial)
         # both responses are without the gains of the channels
-        patched, _ = self.problem.response(trial_index, shared_values, local_values, patch)
+        patched_response, _ = self.problem.response(trial_index, shared_values, local_values, patch)
         response, _ = self.problem.response(trial_index, shared_values, local_values, ModelPatch())
         gains = 1.0 + self.problem.shared.gains(
             shared_values, self.problem.trials[trial_index].trial.channels
         )
-        return trial.divide_by_noise(((patched - response) * gains)[:: trial.stride])
+        return trial.divide_by_noise(((patched_response - response) * gains)[:: trial.stride])
 
     def _readings_of_sensor_errors(
         self, trial: PortedTrial, motion: TrialMotion, trial_index: int, sensors: ModelPatch

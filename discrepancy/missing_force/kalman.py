@@ -172,7 +172,7 @@ def filter_forward(
     -------
     covariances, means : (B, n, n), (B, n, W) ndarray
         The state after the last sample before each queried one.
-    whitened : (query_samples[-1] - first, c, W) ndarray
+    whitened_innovations : (query_samples[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
     half_log_determinants : (B,) ndarray
         Half the sum of the logarithms of the variances of the innovations; infinite if a variance
@@ -185,7 +185,7 @@ def filter_forward(
     query_count = len(query_samples)
     covariances = np.zeros((query_count, n, n))
     means = np.zeros((query_count, n, column_count))
-    whitened = np.zeros((query_samples[-1] - first_sample, channel_count, column_count))
+    whitened_innovations = np.zeros((query_samples[-1] - first_sample, channel_count, column_count))
     half_log_determinants = np.full(query_count, np.inf)
     all_gains = np.zeros((query_count, channel_count, n))
     all_variances = np.ones((query_count, channel_count))
@@ -233,19 +233,19 @@ def filter_forward(
                     return (
                         covariances,
                         means,
-                        whitened,
+                        whitened_innovations,
                         half_log_determinants,
                         all_gains,
                         all_variances,
                     )
-            innovation = whitened[k - first_sample, c]
+            innovation = whitened_innovations[k - first_sample, c]
             innovation[:] = columns[k, c]
             subtract_prediction(output_rows[c], mean, innovation)
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
             half_log_determinant += 0.5 * np.log(variances[c])
         steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
-    return covariances, means, whitened, half_log_determinants, all_gains, all_variances
+    return covariances, means, whitened_innovations, half_log_determinants, all_gains, all_variances
 
 
 @compiled

@@ -137,12 +137,12 @@ class ForceSearch(MissingForces):
                     base, effects, followed_count, extended_hypotheses, on_progress
                 )
             hypotheses |= extended_hypotheses
-            ranked = self._sort_by_score(extended_hypotheses, effect_count)
-            if not ranked or self.score(ranked[0], effect_count) <= self.score(
-                best_hypothesis, effect_count
-            ):
+            ranked_hypotheses = self._sort_by_score(extended_hypotheses, effect_count)
+            if not ranked_hypotheses or self.score(
+                ranked_hypotheses[0], effect_count
+            ) <= self.score(best_hypothesis, effect_count):
                 break
-            beam = ranked[:BEAM_WIDTH]
+            beam = ranked_hypotheses[:BEAM_WIDTH]
         return self._sort_by_score(hypotheses, effect_count)
 
     def extend_hypothesis(
@@ -194,12 +194,12 @@ class ForceSearch(MissingForces):
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         on_progress(f"comparing all effects{base_in_words} with the missing force")
-        promising = self.screen_effects(base, effects)[:followed_count]
-        for number, screened_effect in enumerate(promising):
+        promising_effects = self.screen_effects(base, effects)[:followed_count]
+        for number, screened_effect in enumerate(promising_effects):
             candidate = base.candidate.with_term(screened_effect.term)
             if candidate.key in extended_hypotheses:
                 continue
-            remaining_count = len(promising) - number - 1
+            remaining_count = len(promising_effects) - number - 1
             description = candidate.description
             on_progress(f"following {description} along the missing force, {remaining_count} more")
             fitted_hypotheses = []
@@ -258,11 +258,13 @@ class ForceSearch(MissingForces):
         weighed_columns = self._weigh_columns(base, tried_effects)
         weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
         for index, (log_evidence, factor) in weighed_columns.items():
-            tried = tried_effects[index]
-            start = tried.term.multiply_magnitudes(
-                tried.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
+            tried_effect = tried_effects[index]
+            start = tried_effect.term.multiply_magnitudes(
+                tried_effect.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
             )
-            weighed_by_term.setdefault(tried.term, []).append(_WeighedStart(log_evidence, start))
+            weighed_by_term.setdefault(tried_effect.term, []).append(
+                _WeighedStart(log_evidence, start)
+            )
         screened_effects = []
         for term, weighed_starts in weighed_by_term.items():
             best_evidence = max(weighed.log_evidence for weighed in weighed_starts)
@@ -339,7 +341,7 @@ class ForceSearch(MissingForces):
         """
         if not tried_effects:
             return {}
-        columns = [tried.column for tried in tried_effects]
+        columns = [tried_effect.column for tried_effect in tried_effects]
         with_columns = replace(
             base.linear_trials,
             motions=base.motions,
@@ -355,7 +357,7 @@ class ForceSearch(MissingForces):
             normal_equations = with_columns.regression(
                 scale_processes(base.processes, size_factor, time_factor)
             )
-            for index, tried in enumerate(tried_effects):
+            for index, tried_effect in enumerate(tried_effects):
                 # the unknowns of the base are fitted again, with this column alone
                 unknowns = [*range(base_count), base_count + index]
                 solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
@@ -364,7 +366,7 @@ class ForceSearch(MissingForces):
                     index not in best_columns
                     or best_columns[index].log_evidence < solution.log_evidence
                 )
-                has_possible_sign = factor > 0.0 or tried.term.may_be_negative
+                has_possible_sign = factor > 0.0 or tried_effect.term.may_be_negative
                 if is_better and np.isfinite(solution.log_evidence) and has_possible_sign:
                     best_columns[index] = _WeighedColumn(solution.log_evidence, factor)
         return best_columns
@@ -509,16 +511,18 @@ class ForceSearch(MissingForces):
             return None
         slopes = []
         for k in range(len(effect)):
-            above = self.column_builder.column_of_candidate(
+            column_above = self.column_builder.column_of_candidate(
                 linear_trials, motions, candidate, with_step(effect, k, HALF_DIFFERENCE)
             )
-            below = self.column_builder.column_of_candidate(
+            column_below = self.column_builder.column_of_candidate(
                 linear_trials, motions, candidate, with_step(effect, k, -HALF_DIFFERENCE)
             )
-            if above is None or below is None:
+            if column_above is None or column_below is None:
                 return None
             slopes.append(
-                sum_of_columns((above, below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE))
+                sum_of_columns(
+                    (column_above, column_below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE)
+                )
             )
         # a column for each parameter, and a constant one: the linear effects at zero parameters,
         # which are the effects at `effect` minus the sum of effect * slope

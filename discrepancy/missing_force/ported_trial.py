@@ -329,19 +329,21 @@ def _ported_system(
 
     derivatives: list[PortedSystem | None] = []
     for k in range(unknowns.parameter_count):
-        above = system(with_step(shared_values, k, HALF_DIFFERENCE))
-        below = system(with_step(shared_values, k, -HALF_DIFFERENCE))
-        derivatives.append(_system_derivative(above, below))
+        system_above = system(with_step(shared_values, k, HALF_DIFFERENCE))
+        system_below = system(with_step(shared_values, k, -HALF_DIFFERENCE))
+        derivatives.append(_system_derivative(system_above, system_below))
     derivatives += [None] * (unknowns.unknown_count - len(derivatives))
     return system(shared_values), derivatives
 
 
-def _system_derivative(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+def _system_derivative(
+    system_above: PortedSystem, system_below: PortedSystem
+) -> PortedSystem | None:
     """Return the derivative of a system by a parameter, a central difference; None if zero.
 
     Parameters
     ----------
-    above, below : PortedSystem
+    system_above, system_below : PortedSystem
         The system with the parameter `HALF_DIFFERENCE` above and below its value.
     """
 
@@ -349,11 +351,11 @@ def _system_derivative(above: PortedSystem, below: PortedSystem) -> PortedSystem
         return np.asarray((value_above - value_below) / (2.0 * HALF_DIFFERENCE))
 
     derivative = replace(
-        above,
-        generator=slope(above.generator, below.generator),
-        actions=slope(above.actions, below.actions),
-        outputs=slope(above.outputs, below.outputs),
-        through=slope(above.through, below.through),
+        system_above,
+        generator=slope(system_above.generator, system_below.generator),
+        actions=slope(system_above.actions, system_below.actions),
+        outputs=slope(system_above.outputs, system_below.outputs),
+        through=slope(system_above.through, system_below.through),
     )
     arrays = (derivative.generator, derivative.actions, derivative.outputs, derivative.through)
     return derivative if any(np.any(array) for array in arrays) else None

@@ -107,9 +107,9 @@ class ProcessSearch:
         log_medians = logarithms({port: median_processes[port] for port in initial_processes})
         low = log_medians - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         high = log_medians + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
-        shortest, longest = np.log(time_range)
-        low[:, 1] = np.clip(low[:, 1], shortest, longest)
-        high[:, 1] = np.clip(high[:, 1], shortest, longest)
+        log_shortest, log_longest = np.log(time_range)
+        low[:, 1] = np.clip(low[:, 1], log_shortest, log_longest)
+        high[:, 1] = np.clip(high[:, 1], log_shortest, log_longest)
         return cls(log_evidence, initial_processes, low, high)
 
     def processes(self, logs: FloatArray) -> dict[int, Process]:

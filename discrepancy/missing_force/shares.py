@@ -97,11 +97,11 @@ class ForceShares:
         )
         shares = []
         for block_sums, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
-            before, after, noise = np.array(block_sums).T
+            sums_before, sums_after, noise_sums = np.array(block_sums).T
             share = GapShare(
-                squares_before=before,
-                squares_after=after,
-                noise_squares=noise,
+                squares_before=sums_before,
+                squares_after=sums_after,
+                noise_squares=noise_sums,
                 held_out=held_out,
                 trial_count=len(motions),
                 remaining_rms=remaining_rms,

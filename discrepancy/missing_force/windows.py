@@ -159,8 +159,10 @@ def windows_of_residuals(
         The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
-    white = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
-    for fitted_trial, white_residuals in zip(residuals.trials, white, strict=True):
+    white_residuals_of_trials = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
+    for fitted_trial, white_residuals in zip(
+        residuals.trials, white_residuals_of_trials, strict=True
+    ):
         trial = fitted_trial.trial
         extends_in_time = fitted_trial.used.any() and np.ptp(trial.time) > 0.0
         if trial.kind not in kinds or not extends_in_time:
@@ -184,7 +186,7 @@ def windows_of_residuals(
 
 
 def add_window_sizes(
-    windows: Sequence[GapWindow], before: ResidualSet, after: ResidualSet
+    windows: Sequence[GapWindow], residuals_before: ResidualSet, residuals_after: ResidualSet
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
 
@@ -194,25 +196,26 @@ def add_window_sizes(
     ----------
     windows : sequence of GapWindow
         The windows of the unchanged model, and those of the hypothesis of the verdict.
-    before, after : ResidualSet
-        The residuals without and with the hypothesis. Both are divided by the noise of `before`, so
-        that sizes with and without the hypothesis can be compared.
+    residuals_before, residuals_after : ResidualSet
+        The residuals without and with the hypothesis. Both are divided by the noise of
+        `residuals_before`, so that sizes with and without the hypothesis can be compared.
     """
     noise = {
-        fitted_trial.trial.name: fitted_trial.noise_deviation for fitted_trial in before.trials
+        fitted_trial.trial.name: fitted_trial.noise_deviation
+        for fitted_trial in residuals_before.trials
     }
     windows_with_sizes = []
     for window in windows:
-        residuals = after if window.with_effect else before
+        residuals = residuals_after if window.with_effect else residuals_before
         (fitted_trial,) = (
             fitted_trial
             for fitted_trial in residuals.trials
             if fitted_trial.trial.name == window.trial
         )
-        inside = _used_in_window(window, fitted_trial)
-        if not inside.any():
+        is_in_window = _used_in_window(window, fitted_trial)
+        if not is_in_window.any():
             continue
-        rms_of_channels = _rms_by_channel(inside, fitted_trial, noise[window.trial])
+        rms_of_channels = _rms_by_channel(is_in_window, fitted_trial, noise[window.trial])
         largest = float(rms_of_channels.max())
         is_shown = (rms_of_channels > 0.0) & (rms_of_channels >= LEAST_RMS_SHARE * largest)
         channels = _select_channels(fitted_trial.trial.channels, is_shown)
@@ -228,20 +231,22 @@ def _used_in_window(window: GapWindow, fitted_trial: FittedTrial) -> BoolArray:
     return np.asarray(fitted_trial.used & ((time >= begin) & (time <= end))[:, None])
 
 
-def _rms_by_channel(inside: BoolArray, fitted_trial: FittedTrial, noise: FloatArray) -> FloatArray:
+def _rms_by_channel(
+    is_selected: BoolArray, fitted_trial: FittedTrial, noise: FloatArray
+) -> FloatArray:
     """Return the rms residual (C,) of each channel divided by its noise, over selected readings.
 
     Parameters
     ----------
-    inside : (N, C) array of bool
+    is_selected : (N, C) array of bool
         Whether each reading is selected.
     fitted_trial : FittedTrial
         The residuals of the trial.
     noise : (C,) array
         The standard deviation of the noise of each channel [unit of the channel].
     """
-    squares = np.where(inside, (fitted_trial.residual / noise) ** 2, 0.0).sum(axis=0)
-    return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
+    squares = np.where(is_selected, (fitted_trial.residual / noise) ** 2, 0.0).sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(is_selected.sum(axis=0), 1)))
 
 
 def _select_channels(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:

@@ -156,21 +156,21 @@ class FittedCandidates:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
-    def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
+    def fit_exactly(self, rough_fit: CandidateFit) -> CandidateFit:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
         If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
         has clearly more evidence.
         """
-        key = rough.candidate.key
+        key = rough_fit.candidate.key
         if key in self.wide_fits:
             return self.wide_fits[key]
         previous_fit = self.exact_fits.get(key)
         if (
             previous_fit is None
-            or previous_fit.log_evidence < rough.log_evidence - SEARCH.refit_gain
+            or previous_fit.log_evidence < rough_fit.log_evidence - SEARCH.refit_gain
         ):
-            exact = try_fit(self.problem, rough.candidate, rough.point)
+            exact_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
             # the rough fit may be at a point from which the model cannot be fitted further
-            self.record_fit(rough if exact is None else exact, exact=True)
+            self.record_fit(rough_fit if exact_fit is None else exact_fit, exact=True)
         return self.exact_fits[key]

@@ -426,7 +426,7 @@ def _fit_under_wide_noise(
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in fits]
     fits_with_scores.sort(key=lambda fit_and_score: fit_and_score[1], reverse=True)
     least_score = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
-    promising = [
+    promising_fits = [
         fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least_score
     ]
     # fit the model without effect, and the chosen hypotheses
@@ -434,7 +434,7 @@ def _fit_under_wide_noise(
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in report_each(
         search.on_progress,
-        promising,
+        promising_fits,
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
         _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))

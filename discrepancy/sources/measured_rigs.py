@@ -151,8 +151,8 @@ def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
             f"{file} holds no fall: its column z never stays below {LARGEST_FALLING_READING:g} "
             "m/s2."
         )
-    longest = int(np.argmax(ends - begins))
-    in_fall = slice(begins[longest], ends[longest])
+    longest_run = int(np.argmax(ends - begins))
+    in_fall = slice(begins[longest_run], ends[longest_run])
     time, acceleration = columns["time"][in_fall], columns["z"][in_fall]
     is_inside = (time >= time[0] + END_CUT) & (time <= time[-1] - END_CUT)
     return np.round(time[is_inside] - time[0], 9), acceleration[is_inside]

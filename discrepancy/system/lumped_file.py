@@ -335,11 +335,11 @@ class LumpedDescription(ModelDescription):
                     value for name, value in matrices.items() if name not in parameter.terms
                 ]
                 scales_some = scales_all or len(unscaled) < len(matrices)
-                remains = (
+                remains_nonzero = (
                     bool(unscaled) and not scales_all and _is_definite(np.sum(unscaled, axis=0))
                 )
                 yield (
-                    scales_some and not remains,
+                    scales_some and not remains_nonzero,
                     f"the parameter {parameter.name!r} has low = 0, which would leave no {kind} at "
                     "some unknown: give a low above 0",
                 )

@@ -84,8 +84,8 @@ class RecordedHistory:
         if self.hold is Hold.SMOOTH:
             # a load keeps its first and last value outside of the record; a motion goes on
             is_load = self.motion_order is None
-            inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
-            return np.asarray(self._spline(inside, derivative))
+            is_inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
+            return np.asarray(self._spline(is_inside, derivative))
         if self.hold is not Hold.ZERO_ORDER and derivative == 0:
             return np.asarray(np.interp(time, self.time, self.values))
         if derivative == 0:
@@ -126,8 +126,8 @@ class FormulaHistory:
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times; a formula is never differentiated."""
         spans = self.spans or ((-inf, inf),)
-        inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
-        return np.where(inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
+        is_inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
+        return np.where(is_inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
 
 
 def equivalent_ramps(

@@ -313,12 +313,12 @@ def _state_course(run: Run, index: int, now: int) -> Course:
     predicted_deviation = run["predicted/standard_deviation"][now]
     mean = factor.scale * np.vstack((past_mean, predicted_mean))[:, index]
     deviation = factor.scale * np.vstack((past_deviation, predicted_deviation))[:, index]
-    lowest = factor.levels[0]
-    highest = factor.levels[-1]
+    lowest_level = factor.levels[0]
+    highest_level = factor.levels[-1]
     return Course(
         mean=mean,
-        lower=np.clip(mean - 2.0 * deviation, lowest, highest),
-        upper=np.clip(mean + 2.0 * deviation, lowest, highest),
+        lower=np.clip(mean - 2.0 * deviation, lowest_level, highest_level),
+        upper=np.clip(mean + 2.0 * deviation, lowest_level, highest_level),
     )
 
 
@@ -334,13 +334,13 @@ def _draw_state(index: int, axes: Axes, run: Run, now: int) -> str:
     )
     truth = None if run.true_state is None else factor.scale * run.true_state[:, index]
     _draw_course(axes, run, now, _state_course(run, index, now), truth)
-    lowest = factor.levels[0]
-    highest = factor.levels[-1]
-    margin = 0.075 * (highest - lowest)
+    lowest_level = factor.levels[0]
+    highest_level = factor.levels[-1]
+    margin = 0.075 * (highest_level - lowest_level)
     if margin == 0.0:  # a factor with one level
         margin = 6.0
     axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
-    axes.set(ylim=(lowest - margin, highest + margin), ylabel=factor.label)
+    axes.set(ylim=(lowest_level - margin, highest_level + margin), ylabel=factor.label)
     return capital(factor.title)
 
 

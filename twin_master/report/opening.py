@@ -248,15 +248,15 @@ def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
     threshold = max(_LEAST_DEPARTURE, _DEVIATIONS_OF_CHANCE / np.sqrt(2.0 * count))
     coverage = f"{100.0 * check.overall_coverage:.0f} %"
     scatter = "The observations scatter about the twin's model"
-    within = f"{coverage} of them lie within their 95 % intervals"
+    within_clause = f"{coverage} of them lie within their 95 % intervals"
     if deviation > 1.0 + threshold:
         return (
-            f"{scatter} {deviation:.3g} times as far as it assumes: {within}; "
+            f"{scatter} {deviation:.3g} times as far as it assumes: {within_clause}; "
             "the noise is larger, or the model is off."
         )
     if deviation < 1.0 - threshold:
         return (
-            f"{scatter} {deviation:.2g} times as far as it assumes: {within}; "
+            f"{scatter} {deviation:.2g} times as far as it assumes: {within_clause}; "
             "its intervals are wider than they need be."
         )
     sensor = _sensor_with_low_coverage(check)
@@ -265,7 +265,10 @@ def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
             f"Of all observations {coverage} lie within their 95 % intervals, "
             f"but {100.0 * check.coverage[sensor]:.0f} % of those of {run.sensors.titles[sensor]}."
         )
-    return f"The twin's model explains the observations within the noise that it assumes: {within}."
+    return (
+        "The twin's model explains the observations within the noise that it assumes: "
+        f"{within_clause}."
+    )
 
 
 def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
@@ -275,11 +278,11 @@ def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
     binomial. The limit `_FALSE_ALARM` of its probability is divided by the number of
     sensors, because all sensors are tested (Bonferroni correction).
     """
-    within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
-    p_value = binom.cdf(within, np.maximum(check.count, 1), 0.95)
-    p_value = np.where(check.count > 0, p_value, 1.0)
-    sensor = int(np.argmin(p_value))
-    return sensor if p_value[sensor] < _FALSE_ALARM / len(p_value) else None
+    count_within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
+    p_values = binom.cdf(count_within, np.maximum(check.count, 1), 0.95)
+    p_values = np.where(check.count > 0, p_values, 1.0)
+    sensor = int(np.argmin(p_values))
+    return sensor if p_values[sensor] < _FALSE_ALARM / len(p_values) else None
 
 
 def _with_article(title: str) -> str:
