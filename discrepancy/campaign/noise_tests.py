@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
@@ -20,6 +21,8 @@ LAGS = 20
 """Largest number of autocorrelations in the Ljung-Box test."""
 LARGEST_LAG_SHARE = 0.25
 """Largest lag of an autocorrelation, as a fraction of the record."""
+LEAST_P_VALUE, LARGEST_P_VALUE = 1e-300, 1.0 - 1e-16
+"""Limits of a p-value whose logarithm or normal score is taken, so that these are finite."""
 LEAST_DRAWS = 8_000
 """Fewest series from which the distribution of the Ljung-Box statistic is taken."""
 
@@ -73,7 +76,7 @@ def pooled_variance_p_value(
         Degrees of freedom of each channel's noise record.
     """
     weights = np.sqrt(freedom / (1.0 + freedom / noise_freedom))
-    scores = stats.norm.isf(np.clip(p_values, 1e-300, 1.0 - 1e-16))
+    scores = stats.norm.isf(np.clip(p_values, LEAST_P_VALUE, LARGEST_P_VALUE))
     return float(stats.norm.sf(weights @ scores / np.sqrt(weights @ weights)))
 
 
@@ -178,7 +181,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
         lag_count = len(record_products)
         products[:lag_count] += record_products
         pair_counts[:lag_count] += len(record) - np.arange(lag_count)
-    rho = products[1:] / max(products[0], 1e-300)
+    rho = products[1:] / max(products[0], LEAST_DIVISOR)
     # for white noise: (number of pairs) sigma^4 over (sum of squares = n sigma^2)^2
     return rho, pair_counts[1:] / pair_counts[0] ** 2
 
@@ -321,7 +324,7 @@ def combine_p_values(p_values: Sequence[float]) -> float:
     Fisher's sum -2 sum log p detects many small departures, and Bonferroni's least p-value a single
     large one. The factor two allows for the choice between them.
     """
-    values = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1.0)
+    values = np.clip(np.asarray(p_values, dtype=float), LEAST_P_VALUE, 1.0)
     if values.size == 1:
         return float(values[0])
     fisher = float(stats.chi2.sf(-2.0 * np.log(values).sum(), 2 * values.size))

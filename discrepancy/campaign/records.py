@@ -60,7 +60,7 @@ class TrialKeys:
     name : str
         Name, unique in the campaign.
     kind : TrialKind
-        The kind of the trial.
+        The kind of the trial: what was done in it.
     file : str
         Name of its table; empty if it was not read from a file.
     run : str

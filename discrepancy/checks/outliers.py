@@ -18,6 +18,7 @@ from discrepancy.checks.local_polynomial import (
     weights_for_times,
 )
 from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, row_outlier
+from reporting.arrays import LEAST_DIVISOR
 
 LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
@@ -301,7 +302,7 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     is_wrong = np.zeros(len(residual), dtype=bool)
     for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
         scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
-        scale = max(scatter, noise, 1e-300)
+        scale = max(scatter, noise, LEAST_DIVISOR)
         is_wrong_at_end = exceeds_neighbours[end] & (
             np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale
         )
@@ -349,7 +350,7 @@ def _comparison_deviation(residual: FloatArray, least_deviation: float) -> Float
     It is that of the whole record or that of the samples around it, whichever is larger, and at
     least `least_deviation`.
     """
-    scatter_of_record = max(_robust_scatter(residual), least_deviation, 1e-300)
+    scatter_of_record = max(_robust_scatter(residual), least_deviation, LEAST_DIVISOR)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])
     if len(inner_magnitudes) <= 2 * _HALF_WINDOW:
         return np.full(len(residual), scatter_of_record)

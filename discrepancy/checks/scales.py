@@ -9,6 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from discrepancy.campaign.records import Campaign, Channel, FloatArray, Quantity, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.held import estimate_roughness
+from reporting.arrays import LEAST_DIVISOR
 
 CLEAR_NOISE_DEVIATIONS = 5.0
 """Least size of a clear reading, in standard deviations of the noise."""
@@ -328,5 +329,5 @@ def _misfit(
             np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(predicted_readings)), least_deviation
         )
     # bounded, so that readings of any size stay comparable
-    standardised = np.minimum(np.abs(residual / np.maximum(deviation, 1e-300)), 1e9)
+    standardised = np.minimum(np.abs(residual / np.maximum(deviation, LEAST_DIVISOR)), 1e9)
     return float(np.sum(standardised**2))

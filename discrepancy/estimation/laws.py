@@ -12,6 +12,7 @@ from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.laws.speed import POSITION_EXPONENT, steady_force
+from reporting.arrays import LEAST_DIVISOR
 
 WINDOW_NODES = 8
 """Number of speeds in the window over which a law of the speed is averaged."""
@@ -137,8 +138,8 @@ def force_and_tangents(
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     force, by_position, by_speed = np.zeros((3, len(time)))
-    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
-    rms_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
+    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), LEAST_DIVISOR)
+    rms_position = max(float(np.sqrt(np.mean(positions**2))), LEAST_DIVISOR)
     _compiled_fill()(
         LAWS.index(type(law)),
         type(law).depends_on_speed,

@@ -41,6 +41,15 @@ LARGEST_DAMPING = 1.0
 convergence."""
 HOPELESS_DAMPING = 1e6
 """Damping beyond which a fit ends without convergence."""
+MOST_FIT_STEPS = 60
+"""Largest number of steps of a fit, unless its caller states another number."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-9
+"""Damping of the first step, and the least damping of any step."""
+LEAST_RAISED_DAMPING = 1e-4
+"""Least damping after a step that did not lower the objective."""
+GOOD_DECREASE, OUTDATED_DECREASE = 0.5, 0.7
+"""Decrease of the objective over the predicted decrease: above the first the damping is reduced
+more, and below the second the reused derivatives are outdated."""
 STEP_FRACTIONS = (1.0, 0.3)
 """Fractions of a step that are tried before the damping is increased."""
 
@@ -109,7 +118,7 @@ def fit(
     start: Point,
     *,
     nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
-    iterations: int = 60,
+    iterations: int = MOST_FIT_STEPS,
     local_only: bool = False,
     objective_limit: float | None = None,
 ) -> CandidateFit:
@@ -142,7 +151,7 @@ def fit(
         singular.
     """
     descent = _Descent(problem, candidate, local_only)
-    damping = 1e-3
+    damping = FIRST_DAMPING
     state = descent.state_at(_within_bounds(problem, start), nearby_derivatives)
     if not np.isfinite(state.objective):
         names = comma_list(candidate.identifiers) if candidate.terms else "no effect"
@@ -160,13 +169,14 @@ def fit(
         if next_state is not None:
             decrease = state.objective - next_state.objective
             # less damping for the next step, the more so the better the predicted decrease was
-            reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
-            damping = max(damping * reduction, 1e-9)
+            reduction = 0.1 if decrease > GOOD_DECREASE * predicted_decrease else 0.5
+            damping = max(damping * reduction, LEAST_DAMPING)
             state = next_state
             # a decrease well below the predicted one shows that the derivatives are outdated
-            has_current_derivatives = decrease < 0.7 * predicted_decrease
-            if has_current_derivatives:
+            is_outdated = decrease < OUTDATED_DECREASE * predicted_decrease
+            if is_outdated:
                 state = descent.state_at(state.point)
+            has_current_derivatives = is_outdated
             # the further decrease is taken to be at most twice the one predicted for this step
             is_near_newton = damping < NEWTON_DAMPING
             expected_end = state.objective - 2.0 * predicted_decrease
@@ -180,7 +190,7 @@ def fit(
             converged = damping < LARGEST_DAMPING
             break
         else:
-            damping = max(10.0 * damping, 1e-4)
+            damping = max(10.0 * damping, LEAST_RAISED_DAMPING)
             if damping > HOPELESS_DAMPING:
                 break
     if not has_current_derivatives:
@@ -194,7 +204,7 @@ def try_fit(
     start: Point,
     *,
     nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
-    iterations: int = 60,
+    iterations: int = MOST_FIT_STEPS,
     local_only: bool = False,
     objective_limit: float | None = None,
 ) -> CandidateFit | None:
@@ -219,9 +229,9 @@ def try_fit(
 
 @np.errstate(over="ignore", invalid="ignore")  # a motion that overflows has no probability
 def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
-    """Return the negative log posterior of a candidate at a point, up to a constant [nat].
+    """Return the negative log posterior of a candidate at a point [nat].
 
-    The constant is the same for all candidates.
+    A constant is left out, which is the same for all candidates.
 
     Raises
     ------
@@ -274,8 +284,8 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
     sums = problem.squares_by_channel(residuals)
     minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
     minus_log_prior += 0.5 * float(point.effect @ point.effect)
-    for data, u in zip(problem.trials, point.local, strict=True):
-        minus_log_prior += 0.5 * float(data.unknowns.precision @ u**2)
+    for data, scaled_values in zip(problem.trials, point.local, strict=True):
+        minus_log_prior += 0.5 * float(data.unknowns.precision @ scaled_values**2)
     negative_log_posterior = problem.misfit(sums) + minus_log_prior
     if not np.isfinite(negative_log_posterior):
         negative_log_posterior = np.inf
@@ -470,7 +480,10 @@ def _move_point(
     """Return the point after a fraction of a step, clipped to the ranges of the unknowns."""
     stepped_point = Point(
         shared=point.shared + fraction * step.shared,
-        local=tuple(u + fraction * du for u, du in zip(point.local, step.local, strict=True)),
+        local=tuple(
+            values + fraction * change
+            for values, change in zip(point.local, step.local, strict=True)
+        ),
         effect=candidate.add_step(point.effect, fraction * step.effect),
     )
     return _within_bounds(problem, stepped_point)

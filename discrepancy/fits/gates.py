@@ -152,13 +152,13 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         tests.append(NamedTest("gains beside their priors", p_value))
     for term, values in fit.candidate.split_by_term(fit.effect):
         # the values of free shape parameters follow those of the effect, and are not tested
-        for parameter, u in zip(term.effect.parameters, values.tolist(), strict=False):
+        for parameter, scaled_value in zip(term.effect.parameters, values.tolist(), strict=False):
             # the ends of a uniform prior are as probable as its middle
             is_uniform = parameter.prior.shape == "uniform"
             if parameter.magnitude or is_uniform:
                 continue
             name = f"{parameter.name} of {term.effect.identifier} beside its prior"
-            tests.append(NamedTest(name, float(chi2.sf(u**2, 1))))
+            tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1))))
     return tests
 
 

@@ -109,14 +109,19 @@ class SharedUnknowns:
         scaled_ends[:, uncertain] = (physical_ends[:, uncertain] - centre) / self.scale[uncertain]
         return scaled_ends
 
-    def parameters(self, u: FloatArray) -> FloatArray:
-        """Return the calibrated parameters (P,) within their ranges, given scaled values u (Q,)."""
-        return np.clip((self.centre + self.scale * u)[: self.parameter_count], self.low, self.high)
+    def parameters(self, scaled_values: FloatArray) -> FloatArray:
+        """Return the calibrated parameters (P,), given the scaled shared unknowns (Q,).
 
-    def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
-        """Return the gain errors (C,) of channels, given the scaled variables u (Q,)."""
-        values = (self.centre + self.scale * u)[self.parameter_count :]
-        gains = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
+        Parameters beyond their ranges are clipped.
+        """
+        values = self.centre + self.scale * scaled_values
+        return np.clip(values[: self.parameter_count], self.low, self.high)
+
+    def gains(self, scaled_values: FloatArray, channels: tuple[str, ...]) -> FloatArray:
+        """Return the gain errors (C,) of channels, given the scaled shared unknowns (Q,)."""
+        values = self.centre + self.scale * scaled_values
+        fitted_gains = values[self.parameter_count :]
+        gains = self.fixed_gain | dict(zip(self.gain_channels, fitted_gains, strict=True))
         return np.array([gains.get(name, 0.0) for name in channels])
 
 
@@ -176,14 +181,16 @@ class LocalUnknowns:
         )
         return list(accumulate(counts))
 
-    def channel_zeros(self, u: FloatArray, channel_count: int) -> FloatArray:
-        """Return the zeros (C,) of the trial's channels, given the scaled variables u (L,)."""
-        values = np.zeros(channel_count)
-        values[self.zero_columns] = (self.scale * u)[: self.zero_count]
-        return values
+    def channel_zeros(self, scaled_values: FloatArray, channel_count: int) -> FloatArray:
+        """Return the zeros (C,) of the trial's channels, given its scaled unknowns (L,)."""
+        zeros = np.zeros(channel_count)
+        zeros[self.zero_columns] = (self.scale * scaled_values)[: self.zero_count]
+        return zeros
 
-    def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
-        """Return the conditions for which the model is evaluated: initial state, health and inputs.
+    def conditions(
+        self, trial: Trial, parameters: FloatArray, scaled_values: FloatArray
+    ) -> Conditions:
+        """Return the conditions of a trial for the model: initial state, health and inputs.
 
         Parameters
         ----------
@@ -191,11 +198,11 @@ class LocalUnknowns:
             The trial with its readings, inputs and sample times.
         parameters : (P,) array
             The calibrated parameters.
-        u : (L,) array
-            The scaled variables of the trial.
+        scaled_values : (L,) array
+            The scaled values of the L unknowns of the trial.
         """
         _, initial_entries, input_constants, time_zero, loss_changes = np.split(
-            self.scale * u, self.ends_by_kind
+            self.scale * scaled_values, self.ends_by_kind
         )
         rows, width = self.initial_shape
         initial_states = np.zeros((rows, 2))

@@ -230,7 +230,10 @@ def _reduce_dimensions(
     mean_of_hypotheses = np.average(means, axis=0, weights=weights)
     directions = np.concatenate((np.stack(means) - mean_of_hypotheses, *factors))
     _, singular_values, basis = np.linalg.svd(check_finite(directions), full_matrices=False)
-    basis = basis[singular_values > LEAST_SINGULAR_VALUE * max(singular_values[0], 1e-300)]
+    # no direction is left if all hypotheses predict the same, with singular values of zero
+    largest_singular_value = singular_values[0]
+    differ_along = singular_values > LEAST_SINGULAR_VALUE * largest_singular_value
+    basis = basis[differ_along & (singular_values > 0.0)]
     # the rows of the basis are orthonormal, so the noise keeps its unit covariance
     gaussians = []
     for mean, factor in zip(means, factors, strict=True):

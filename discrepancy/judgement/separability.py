@@ -25,6 +25,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
+from reporting.arrays import LEAST_DIVISOR
 
 CONFUSION_DISTANCE = 9.0
 """Squared distance below which two effects form a confusion group [sigma^2]."""
@@ -424,7 +425,7 @@ def _squared_distance(
     # added because changes by several parameters may be nearly parallel
     spanning_changes = np.stack(changes)
     gram = (spanning_changes * sign) @ spanning_changes.T
-    lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    lengths = np.sqrt(np.maximum(np.diag(gram), LEAST_DIVISOR))
     gram = gram / np.outer(lengths, lengths) + 1e-6 * np.eye(len(gram))
     overlaps = (spanning_changes * sign) @ target.vector / lengths
     explained_squares = float(overlaps @ np.linalg.solve(gram, overlaps))

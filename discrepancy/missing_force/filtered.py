@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 from .backward import smoother_corrections
 from .kalman import RecordFilter, discretise, filter_forward
@@ -142,7 +143,7 @@ class ForceFilter:
             np.abs(system.actions[port]).max(initial=0.0) * process.standard_deviation
             for port, process in self.processes
         ]
-        largest_acceleration = max([*accelerations, 1e-300])  # not zero, as it divides
+        largest_acceleration = max([*accelerations, LEAST_DIVISOR])
         units = np.full(state_count, largest_acceleration / highest_frequency)
         # The system does not say which states are positions. An even number of states is taken for
         # positions and then as many speeds, an odd number for speeds alone.

@@ -23,6 +23,7 @@ from discrepancy.fits.candidate import (
     with_step,
 )
 from discrepancy.fits.fitting import LARGEST_EFFECT
+from reporting.arrays import LEAST_DIVISOR
 
 from .at_ports import MissingForces
 from .explained import ForceHypothesis, fit_missing_forces
@@ -534,9 +535,9 @@ class ForceSearch(MissingForces):
 
 
 def _rms(series: Iterable[FloatArray]) -> float:
-    """Return the root mean square of several arrays together, at least 1e-300."""
+    """Return the root mean square of several arrays together, at least `LEAST_DIVISOR`."""
     values = np.concatenate([np.ravel(entries) for entries in series])
-    return max(float(np.sqrt(np.mean(values**2))), 1e-300)
+    return max(float(np.sqrt(np.mean(values**2))), LEAST_DIVISOR)
 
 
 def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:

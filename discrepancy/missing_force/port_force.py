@@ -11,6 +11,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
+from reporting.arrays import LEAST_DIVISOR
 
 from .explained import ForceHypothesis
 from .gap_share import GapShare
@@ -55,7 +56,7 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
     ]
     # each bin has its own mean, which takes one degree of freedom
     variance_within = sum(squares_by_bin) / (count - bin_count)
-    variance = max(float(np.var(force, ddof=1)), 1e-300)
+    variance = max(float(np.var(force, ddof=1)), LEAST_DIVISOR)
     return max(1.0 - variance_within / variance, 0.0)
 
 
@@ -78,8 +79,8 @@ def ordering_variables(
         one.
     """
     # unit standard deviations, so that position and speed of a harmonic motion form a circle
-    scaled_position = position / max(float(np.std(position)), 1e-300)
-    scaled_speed = speed / max(float(np.std(speed)), 1e-300)
+    scaled_position = position / max(float(np.std(position)), LEAST_DIVISOR)
+    scaled_speed = speed / max(float(np.std(speed)), LEAST_DIVISOR)
     # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {

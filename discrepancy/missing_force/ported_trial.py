@@ -16,6 +16,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import shift_clock_to_first_sample
 from fe.runtime.patch import ModelPatch
+from reporting.arrays import LEAST_DIVISOR
 
 from .trial import ColouredNoise, GainUnknown, PortedTrial
 
@@ -148,10 +149,10 @@ def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
     # for a sine, the rms rate of the speed over the rms speed is its angular frequency
     rms_change = np.sqrt(np.mean(np.diff(trial.port_speeds, axis=0) ** 2, axis=0)) * trial.substeps
     rms_speed = np.sqrt(np.mean(trial.port_speeds**2, axis=0))
-    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, 1e-300), initial=0.0))
+    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, LEAST_DIVISOR), initial=0.0))
     # a thinned trial has at least `FEWEST_SUBSTEPS`
     largest_phase = LARGEST_SUBSTEP_PHASE * max(trial.substeps, FEWEST_SUBSTEPS)
-    longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, 1e-300)
+    longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, LEAST_DIVISOR)
     stride = int(min(wanted_stride, longest_stride, len(trial.time) / FEWEST_SAMPLES))
     # the substeps of a thinned trial end at fine stamps of the trial
     multiple = FEWEST_SUBSTEPS // trial.substeps if trial.substeps < FEWEST_SUBSTEPS else 1
@@ -324,8 +325,8 @@ def _ported_system(
     unknowns = problem.shared
     outputs = problem.campaign.outputs(trial)
 
-    def system(u: FloatArray) -> PortedSystem:
-        return problem.model.ported_system(trial, outputs, unknowns.parameters(u))
+    def system(shared_at: FloatArray) -> PortedSystem:
+        return problem.model.ported_system(trial, outputs, unknowns.parameters(shared_at))
 
     derivatives: list[PortedSystem | None] = []
     for k in range(unknowns.parameter_count):

@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 from .filtered import Process
 
@@ -234,7 +235,7 @@ class ProcessSearch:
         # magnitudes of the eigenvalues: the step leads uphill where the value is convex, too
         step = np.zeros(logs.size)
         step[free_axes] = eigenvectors @ (
-            eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), 1e-300)
+            eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), LEAST_DIVISOR)
         )
         length_ratio = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
         return np.asarray(step.reshape(logs.shape) / length_ratio)

@@ -21,7 +21,7 @@ import numpy as np
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import CandidateKey, ResidualProcess
-from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.fitting import MOST_FIT_STEPS, CandidateFit, try_fit
 from discrepancy.fits.gates import ResidualRecord, residual_records, whiteness_p_value
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
@@ -315,7 +315,7 @@ def with_wide_noise(problem: Problem, process: ResidualProcess) -> Problem:
 
 
 def refit_under_wide_noise(
-    problem: Problem, wide_problem: Problem, fit: CandidateFit, *, iterations: int = 60
+    problem: Problem, wide_problem: Problem, fit: CandidateFit, *, iterations: int = MOST_FIT_STEPS
 ) -> CandidateFit | None:
     """Return the fit of a hypothesis under a wider noise.
 
