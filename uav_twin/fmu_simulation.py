@@ -290,7 +290,7 @@ def _write_and_print_history(
     file : Path
         The file of the FMU.
     out, plot : Path or None
-        Files for the history and for its picture.
+        The files for the history and for its picture.
     """
     from fmu_asset.client.history_files import write_history
     from reporting.files import hash_file

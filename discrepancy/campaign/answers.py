@@ -22,14 +22,15 @@ class Questionnaire:
     Parameters
     ----------
     answers : mapping
-        Answers by option and subject; the subject is a column, a file, or empty for all of them.
+        The answers by option and subject; the subject is a column, a file, or empty for all of
+        them.
 
     Attributes
     ----------
     questions : dict of (str, str) to list of str
-        Subjects of open questions, by option and what it expects.
+        The subjects of open questions, by option and what it expects.
     assumptions : dict of (str, str) to dict of str to str
-        Default answers that were used, by subject, by option and what it expects.
+        The default answers that were used, by subject, by option and what it expects.
     """
 
     def __init__(self, answers: Answers) -> None:
@@ -110,11 +111,11 @@ def check_subjects(answers: Answers, heads: Collection[str], files: Collection[s
     Parameters
     ----------
     answers : mapping
-        Answers by option and subject.
+        The answers by option and subject.
     heads : collection of str
-        Heads of all columns, in order.
+        The heads of all columns, in order.
     files : collection of str
-        Names of all files, in order.
+        The names of all files, in order.
 
     Raises
     ------

@@ -119,12 +119,12 @@ def seconds_of_clock_times(
     columns : sequence of tuple of str
         Cells (N,) of each column.
     places : sequence of str
-        File and line of each row, for messages.
+        The file and line of each row, for messages.
 
     Returns
     -------
     dict of int to tuple of str
-        Cells of the columns of clock times, by the number of the column.
+        The cells of the columns of clock times, by the number of the column.
     """
     seconds_of_columns: dict[int, dict[int, Decimal]] = {}
     starts: dict[bool, Decimal] = {}  # first time of columns with, and without, a date
@@ -185,9 +185,9 @@ def decimal_mark(
     columns : sequence of sequence of str
         Cells (N,) of each column.
     lines : sequence of int
-        Line of the file for each row.
+        The line of the file for each row.
     place : str
-        Name of the file and what its rows are called, for messages.
+        The name of the file and what its rows are called, for messages.
     separator : str
         The character between two cells.
 

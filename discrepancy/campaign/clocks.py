@@ -34,9 +34,9 @@ class MergedTable(NamedTuple):
     cells : dict of str to tuple of str
         Cells (N,) of each column by its title.
     lines : tuple of int
-        Line of the file for each row.
+        The line of the file for each row.
     sentence : str
-        Remark on how the clocks were merged.
+        The remark on how the clocks were merged.
     """
 
     cells: dict[str, tuple[str, ...]]
@@ -75,11 +75,11 @@ def merge_clocks(
     clocks : sequence of TableClock
         One clock or more, of one table.
     kind : str
-        Kind of its trial, or `NOISE`.
+        The kind of its trial, or `NOISE`.
     decimal : str
-        Decimal mark of its numbers.
+        The decimal mark of its numbers.
     holds : mapping of str to str or None
-        Course of a load between its samples, by the head of its column; None means linear.
+        The course of a load between its samples, by the head of its column; None means linear.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
     filled_loads : sequence of str
         Loads that were filled in between their samples, and how.
     outside : int
-        Number of stamps before or after the records of these loads.
+        The number of stamps before or after the records of these loads.
     """
     remark = ""
     if filled_loads:
@@ -195,13 +195,13 @@ def _place_cells(
     Parameters
     ----------
     cells : sequence of str
-        Cells of a column of the table.
+        The cells of a column of the table.
     rows : sequence of int
         Rows of the table whose cells are taken.
     positions : sequence of int
-        Position of each of them in the result.
+        The position of each of them in the result.
     count : int
-        Number of cells of the result.
+        The number of cells of the result.
     """
     result = [""] * count
     for position, row in zip(positions, rows, strict=True):
@@ -373,9 +373,9 @@ def _fill_between_samples(
     seconds : (N,) ndarray
         Times of all cells [s].
     positions : sequence of int
-        Indices of the load's own samples among the cells.
+        The indices of the load's own samples among the cells.
     hold : Hold
-        Course between the samples, by which the load is interpolated.
+        The course between the samples, by which the load is interpolated.
     """
     if len(positions) < 2 or not all(cells[position] for position in positions):
         return

@@ -46,15 +46,15 @@ class LaboratoryColumn:
         `LEFT_OUT`, a column that every table may have such as "time" or "force", `INPUT` with the
         name of an input, or the name of the model's output that a channel measures.
     unit : str
-        Unit of its cells, as the file or the user states it.
+        The unit of its cells, as the file or the user states it.
     si : str
-        Unit of its values in SI.
+        The unit of its values in SI.
     quantity : Quantity or None
-        Quantity of a channel or an input.
+        The quantity of a channel or an input.
     to_si : float or None
-        Factor from its cells to SI, which includes the option `--scale`.
+        The factor from its cells to SI, which includes the option `--scale`.
     read_in : str
-        Unit of its readings after `--scale`; equal to `unit` without a scale.
+        The unit of its readings after `--scale`; equal to `unit` without a scale.
     """
 
     sheet: Sheet
@@ -82,7 +82,7 @@ class LaboratoryColumn:
         Parameters
         ----------
         decimal : str
-            Decimal mark of the file, or an empty text.
+            The decimal mark of the file, or an empty text.
         """
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
@@ -114,9 +114,9 @@ def role_by_unit(
     head : str
         The name of the column as printed at its head.
     heads, units : sequence of str
-        Names and units of all columns of the table; a unit is empty if it is not known.
+        The names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        Roles that a unit may determine. It lacks "force" for trials that do not read a column
+        The roles that a unit may determine. It lacks "force" for trials that do not read a column
         `force`, in which a column in newtons may be a channel.
     """
     if head in time_heads(heads, units):
@@ -134,16 +134,16 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     head : str
         The name of the column as printed at its head.
     unit : str
-        Unit of its cells; empty if the file does not state it.
+        The unit of its cells; empty if the file does not state it.
     scale : str
         The option, such as `200 N/V`; `200 N` is for cells without a unit, and `-1` keeps the unit.
 
     Returns
     -------
     cell_unit, reading_unit : str
-        Units of the cells and of the readings.
+        The units of the cells and of the readings.
     factor : float
-        Factor from cells to readings.
+        The factor from cells to readings.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
         The value of the option: a standard deviation such as `0.1mm`, a percentage of the largest
         reading such as `1%`, `exact` (there is no offset) or `free` (nothing is known of it).
     largest : float
-        Largest reading of the column [SI].
+        The largest reading of the column [SI].
 
     Returns
     -------
@@ -330,7 +330,7 @@ def units_of_columns(
     columns : iterable of LaboratoryColumn
         The columns of all tables.
     kinds : mapping of str to str
-        Kind of each table's trial, by the name of the table.
+        The kind of each table's trial, by the name of the table.
     """
     units: dict[str, str] = {}
     for column in columns:
@@ -353,7 +353,7 @@ def origin_remark(
     sheet : Sheet
         The table.
     columns : sequence of LaboratoryColumn
-        Its columns that are not left out.
+        The columns of the table that are not left out.
     scales : mapping of str to str
         Values of the option `--scale` of the import, by the head of the column they apply to.
     """

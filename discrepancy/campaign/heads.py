@@ -24,7 +24,7 @@ def split_head(text: str, unit: str) -> tuple[str, str]:
     text : str
         The text at the head of the column.
     unit : str
-        Unit from a row of units below the heads, which comes first; empty if there is none.
+        The unit from a row of units below the heads, which comes first; empty if there is none.
     """
     match = _HEAD.fullmatch(text[:_LONGEST_HEAD])
     if match is None:

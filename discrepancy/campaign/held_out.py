@@ -87,7 +87,7 @@ def _choose_trials(
     campaign : Campaign
         The campaign with all of its trials.
     held_out_before : set of str
-        Names of the trials of other kinds that are held out already.
+        The names of the trials of other kinds that are held out already.
     """
     if len(trials) < LEAST_TRIALS:
         return set()
@@ -141,7 +141,7 @@ def _stays_covered(
     other_trials : sequence of Trial
         The other trials of its kind that are fitted.
     of_other_kinds : sequence of Trial
-        Fitted trials of other kinds, which cover the run only.
+        The fitted trials of other kinds, which cover the run only.
     """
     channels = {name for trial in other_trials for name in trial.channels}
     if not channels.issuperset(candidate.channels):
@@ -165,7 +165,7 @@ def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | Non
     trial : Trial
         A static or flight trial.
     names : set of str
-        Names of the existing trials, which the new held-out trial must not have.
+        The names of the existing trials, which the new held-out trial must not have.
 
     Returns
     -------

@@ -50,8 +50,8 @@ class LaboratoryImport:
     sheets : sequence of Sheet
         The tables of all files.
     answers : mapping
-        Answers of the user, by option (`OF_COLUMNS`, `OF_FILES`, "reference-temperature") and by
-        the column or file that they are about.
+        The answers of the user, by option (`OF_COLUMNS`, `OF_FILES`, "reference-temperature") and
+        by the column or file that they are about.
     quantity_of : callable, optional
         Returns the quantity of a model's output. Without it any name can be that of an output.
 
@@ -127,9 +127,9 @@ class LaboratoryImport:
         Parameters
         ----------
         option : str
-            Option that is answered, without dashes.
+            The option that is answered, without dashes.
         subject : str
-            Column or file that the answer is about.
+            The column or file that the answer is about.
         answer : str
             The answer that the user gave.
         """

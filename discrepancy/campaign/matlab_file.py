@@ -28,7 +28,7 @@ class MatlabTable(NamedTuple):
     Attributes
     ----------
     heads : tuple of str
-        Names of its C columns.
+        The names of its C columns.
     columns : tuple of tuple of str
         The cells of C columns with N rows each.
     remark : str

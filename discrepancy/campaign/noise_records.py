@@ -30,7 +30,7 @@ def pre_trigger_record(
         Sampling interval [s]; None if the samples are not evenly spaced, so that their correlation
         in time is not known.
     name, source : str
-        Name of the channel, and of the file, for messages.
+        The name of the channel, and of the file, for messages.
 
     Raises
     ------

@@ -38,11 +38,11 @@ def variance_p_value(
     Parameters
     ----------
     mean_square : float
-        Mean square of residuals over the variance of the noise [1].
+        The mean square of residuals over the variance of the noise [1].
     freedom : float
-        Degrees of freedom of the residuals.
+        The degrees of freedom of the residuals.
     noise_freedom : float
-        Degrees of freedom of the noise record; infinite if its variance is exact.
+        The degrees of freedom of the noise record; infinite if its variance is exact.
     small : bool
         True for the probability of a smaller mean square; by default it is that of a larger one.
     """
@@ -71,9 +71,9 @@ def pooled_variance_p_value(
     p_values : (C,) ndarray
         p-value of each channel, from `variance_p_value`.
     freedom : (C,) ndarray
-        Degrees of freedom of each channel's residuals.
+        The degrees of freedom of each channel's residuals.
     noise_freedom : (C,) ndarray
-        Degrees of freedom of each channel's noise record.
+        The degrees of freedom of each channel's noise record.
     """
     weights = np.sqrt(freedom / (1.0 + freedom / noise_freedom))
     scores = stats.norm.isf(np.clip(p_values, LEAST_P_VALUE, LARGEST_P_VALUE))
@@ -88,7 +88,7 @@ class SeriesTest(NamedTuple):
     statistic : float
         The statistic of the test.
     p_value : float
-        Probability of a larger statistic if the series is white.
+        The probability of a larger statistic if the series is white.
     """
 
     statistic: float
@@ -170,7 +170,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     rho : (K,) ndarray
         Autocorrelation at lags 1 .. K, with K a quarter of the longest record.
     chance : (K,) ndarray
-        Variance of `rho` if the records are white.
+        The variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
     lags = max(int(LARGEST_LAG_SHARE * longest), 2)
@@ -198,9 +198,9 @@ def statistical_inefficiency(
     Parameters
     ----------
     rho, white_variance : (K,) ndarray
-        Autocorrelation and its variance for white noise, from `autocorrelation`.
+        The autocorrelation and its variance for white noise, from `autocorrelation`.
     ratio : float
-        Factor on the autocorrelation `rho`, if the correlation of the samples in question is
+        The factor on the autocorrelation `rho`, if the correlation of the samples in question is
         weaker or stronger than that of the whole series.
 
     Returns
@@ -222,9 +222,9 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
     rows : (M, N) ndarray
         Series; samples that are left out are zero.
     count : int
-        Number of samples that are used.
+        The number of samples that are used.
     pairs : (lags,) ndarray
-        Number of pairs of them at each lag.
+        The number of pairs of them at each lag.
     """
     products = lag_products(rows, len(pairs))
     rho = products[:, 1:] / products[:, :1]
@@ -240,9 +240,9 @@ def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
     Parameters
     ----------
     count : int
-        Number n of samples of the series.
+        The number n of samples of the series.
     lags : int
-        Number of lags in the statistic.
+        The number of lags in the statistic.
     """
     generator = np.random.default_rng(20260101)
     draws_at_once = max(20, 400_000 // count)
@@ -292,9 +292,9 @@ class LineTest(NamedTuple):
     statistic : float
         Fisher's g: the largest ordinate of the periodogram over the sum of all.
     p_value : float
-        Probability of a larger g for white noise.
+        The probability of a larger g for white noise.
     frequency_index : int
-        Index j of the largest ordinate; the frequency is j / n per sample.
+        The index j of the largest ordinate; the frequency is j / n per sample.
     """
 
     statistic: float

@@ -39,7 +39,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     Parameters
     ----------
     folder : path
-        Folder with `campaign.toml` and the tables that it names.
+        The folder with `campaign.toml` and the tables that it names.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def assemble_campaign(
     section : CampaignSection
         The content of `campaign.toml`.
     tables : mapping of str to TextTable
-        Tables by the names that the description has for them.
+        The tables by the names that the description has for them.
     data_hash : str
         SHA-256 of all that was read.
 
@@ -166,11 +166,12 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Parameters
     ----------
     events : iterable of Event
-        Events of a file. An event without trials happened in all trials that are records in time.
+        The events of a file. An event without trials happened in all trials that are records in
+        time.
     trials : tuple of Trial
         The trials of the campaign.
     source : str
-        Name of the file, for messages.
+        The name of the file, for messages.
 
     Raises
     ------
@@ -290,7 +291,7 @@ def _read_channels(
     trials : tuple of Trial
         The trials, among which repeats are searched.
     remarks : list of str
-        Remarks of the reader, to which that on noise from repeats is added.
+        The remarks of the reader, to which that on noise from repeats is added.
     """
     samples_at_rest = _samples_at_rest(section, tables)
     channels = {}

@@ -40,7 +40,8 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     cells : sequence of str
         The same times as printed in the file.
     user, file : str
-        Name of the trial or record that the times belong to, and name of the file, for messages.
+        The name of the trial or record that the times belong to, and name of the file, for
+        messages.
 
     Returns
     -------
@@ -71,11 +72,11 @@ def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: 
     Parameters
     ----------
     file, user : str
-        Name of the file, and name of the trial or record that the times belong to.
+        The name of the file, and name of the trial or record that the times belong to.
     cells : sequence of str
         The times as printed in the file [s].
     index : int
-        Index of the time that the next one does not exceed.
+        The index of the time that the next one does not exceed.
     """
     return (
         f"{file}: the time of {user} does not increase after sample {index + 1} "
@@ -209,7 +210,7 @@ def least_beyond_rounding(differences: FloatArray) -> float:
     Parameters
     ----------
     differences : (M,) ndarray
-        Differences between readings, of any sign.
+        The differences between readings, of any sign.
 
     Returns
     -------

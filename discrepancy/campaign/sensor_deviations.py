@@ -33,14 +33,14 @@ class SensorDeviations:
     kinds : mapping of str to str
         The kind of trial of each file, by the name of the file.
     decimals : mapping of str to str
-        Decimal mark of each file.
+        The decimal mark of each file.
 
     Attributes
     ----------
     zeros : dict of str to (float or str)
-        Standard deviation of the zero of each channel and input [SI], or "free", by head.
+        The standard deviation of the zero of each channel and input [SI], or "free", by head.
     gains : dict of str to (float or str)
-        Relative standard deviation of the gain of each channel, or "free", by head.
+        The relative standard deviation of the gain of each channel, or "free", by head.
     """
 
     def __init__(

@@ -56,11 +56,11 @@ def _rows_of_longer_clocks(
     rows : list of (int, list of str)
         The rows below the table: the number of the line, and its cells.
     first_index : int
-        Index of the first of them.
+        The index of the first of them.
     head, units : sequence of str
-        Heads and units of the table.
+        The heads and units of the table.
     places_of_values : sequence of set of int
-        Indices of the cells with numbers or times in each row of the file.
+        The indices of the cells with numbers or times in each row of the file.
     """
     names = []
     units_of_names = []
@@ -94,7 +94,7 @@ class TableLayout(NamedTuple):
     body : list of (int, list of str)
         Rows of numbers, with their line.
     remark : str
-        Remark on the rows below it that are left out.
+        The remark on the rows below it that are left out.
     """
 
     head: list[str]
@@ -115,9 +115,9 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     rows : list of (int, list of str)
         Rows of the file that are not empty.
     name : str
-        Name of the file, for messages.
+        The name of the file, for messages.
     place : str
-        Start of the place of a row, for messages, before its number.
+        The start of the place of a row, for messages, before its number.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def _head_and_units(rows: Rows, first_row: int) -> tuple[list[str], list[str]]:
     rows : list of (int, list of str)
         The rows of the file: the number of the line, and its cells.
     first_row : int
-        Index of the first row of numbers.
+        The index of the first row of numbers.
     """
     row_above = rows[first_row - 1][1]
     row_two_above = rows[first_row - 2][1] if first_row > 1 else []

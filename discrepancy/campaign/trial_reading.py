@@ -50,7 +50,7 @@ def read_trial(
     campaign : CampaignSection
         The whole content of `campaign.toml`.
     remarks : list of str
-        Remarks of the reader; those on this trial are added.
+        The remarks of the reader; those on this trial are added.
     """
     user = f"the trial {section.name!r}"
     time, start = _read_times(section, table, campaign, user)
@@ -214,11 +214,11 @@ def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArra
     Parameters
     ----------
     table : TextTable
-        Table of a static or flight trial.
+        The table of a static or flight trial.
     loads : sequence of str
-        Its columns of loads; a branch ends if any of them changes direction.
+        The columns of loads in the table; a branch ends if one of them changes direction.
     user : str
-        Name of the trial, for messages.
+        The name of the trial, for messages.
     """
     begins_branch = np.zeros(len(table), dtype=np.int64)
     for column in loads:

@@ -39,9 +39,9 @@ class _FileUnits:
     Attributes
     ----------
     units : mapping of str to str
-        Units of channels, inputs and `force` by name.
+        The units of channels, inputs and `force` by name.
     digits : int
-        Significant digits of values in these units.
+        The significant digits of values in these units.
     left_out_as_empty : bool
         True if readings that are left out become empty cells.
     """
@@ -58,9 +58,9 @@ class _FileUnits:
         values : (N,) ndarray
             The values to convert [SI].
         name : str
-            Name of the channel or input.
+            The name of the channel or input.
         to_si : float
-            Factor from its unit to SI.
+            The factor from its unit to SI.
         """
         in_unit = values / to_si
         if self.digits == _EXACT_DIGITS or name not in self.units:
@@ -95,12 +95,13 @@ def write_campaign(
     folder : path
         The folder, made if it is missing; files of the same names are replaced.
     si : bool
-        Write strain and displacement in SI, too.
+        Whether strain and displacement are written in SI, too.
     units : mapping of str to str, optional
         Other units of channels and inputs by name, and of the force of static and forced trials by
         "force"; their values have 15 significant digits then.
     left_out_as_empty : bool
-        Leave the cells of readings empty that are left out, instead of listing them in `left_out`.
+        Whether the cells of left-out readings are empty, instead of their being listed in
+        `left_out`.
 
     Returns
     -------
@@ -261,9 +262,9 @@ def _campaign_text(
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     files : list of str
-        Names of the tables, one for each trial.
+        The names of the tables, one for each trial.
     noise_interval : float or None
-        Sampling interval of the samples at rest [s]; None if there are none.
+        The sampling interval of the samples at rest [s]; None if there are none.
     file_units : _FileUnits
         The units in which the files are written.
     """

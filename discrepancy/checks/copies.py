@@ -119,12 +119,12 @@ def _describe_copy(
     original_used, copy_used : (N,) ndarrays of bool
         False for samples that are left out.
     shift : int
-        Number of samples by which the copy comes later than the original.
+        The number of samples by which the copy comes later than the original.
 
     Returns
     -------
     str
-        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is no copy.
+        The phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is no copy.
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)

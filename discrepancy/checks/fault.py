@@ -54,9 +54,9 @@ class DataFault:
     kind : FaultKind
         The kind of fault.
     sentence : str
-        Message to the user: what was found, where, and what to do.
+        The message to the user: what was found, where, and what to do.
     channel, trial : str
-        Names of the channel and the trial; empty if it concerns all.
+        The names of the channel and the trial; empty if it concerns all.
     accepted : bool
         True if the campaign accepts it by its key `accept`.
     """

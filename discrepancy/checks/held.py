@@ -67,7 +67,7 @@ def runs_of_true(flags: BoolArray) -> IntArray:
     Returns
     -------
     (R, 2) ndarray of int
-        Index of the first entry of each run, and the index after its last entry.
+        The index of the first entry of each run, and the index after its last entry.
     """
     padded_flags = np.concatenate(([False], flags, [False])).astype(np.int8)
     edges = np.flatnonzero(np.diff(padded_flags))
@@ -114,9 +114,9 @@ class _RunsOfRecord(NamedTuple):
     quantum : float
         The least difference between two values of the record, which is its last digit.
     bounds : (R, 2) ndarray of int
-        First sample of each run, and the one after its last.
+        The first sample of each run, and the one after its last.
     lengths : (R,) ndarray of int
-        Lengths of the runs in samples.
+        The lengths of the runs in samples.
     """
 
     values: FloatArray
@@ -152,12 +152,12 @@ def stuck_spans(
     other_records : (N, K) ndarray
         The records of the K other channels and inputs of the trial.
     noise : float
-        Standard deviation of the channel's noise; 0 if it is not known.
+        The standard deviation of the channel's noise; 0 if it is not known.
 
     Returns
     -------
     list of (int, int)
-        First sample of each run, and the one after its last.
+        The first sample of each run, and the one after its last.
     """
     is_equal_to_next = (np.diff(values) == 0.0) & is_used[1:] & is_used[:-1]
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
@@ -192,7 +192,7 @@ def _is_sensor_failure(
     Parameters
     ----------
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     runs : _RunsOfRecord
         The record and all its runs.
     other_records : (N, K) ndarray
@@ -257,9 +257,9 @@ def _other_movement(
     Parameters
     ----------
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     window_starts : sequence of int
-        First samples of the windows, which are as long as the run.
+        The first samples of the windows, which are as long as the run.
     other_records : (N, K) ndarray
         The K other records of the same trial, for comparison.
     """

@@ -26,7 +26,7 @@ def event_patterns(width: int, degree: int) -> FloatArray:
     Parameters
     ----------
     width, degree : int
-        Half width of the neighbourhood in samples, and degree of the polynomial.
+        The half width of the neighbourhood in samples, and degree of the polynomial.
 
     Returns
     -------
@@ -54,9 +54,9 @@ class LocalPolynomial:
     Parameters
     ----------
     weights : callable
-        Weights of residuals; see `Weights`.
+        The weights of residuals; see `Weights`.
     width : int
-        Half width of the neighbourhood in samples.
+        The half width of the neighbourhood in samples.
     degree : int
         The degree of the polynomial.
     """
@@ -123,12 +123,12 @@ def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
     time : (N,) ndarray
         The times of the samples [s].
     width, degree : int
-        Half width of the neighbourhood in samples, and degree of the polynomial.
+        The half width of the neighbourhood in samples, and degree of the polynomial.
 
     Returns
     -------
     (N - 2 width, 2 width + 1) ndarray
-        Weights of each sample that has all its neighbours.
+        The weights of each sample that has all its neighbours.
     """
     inner_times = time[width : len(time) - width, np.newaxis]
     relative_times = sliding_window_view(time, 2 * width + 1) - inner_times

@@ -47,7 +47,8 @@ def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, flo
     Returns
     -------
     dict of str to float
-        Ratio by the name of the parameter, for parameters with a prior standard deviation above 0.
+        The ratio by the name of the parameter, for parameters with a prior standard deviation above
+        0.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     channel_weights = np.ones(len(problem.channel_names))
@@ -250,7 +251,7 @@ def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     frequency : float
-        Frequency of the first mode [Hz].
+        The frequency of the first mode [Hz].
     """
     for trial in campaign.trials:
         if not trial.is_dynamic or trial.kind is TrialKind.DRIVEN:
@@ -276,9 +277,9 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
     trial : Trial
         The trial with its readings, inputs and sample times.
     frequency : float
-        Frequency of the first mode [Hz].
+        The frequency of the first mode [Hz].
     samples : float
-        Number of samples in a period.
+        The number of samples in a period.
     """
     in_milliseconds = 1e3 * samples
     if samples < LEAST_SAMPLES / 10.0 and in_milliseconds >= LEAST_SAMPLES:
@@ -306,7 +307,7 @@ def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> I
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
     """
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
@@ -332,7 +333,7 @@ def _sign_faults(
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     scales : mapping of (str, str) to float
-        Signed ratio of data to prediction by channel and trial; see `data_scales`.
+        The signed ratio of data to prediction by channel and trial; see `data_scales`.
     """
     dynamic_trials = {trial.name for trial in campaign.trials if trial.is_dynamic}
     channels_at_rest = {name for name, trial in scales if trial not in dynamic_trials}

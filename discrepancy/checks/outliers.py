@@ -97,7 +97,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     channel : str
         The name of the channel.
     is_outlier : (N,) ndarray of bool
-        Which of its readings are outliers.
+        Whether each reading of the channel is an outlier.
     """
     # all channels of a trial have its times
     weights = {
@@ -135,9 +135,10 @@ def sample_outliers(
     is_used : (N,) ndarray of bool, optional
         False for samples that are left out: they are interpolated and never outliers.
     weights : callable, optional
-        Weights of the local polynomials at the record's times; those of even samples by default.
+        The weights of the local polynomials at the record's times; those of even samples by
+        default.
     noise : float
-        Standard deviation of the channel's noise; 0 if it is not known.
+        The standard deviation of the channel's noise; 0 if it is not known.
     """
     count = len(values)
     largest_reading = float(np.max(np.abs(values), initial=0.0))
@@ -200,14 +201,14 @@ def _find_suspects(
     polynomial : LocalPolynomial
         The polynomial that predicts each sample.
     rounding : float
-        Standard deviation of its residuals that rounding of the readings causes.
+        The standard deviation of its residuals that rounding of the readings causes.
     noise_limit : float
-        Largest residual that the noise of the channel explains.
+        The largest residual that the noise of the channel explains.
 
     Returns
     -------
     is_suspect : (N,) ndarray of bool
-        Samples with a significant residual that are not at an event such as a kink.
+        The samples with a significant residual that are not at an event such as a kink.
     cleaned_record : (N,) ndarray
         The record with the predictions in place of these samples.
     """
@@ -255,7 +256,7 @@ def wrong_end_readings(
     is_used : (N, C) ndarray of bool
         False for samples that are left out.
     noise : (C,) ndarray or float
-        Standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
+        The standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
         known.
 
     Returns
@@ -291,7 +292,7 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     residual : (N,) ndarray
         The readings minus their prediction.
     noise : float
-        Standard deviation of the noise; 0 if it is not known.
+        The standard deviation of the noise; 0 if it is not known.
     """
     padded_residual = np.pad(residual, 2, constant_values=np.nan)
     neighbours = sliding_window_view(padded_residual, 5)[:, _NEIGHBOURS]

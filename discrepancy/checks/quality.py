@@ -200,7 +200,7 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     extreme : float
         The largest or smallest of them.
     load : (N,) ndarray, optional
-        Loads of readings at rest; without them the readings are samples in time.
+        The loads of readings at rest; without them the readings are samples in time.
     """
     digit = quantum_of(values)
     least_length = LEAST_CLIPPED_RUN * (update_length(values) if load is None else 1.0)
@@ -229,7 +229,7 @@ def _is_clipped_over_load(
     values, load : (N,) ndarrays
         Readings and loads, in the order of load.
     start, stop : int
-        First reading of the run, and the one after its last.
+        The first reading of the run, and the one after its last.
     digit : float
         The least difference between two readings, which is their last digit.
     """
@@ -254,7 +254,7 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     values : (N,) ndarray
         Readings in the order of time.
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     digit : float
         The least difference between two readings, which is their last digit.
     """

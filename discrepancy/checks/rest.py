@@ -37,7 +37,7 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     frequency : float, optional
-        Frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
+        The frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
     """
     for name, channel in campaign.channels.items():
         if channel.noise is None:
@@ -66,13 +66,13 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     record : NoiseRecord
         The noise record, taken while nothing should move.
     frequency : float, optional
-        Frequency of a mode of the structure [Hz].
+        The frequency of a mode of the structure [Hz].
 
     Returns
     -------
     str or None
-        Verb phrase for a message, such as "drifts by ...". None if nothing else was found, or if
-        the record has too few samples for the tests.
+        The verb phrase for a message, such as "drifts by ...". None if nothing else was found, or
+        if the record has too few samples for the tests.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
@@ -100,7 +100,7 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
     interval : float
         The interval between successive samples [s].
     frequency : float
-        Frequency of the mode [Hz].
+        The frequency of the mode [Hz].
     """
     is_short = frequency * interval * len(residual) < LEAST_PERIODS
     if is_short or any(abs(frequency / mains - 1.0) < RELATIVE_HALF_BAND for mains in MAINS):

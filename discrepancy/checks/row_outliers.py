@@ -61,7 +61,7 @@ def _outliers_among_repeats(
     readings : (R, N) ndarray
         Readings of the N rows of each trial.
     noise : float
-        Standard deviation of the channel's noise.
+        The standard deviation of the channel's noise.
     has_free_zero : bool
         Whether each trial may have a zero of its own, which is removed first: the median over the
         rows of what the readings differ from the median over the trials.

@@ -41,7 +41,7 @@ def data_scales(
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def _static_scale(
     readings, predicted_readings : (N,) ndarrays
         Readings, and their prediction by the model [channel's unit].
     noise, zero_deviation : float
-        Standard deviations of the noise and of the channel's zero [channel's unit].
+        The standard deviations of the noise and of the channel's zero [channel's unit].
     """
     # all pairs of at most 400 rows
     rows = np.linspace(0, len(readings) - 1, min(len(readings), 400)).round().astype(int)
@@ -207,7 +207,7 @@ def swapped_channels(
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
     """
     groups: dict[tuple[Quantity, tuple[str, ...]], list[Channel]] = defaultdict(list)
     for name, channel in campaign.channels.items():
@@ -251,7 +251,7 @@ def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int
     misfits : (C, C) ndarray
         Chi-squared of each channel (row) to the prediction of each channel (column).
     first_index, second_index : int
-        Indices of the two channels.
+        The indices of the two channels.
     """
     pair = [first_index, second_index]
     exchanged = [second_index, first_index]
@@ -271,7 +271,7 @@ def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel])
     trial : Trial
         The trial with its readings, inputs and sample times.
     predictions : (N, M) ndarray
-        Predicted readings of all channels of the trial.
+        The predicted readings of all channels of the trial.
     channels : sequence of Channel
         The C channels.
 

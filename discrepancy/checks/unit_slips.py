@@ -35,7 +35,7 @@ class Slip(NamedTuple):
     Attributes
     ----------
     factor : float
-        Factor of data over model if one unit was given as the other.
+        The factor of data over model if one unit was given as the other.
     meant : str
         The unit that the data have.
     stated : str
@@ -81,7 +81,7 @@ def find_slip(
     Parameters
     ----------
     scale : float
-        Ratio of data to model, of any sign.
+        The ratio of data to model, of any sign.
     quantity : Quantity
         The quantity whose units may have been mixed up.
     stated_unit : str
@@ -131,7 +131,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
     campaign : Campaign
         The campaign: its trials, channels and noise records.
     scales : mapping of (str, str) to float
-        Data over model by channel and trial.
+        The ratio of data to model, by channel and trial.
     """
     trials = {trial.name: trial for trial in campaign.trials}
     input_slips = {key: _slip_of_input(trials[key[1]], scale) for key, scale in scales.items()}
@@ -178,11 +178,11 @@ def _slips_in_trial(
     trial : Trial
         The trial with its readings, inputs and sample times.
     keys : sequence of (str, str)
-        Channel and trial for its channels whose own unit is right.
+        The channel and trial for its channels whose own unit is right.
     scales : mapping of (str, str) to float
-        Data over model by channel and trial.
+        The ratio of data to model, by channel and trial.
     input_slips : mapping of (str, str) to Slip or None
-        Slip of the trial's input that would explain each scale.
+        The slip of the trial's input that would explain each scale.
     """
     common_slip = _common_slip([input_slips[key] for key in keys])
     if common_slip is not None:
@@ -285,7 +285,7 @@ def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[Data
     slip : Slip
         The slip of a unit that explains the scale.
     agreeing : int
-        Number of records that show the same slip.
+        The number of records that show the same slip.
     """
     sentence = fault.sentence
     if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):

@@ -74,8 +74,8 @@ class CandidateFit(FitState):
     converged : bool
         Whether the predicted decrease of the objective fell below `CONVERGED_DECREASE`.
     draws : (N, E) array or None
-        Posterior draws of the effect parameters, if their posterior is wider than the covariance
-        says (see `predictive.with_draws`).
+        The posterior draws of the effect parameters, if their posterior is wider than the
+        covariance says (see `predictive.with_draws`).
     residual_process : ResidualProcess or None
         The random process of the residuals besides the noise, if hypotheses are compared under a
         wider noise than recorded.
@@ -133,8 +133,8 @@ def fit(
     start : Point
         The point from which the fit begins.
     nearby_derivatives : tuple of TrialDerivatives, optional
-        Derivatives of each trial with respect to nuisances at a nearby point, used for the first
-        steps instead of new ones.
+        The derivatives of each trial with respect to nuisances at a nearby point, used for the
+        first steps instead of new ones.
     iterations : int
         The largest number of steps.
     local_only : bool

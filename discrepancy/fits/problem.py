@@ -322,7 +322,8 @@ class Problem:
         candidate : Candidate
             The effects that act, each at its place.
         nearby_derivatives : TrialDerivatives, optional
-            Derivatives with respect to nuisances at a nearby point, which are not computed again.
+            The derivatives with respect to nuisances at a nearby point, which are not computed
+            again.
         effect_steps : (E,) array, optional
             The posterior standard deviations of the effect parameters, used as steps of their
             finite differences, at least `LEAST_EFFECT_STEP` and at most `PARAMETER_STEP`. Such a

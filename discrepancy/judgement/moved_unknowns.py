@@ -117,7 +117,7 @@ def _unknown_stated_as_zero(
     name : str
         The name of the unknown.
     scaled_value : float
-        Its scaled value in the fit.
+        The scaled value of the unknown in the fit.
     scale : float
         Its stated standard deviation [unit].
     unit : str

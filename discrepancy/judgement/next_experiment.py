@@ -49,7 +49,7 @@ class Proposal:
     trial : Trial
         The trial; its readings are not used, as it has not been made.
     description, reason : str
-        Sentences for the user: what to do, and why.
+        The sentences for the user: what to do, and why.
     cost : float
         The cost relative to one more trial of a kind that was done already.
     added_patch : ModelPatch

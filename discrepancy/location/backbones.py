@@ -26,11 +26,11 @@ class Backbone:
     Attributes
     ----------
     mode : int
-        Number of the mode from one, by start frequency.
+        The number of the mode from one, by start frequency.
     time : (W,) ndarray
-        Centroid of the mode's energy in each window [s].
+        The centroid of the mode's energy in each window [s].
     amplitude, amplitude_error : (W,) ndarray
-        Amplitude at that time and its standard error [signal's unit].
+        The amplitude at that time and its standard error [signal's unit].
     frequency, frequency_error : (W,) ndarray
         Natural frequency |s| / 2 pi with s = -decay + i omega_d, and its standard error [Hz].
     damping_ratio, damping_ratio_error : (W,) ndarray
@@ -66,14 +66,14 @@ def backbones(
     time, signal : (N,) ndarray
         The record, evenly spaced [s], [any unit].
     frequencies : sequence of float
-        Start values of the frequencies of all modes in the signal [Hz].
+        The start values of the frequencies of all modes in the signal [Hz].
     noise_deviation : float, optional
-        Standard deviation of the noise [signal's unit]. By default, that of the residuals of each
-        window, which also contain what the cosines do not describe.
+        The standard deviation of the noise [signal's unit]. By default, that of the residuals of
+        each window, which also contain what the cosines do not describe.
     averaging_width : float
-        Interval over which each value is an average [s]; 0 for samples.
+        The interval over which each value is an average [s]; 0 for samples.
     periods : float
-        Length of a window in periods of the lowest frequency. A longer window gives smaller
+        The length of a window in periods of the lowest frequency. A longer window gives smaller
         standard errors, but averages over a larger change of amplitude: for quadratic damping with
         a ratio of 0.045, windows of three periods give 0.043.
 
@@ -172,7 +172,7 @@ def _points_of_window(
     solution : DampedCosineFit
         The damped cosine that was fitted in the window.
     noise_deviation : float or None
-        Standard deviation of the noise; that of the window's residuals if None.
+        The standard deviation of the noise; that of the window's residuals if None.
     """
     residual_deviation = float(solution.deviation[0])
     deviation = residual_deviation if noise_deviation is None else noise_deviation

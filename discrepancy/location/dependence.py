@@ -50,7 +50,7 @@ def modal_motion(
     interval : float
         The interval between successive samples [s].
     frequencies : sequence of float
-        Frequencies of the K modes [Hz], lowest first, apart by more than the resolution of the
+        The frequencies of the K modes [Hz], lowest first, apart by more than the resolution of the
         record.
 
     Returns
@@ -87,7 +87,7 @@ def mode_shares(
     white_residuals : sequence of (N, C) ndarray
         The white residuals of each trial.
     frequencies : sequence of float
-        Frequencies of the M modes [Hz], lowest first.
+        The frequencies of the M modes [Hz], lowest first.
     """
     excess_of_modes = np.zeros(len(frequencies))
     total_excess = 0.0
@@ -151,7 +151,7 @@ class Dependence(NamedTuple):
     name : str
         What residuals depend on: "amplitude", "time", "load (not proportional)", ...
     share : float
-        Fraction of the excess variance that it explains.
+        The fraction of the excess variance that it explains.
     p_value : float
         p-value if there is no such dependence.
     coefficient_count : int
@@ -190,7 +190,7 @@ def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
     Returns
     -------
     (n, `_HAT_COUNT`) ndarray
-        Value of each hat function; the constant 1 in a single column if the knots coincide.
+        The value of each hat function; the constant 1 in a single column if the knots coincide.
     """
     if high <= low:
         return np.ones((values.size, 1))
@@ -257,7 +257,7 @@ class SpectralLine(NamedTuple):
     decay : float
         The decay rate of the line [1/s].
     choice_count : int
-        Number of lines from which it was chosen.
+        The number of lines from which it was chosen.
     """
 
     frequency: float
@@ -347,7 +347,7 @@ def dependence_bases(
     column : int
         The index of the channel's column in the arrays of the trial.
     modes : sequence of float
-        Frequencies of the modes [Hz].
+        The frequencies of the modes [Hz].
 
     Returns
     -------

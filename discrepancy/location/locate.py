@@ -66,13 +66,13 @@ class Location:
     disagrees : bool
         Global verdict, by Holm's rule at `GLOBAL_LEVEL` over the omnibus tests.
     tests : tuple of OmnibusTest
-        Tests of variance, Ljung-Box, cumulative periodogram and Fisher g.
+        The tests of variance, Ljung-Box, cumulative periodogram and Fisher g.
     cells : tuple of Cell
         The map; cells are significant at the false discovery rate `MAP_RATE`.
     disagreements : tuple of Disagreement
-        Findings in words, largest first; empty if nothing disagrees.
+        The findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
-        Limits of these statements: a missing noise record, noise that is not white, residuals
+        The limits of these statements: a missing noise record, noise that is not white, residuals
         smaller than the noise, a model so far off that no cell can be judged.
     """
 
@@ -94,7 +94,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are left out.
     seed : int
-        Seed of the random draw that makes the residuals white; see
+        The seed of the random draw that makes the residuals white; see
         `ResidualSet.whitened_residuals`.
 
     Returns
@@ -145,7 +145,7 @@ def _disagreements(
     residuals : ResidualSet
         The residuals of the fitted trials.
     white_residuals : sequence of (N, C) ndarray
-        White residuals of each trial.
+        The white residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
     for kind in group_by_kind(residuals, white_residuals):
@@ -222,7 +222,7 @@ def _count_isolated_outliers(absolute_residuals: FloatArray) -> int:
     Parameters
     ----------
     absolute_residuals : (N,) ndarray
-        Absolute residuals in units of the noise; nan in gaps.
+        The absolute residuals in units of the noise; nan in gaps.
     """
     finite = absolute_residuals[np.isfinite(absolute_residuals)]
     if not finite.size:
@@ -249,7 +249,7 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
     kind : TrialsOfKind
         The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
-        Their patterns over the channels.
+        The patterns of these trials over the channels.
     """
     candidates = list(explained_dependences(kind.trials))
     significant = [
@@ -305,7 +305,7 @@ def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -
     kind : TrialsOfKind
         The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
-        Their patterns over the channels.
+        The patterns of these trials over the channels.
     """
     channels = kind.trials[0].trial.channels
     for pattern in patterns:

@@ -94,9 +94,9 @@ class ExplainedSquares(NamedTuple):
     Attributes
     ----------
     sum_of_squares : float
-        Explained sum of squares, in units of the noise variance.
+        The explained sum of squares, in units of the noise variance.
     degrees_of_freedom : int
-        Number of directions that remain after the fit of the model; chi-squared has as many.
+        The number of directions that remain after the fit of the model; chi-squared has as many.
     """
 
     sum_of_squares: float
@@ -112,7 +112,7 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     Parameters
     ----------
     equations : sequence of NormalEquations
-        Normal equations of each channel; every channel has its own coefficients.
+        The normal equations of each channel; every channel has its own coefficients.
     """
     covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
     if all(channel_equations.absorbed_by_fit.shape[0] for channel_equations in equations):
@@ -237,13 +237,13 @@ def _add_projected_function(
     Parameters
     ----------
     functions : dict of str to ndarray
-        Functions by name, changed in place.
+        The functions by name, changed in place.
     name : str
         The name of the function.
     columns : (n, k) ndarray
         The values of the k columns of the function at n samples.
     basis : (n, b) ndarray
-        Orthonormal columns that are projected out.
+        The orthonormal columns that are projected out.
     """
     projected_columns = columns - basis @ (basis.T @ columns)
     norms = np.linalg.norm(columns, axis=0)
@@ -277,12 +277,12 @@ class Cell:
     Attributes
     ----------
     trial, channel : str
-        Names of the trial and the channel.
+        The names of the trial and the channel.
     axis : str
         "whole", "time", "amplitude", "frequency" or "load".
     low, high : float
-        Ends of the bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for the
-        whole record.
+        The ends of the bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for
+        the whole record.
     count : int
         The number of samples.
     statistic : str
@@ -322,7 +322,7 @@ def residual_map(
     residuals : ResidualSet
         The residuals of the fitted trials.
     white_residuals : tuple of (N, C) ndarray
-        White residuals of each trial, from its method `whitened_residuals`, for the bins of
+        The white residuals of each trial, from its method `whitened_residuals`, for the bins of
         frequency.
     rate : float
         The false discovery rate that is accepted.
@@ -350,7 +350,7 @@ def _cells_of_trial(
     fitted_trial : FittedTrial
         The trial with its prediction and residuals.
     white_residuals : (N, C) ndarray
-        White residuals of the trial.
+        The white residuals of the trial.
     """
     trial = fitted_trial.trial
     for column, channel in enumerate(trial.channels):
@@ -399,7 +399,7 @@ class _Span(NamedTuple):
     low, high : float
         Ends; nan for the whole record.
     used : (N,) ndarray of bool
-        Used samples between the ends.
+        The used samples between the ends.
     """
 
     axis: str
@@ -440,9 +440,9 @@ def _spans_of_bins(
     axis : str
         The name of the axis.
     values : (N,) ndarray
-        Value of each sample on the axis.
+        The value of each sample on the axis.
     edges : (B + 1,) ndarray
-        Edges of the bins, ascending.
+        The edges of the bins, ascending.
     is_used : (N,) ndarray of bool
         Whether each sample is used.
     """
@@ -469,14 +469,14 @@ def _test_dependence(
     column : int
         The index of the channel in the trial.
     is_used : (N,) ndarray of bool
-        Mask of the n samples that are tested.
+        Whether each sample is one of the n samples that are tested.
     function_values : (n, k) ndarray
         Values of the function at these samples. Most functions have k = 1 component; a harmonic has
         two, its cosine and its sine. A constant function tests the mean of the residuals.
     cell : Cell
         The entry of the map for the result, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if there is no record, and the noise
+        The degrees of freedom of the channel's noise record; 0 if there is no record, and the noise
         variance is then taken as exact.
 
     Returns
@@ -528,7 +528,7 @@ def _variance_cells(
     cell : Cell
         The cell, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if it has none.
+        The degrees of freedom of the channel's noise record; 0 if it has none.
     """
     # a bin of few samples is not tested; a whole record is, however short
     least_count = 1 if cell.axis == "whole" else _LEAST_SAMPLES_OF_CELL
@@ -562,7 +562,7 @@ def _frequency_cells(
     template : Cell
         A cell with the names of the trial and the channel, which the yielded cells take over.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if it has none.
+        The degrees of freedom of the channel's noise record; 0 if it has none.
     """
     ordinates = periodogram(series)  # of the frequencies 1, 2, 3, ... times the resolution
     # With four ordinates in each band on average, the variance of a band can be tested.

@@ -29,7 +29,7 @@ class OmnibusTest:
         Variance: mean square over its expectation; else the statistic of the record with the least
         p-value.
     where : str
-        Trial and channel of that record.
+        The trial and channel of that record.
     rejected : bool
         True if Holm's rule over all tests rejects it.
     """
@@ -51,7 +51,7 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
     Returns
     -------
     dict of str to tuple of str
-        Names of the channels of each group, by the first of them.
+        The names of the channels of each group, by the first of them.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in residuals.recorded_channels:
@@ -163,7 +163,7 @@ def serial_tests(
     residuals : ResidualSet
         The residuals of all trials, with the channels.
     white_residuals : sequence of (N, C) ndarray
-        White residuals of each trial, from its method `whitened_residuals`.
+        The white residuals of each trial, from its method `whitened_residuals`.
     coloured_channels : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """

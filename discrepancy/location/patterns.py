@@ -29,20 +29,20 @@ class Disagreement:
     Attributes
     ----------
     trials : str
-        Kind of the trials in which it shows.
+        The kind of the trials in which it shows.
     subject : str
         "mode 1", "channel g17", "all channels", ...; for a pattern over channels its meaning.
     dependence : str
         What the residuals depend on: "amplitude", "time", "load (not proportional)", "channels",
         ...
     share : float
-        Fraction of the excess variance of these trials that it explains.
+        The fraction of the excess variance of these trials that it explains.
     p_value : float
         The p-value of the finding.
     sentence : str
         The sentence that tells the finding.
     channel : str
-        Channel on which a pattern over channels is strongest.
+        The channel on which a pattern over channels is strongest.
     """
 
     trials: str
@@ -60,7 +60,7 @@ class TrialsOfKind(NamedTuple):
     Attributes
     ----------
     name : str
-        Name of the kind, for messages.
+        The name of the kind, for messages.
     trials : list of FittedTrial
         The trials with their predictions and residuals.
     white : list of (N, C) ndarray
@@ -83,7 +83,7 @@ class TrialsOfKind(NamedTuple):
         phrase : str
             The beginning of the sentence that tells the finding.
         share : float
-            Fraction of the excess variance that it explains.
+            The fraction of the excess variance that it explains.
         p_value : float
             The p-value of the finding.
         """
@@ -105,7 +105,7 @@ def group_by_kind(
     residuals : ResidualSet
         The residuals of all trials, with the channels.
     white_residuals : sequence of (N, C) ndarray
-        White residuals of each trial.
+        The white residuals of each trial.
     """
     groups: dict[tuple[str, tuple[str, ...]], TrialsOfKind] = {}
     for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
@@ -211,7 +211,7 @@ class _PatternMeaning(NamedTuple):
     subject : str
         "sensor", "common", "dynamics or load" or "mixed".
     phrase : str
-        Start of a sentence about it.
+        The beginning of a sentence about the pattern.
     """
 
     subject: str

@@ -29,21 +29,21 @@ class FittedTrial:
     trial : Trial
         Readings and inputs; it took part in the fit unless `trial.held_out`.
     prediction : (N, C) ndarray
-        Mean of the posterior prediction, with gains and offsets [channel's unit].
+        The mean of the posterior prediction, with gains and offsets [channel's unit].
     residual : (N, C) ndarray
         Readings minus prediction [channel's unit]; any value where `trial.used` is False.
     noise_deviation : (C,) ndarray
         Standard deviation s0 of each channel's noise [channel's unit]; an estimate without a noise
         record.
     predictive_deviation : (N, C) ndarray
-        Standard deviation of a measured value under the posterior prediction, noise included.
+        The standard deviation of a measured value under the posterior prediction, noise included.
     leverage : (N, C) ndarray
         Leverage: if the model is right, a residual has the variance s0^2 (1 - leverage) in a fitted
         trial and s0^2 (1 + leverage) in a held-out one. It is negative in a held-out trial whose
         own nuisances (a release amplitude, an offset) were fitted to it. The sum over the used
         samples of fitted trials is the effective number of parameters.
     rates : (N, C) ndarray or None
-        Time derivatives of the prediction of a dynamic trial [channel's unit / s].
+        The time derivatives of the prediction of a dynamic trial [channel's unit / s].
     sensitivity : (N, C, P) ndarray or None
         S of the module's text for the P parameters of the whole fit (in held-out trials without
         those that were fitted to the trial itself). With it tests allow exactly for what the fit
@@ -152,7 +152,7 @@ class ResidualSet:
     Attributes
     ----------
     channels : mapping of str to Channel
-        Channels by name, with the noise records that residuals are compared with.
+        The channels by name, with the noise records that residuals are compared with.
     trials : tuple of FittedTrial
         Trials in the campaign's order.
 
@@ -224,7 +224,7 @@ class ResidualSet:
         Returns
         -------
         tuple of (N, C) ndarray
-            White residuals of each trial.
+            The white residuals of each trial.
         """
         draw = generator.standard_normal(self._parameter_count())
         held_out_draw = self._held_out_draw(draw)
@@ -259,7 +259,7 @@ class ResidualSet:
         Parameters
         ----------
         white_residuals : sequence of (N, C) ndarray
-            White residuals of each trial, from the method `whitened_residuals`.
+            The white residuals of each trial, from the method `whitened_residuals`.
         """
         for fitted_trial, values in zip(self.trials, white_residuals, strict=True):
             if not fitted_trial.trial.is_dynamic or len(values) < SHORTEST_SERIES:
@@ -315,9 +315,9 @@ class SumOfSquaresMoments(NamedTuple):
     Attributes
     ----------
     expected_sum : float
-        Expected sum of squares, in units of the noise variance.
+        The expected sum of squares, in units of the noise variance.
     degrees_of_freedom : float
-        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
+        The effective degrees of freedom; 0 if the fit has absorbed all residuals.
     """
 
     expected_sum: float
@@ -337,8 +337,8 @@ def sum_of_squares_moments(
     Parameters
     ----------
     records : iterable of ((n,) ndarray, (n, P) ndarray or None)
-        Expected variances of n residuals in units of the noise variance (the diagonal of A), and
-        their sensitivities S, for each trial and channel.
+        The expected variances of n residuals in units of the noise variance (the diagonal of A),
+        and their sensitivities S, for each trial and channel.
     held_out : bool
         True for residuals of held-out trials, where A = I + S S^T.
     """
@@ -377,7 +377,7 @@ class MeanSquareRatio(NamedTuple):
     ratio : float
         The ratio; 1 on average if the model is right, nan if the expectation is zero.
     degrees_of_freedom : float
-        Effective degrees of freedom of the sum; see `sum_of_squares_moments`.
+        The effective degrees of freedom of the sum; see `sum_of_squares_moments`.
     """
 
     ratio: float

@@ -248,8 +248,8 @@ def find_events(
     Returns
     -------
     Events
-        Events with changes if these are more probable than `least_score` and than a force that acts
-        throughout the records that have one; otherwise such a force.
+        The events with changes if these are more probable than `least_score` and than a force that
+        acts throughout the records that have one; otherwise such a force.
     """
     sample_count = sum(len(trial.time) for trial in linear_trials.trials)
     stride = ceil(sample_count / MOST_SAMPLES)

@@ -301,8 +301,8 @@ class ForceFilter:
         products : (K, K) array
             The inner products of all pairs of whitened columns.
         half_log_determinant : float
-            Half the sum of the logarithms of the variances of the readings, each given those before
-            it [nat]. It is infinite if a force is so large that rounding loses the readings.
+            Half the sum of the logarithms of the variances of the readings, each given those
+            before it [nat]. It is infinite if a force is so large that rounding loses the readings.
         """
         record_filter = self.record_filter(columns)
         _, step_of_sample = self.trial.intervals

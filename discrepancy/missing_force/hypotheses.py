@@ -384,7 +384,7 @@ class ColumnBuilder:
         motion : TrialMotion
             The estimated motion of the trial, with the forces at its ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         patch : ModelPatch
             The change of the model.
         acts_on : frozenset of TrialKind
@@ -455,7 +455,7 @@ class ColumnBuilder:
         trial : PortedTrial
             The trial as a linear system with ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         patch : ModelPatch
             The change of the model.
         """
@@ -484,7 +484,7 @@ class ColumnBuilder:
         motion : TrialMotion
             The estimated motion of the trial, with the forces at its ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         sensors : ModelPatch
             The change of the model that consists of errors of sensors.
         """

@@ -175,8 +175,8 @@ def filter_forward(
     whitened_innovations : (query_samples[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
     half_log_determinants : (B,) ndarray
-        Half the sum of the logarithms of the variances of the innovations; infinite if a variance
-        has been lost to rounding.
+        Half the sum of the logarithms of the variances of the innovations; infinite if a
+        variance has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
         The gains and the variances of the innovations of that last sample.
     """

@@ -54,13 +54,13 @@ class ExamplePlan:
     release : float
         The largest displacement before a release [m].
     load_factors : tuple of float
-        Load factors of the flights [1].
+        The load factors of the flights [1].
     duration, interval : float
-        Duration and sampling interval of a ring-down [s].
+        The duration and sampling interval of a ring-down [s].
     load_place : str or tuple of float
-        Point at which the force acts.
+        The point at which the force acts.
     flight_channels : tuple of str
-        Names of the channels that flights measure; all if empty.
+        The names of the channels that flights measure; all if empty.
     """
 
     channels: tuple[Channel, ...]
@@ -88,7 +88,7 @@ def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
     Parameters
     ----------
     gauges : tuple of int
-        Numbers of the gauges, from 1.
+        The numbers of the gauges, from 1.
     """
     channels = []
     for number in gauges:
@@ -147,11 +147,11 @@ def plan_from_scales(
     model : Model
         The model that predicts the readings.
     outputs : tuple of str
-        Outputs that are measured, each by a channel of the same name.
+        The outputs that are measured, each by a channel of the same name.
     load_place : str or tuple of float
-        Point at which the force acts.
+        The point at which the force acts.
     largest_force : float
-        Largest force that the model can take [N]; it may limit the motion.
+        The largest force that the model can take [N]; it may limit the motion.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def example_campaign(
     plan : ExamplePlan, optional
         What is measured; `wing_plan()` by default.
     patch : ModelPatch, optional
-        Effects that the structure has and the model lacks; none by default.
+        The effects that the structure has and the model lacks; none by default.
 
     Raises
     ------
@@ -404,7 +404,7 @@ def _simulate_readings(
     gains : mapping of str to float
         The gain of each channel, by its name.
     generator : Generator
-        Source of the errors of release and zeros, and of noise.
+        The source of the errors of release and zeros, and of noise.
     """
     conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:

@@ -67,11 +67,11 @@ def run_campaign(
     Parameters
     ----------
     folder : path
-        Folder that `uav-twin run --out` leaves.
+        The folder that `uav-twin run --out` leaves.
     first_step, last_step : int, optional
-        Steps that are read; by default from the first of the flight to its last.
+        The steps that are read; by default from the first of the flight to its last.
     held_out_share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def _build_campaign(
     steps : slice
         The labels of the first and the last step.
     held_out_share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
     """
     observed_steps = run["observed"].to_dataset().sel(step=steps)
     count = observed_steps.sizes["step"]
@@ -221,7 +221,7 @@ def _flight_remarks(is_used: BoolArray, noise: float, source_of_noise: str) -> t
     is_used : (N, C) ndarray of bool
         False for readings of N steps that were lost.
     noise : float
-        Standard deviation of a gauge's noise [1].
+        The standard deviation of a gauge's noise [1].
     source_of_noise : str
         Where it is stated, as a phrase.
     """
@@ -265,9 +265,9 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     model : WingModel
         The model of the wing with the patch.
     wing_file : Path
-        File of its calibration or design.
+        The file of its calibration or design.
     patch_file : Path or None
-        File of its patch, if there is one.
+        The file of its patch, if there is one.
 
     Raises
     ------
@@ -324,9 +324,9 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     count : int
         The number of steps.
     block : int
-        Number of steps in a block.
+        The number of steps in a block.
     share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
 
     Returns
     -------

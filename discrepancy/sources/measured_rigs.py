@@ -48,7 +48,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) ->
     rig : str
         The name of the rig, one of `RIGS`.
     data : Path
-        Folder of the published records.
+        The folder of the published records.
     folder : Path
         The folder of the campaign.
     **options
@@ -94,9 +94,9 @@ def _read_numbers(
     file : Path
         The path of the table.
     columns : sequence of str
-        Names of the columns, in order; an increasing "time" first if there is one.
+        The names of the columns, in order; an increasing "time" first if there is one.
     separator : str or None
-        Character between cells; None for blanks.
+        The character between cells; None for blanks.
     skipped : int
         The number of lines before the first line of numbers.
 
@@ -232,12 +232,12 @@ def _group_means(samples: FloatArray, averaged: int) -> FloatArray:
     samples : (N, C) ndarray
         Samples; an incomplete group at the end is dropped.
     averaged : int
-        Number of samples in a group.
+        The number of samples in a group.
 
     Returns
     -------
     (N // averaged, C) ndarray
-        Mean of each group.
+        The mean of each group.
     """
     count = len(samples) // averaged * averaged
     groups = samples[:count].reshape(-1, averaged, samples.shape[1])

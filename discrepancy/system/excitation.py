@@ -72,13 +72,13 @@ class Excitation:
     Attributes
     ----------
     time : (N,) ndarray
-        Stamps of the inputs [s].
+        The stamps of the inputs [s].
     sample_times : (S,) ndarray
         Times at which the samples show the motion [s].
     loads : sequence of Load
         The forces and flows that act on the system.
     prescribed_motions : mapping of str to RecordedHistory
-        Prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
+        The prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
     begins : Start
         How the motion begins, unless it is a release.
     initial : (L,) or (R, 2) ndarray

@@ -163,12 +163,12 @@ def _held_state(
     system, point, laws
         The structure, its release point and its internal forces.
     displacements : (M,) array
-        Deviations from the static shape by mode, in units of the release displacement; the first
-        entry is the deviation of the whole shape.
+        The deviations from the static shape by mode, in units of the release displacement; the
+        first entry is the deviation of the whole shape.
     unit_amplitudes : (M,) array
-        Modal amplitudes of the release displacement.
+        The modal amplitudes of the release displacement.
     load : (1, n) array
-        Sum of the other loads [N].
+        The sum of the other loads [N].
     """
     row = point.row
     unit_force_displacement = system.apply_flexibility(row)

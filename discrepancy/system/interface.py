@@ -37,19 +37,20 @@ class Model(ABC):
     quantities : mapping of str to Quantity
         The physical quantity of each output, by name.
     ports : tuple of str
-        Names of the ports where internal forces can act on one motion; user effects act at these.
+        The names of the ports where internal forces can act on one motion; user effects act at
+        these.
     length : float or None
         Characteristic length [m], if it has any.
     stations : tuple of float, optional
         Least and largest station [m] along the structure, if it has a length.
     patch : ModelPatch
-        Primitives that act in every response: a known addition, or an effect that was found.
+        The primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
         The names of the damage regions.
     kinds : frozenset of TrialKind
-        Kinds of trials that it can simulate.
+        The kinds of trials that it can simulate.
     load_places : tuple of str, optional
-        Names of the places where forces can act; None: anywhere along the structure.
+        The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
         Largest force at these places that is well within the model's range [N].
     holds_inputs : bool
@@ -119,7 +120,7 @@ class Model(ABC):
         trial : Trial
             The trial, of which only the inputs and the sample times are used.
         outputs : tuple of (str, Quantity)
-            Outputs that the model has, and the quantity wanted of each.
+            The outputs that the model has, and the quantity wanted of each.
         patch : ModelPatch
             All primitives that act, those of the model too.
         conditions : Conditions
@@ -317,7 +318,7 @@ class Model(ABC):
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         patch : ModelPatch
-            Primitives that act in addition to those of the model.
+            The primitives that act in addition to those of the model.
         conditions : Conditions
             Parameters, initial state, clock and health.
 
@@ -394,10 +395,10 @@ class Model(ABC):
         Parameters
         ----------
         patch : ModelPatch
-            Its sensors name channels of a campaign, or outputs of the model; they come before those
-            of a response's patch.
+            The change of the model. Its errors of sensors name channels of a campaign or outputs of
+            the model, and come before the errors of sensors in the patch of a response.
         calibrated : mapping of str to (float, float)
-            Means and standard deviations of those parameters that differ from the model's.
+            The means and standard deviations of those parameters that differ from the model's.
         """
         parameters = []
         for parameter in self.parameters:

@@ -42,7 +42,7 @@ class Modes(NamedTuple):
     shapes : (N, M) ndarray
         The mass-normalised shapes of M modes, in N degrees of freedom.
     displacement_count : int
-        Number of the coordinates that are displacements.
+        The number of the coordinates that are displacements.
     """
 
     angular_frequency: FloatArray
@@ -81,7 +81,7 @@ class StaticPath(NamedTuple):
     values : (L, N) or (L, C) ndarray
         Displacements and states at each level, or rows times these.
     memory : ndarray, optional
-        Memory of the laws at the last level; None without laws.
+        The memory of the laws at the last level; None without laws.
     """
 
     values: FloatArray
@@ -110,17 +110,17 @@ class LinearSystem:
         modes that have inertia; the other modes follow without it. None: all modes have inertia,
         and nothing need hold the system.
     relaxation : float
-        Factor of the part of the damping that is proportional to the stiffness, for the modes
+        The factor of the part of the damping that is proportional to the stiffness, for the modes
         without inertia [s].
     on_modes : frozenset of str
         Ports whose position is that of the modes with inertia alone.
     state_count : int
-        Number of states, N - n.
+        The number of states, N - n.
     drives : (P, N) ndarray
         Rows that are prescribed: each of displacements alone, whose motion is prescribed, or of
         states alone.
     actions : mapping of str to (N,) ndarray
-        Directions in which laws at ports act, for all ports; empty if they are the rows of the
+        The directions in which laws at ports act, for all ports; empty if they are the rows of the
         ports.
     solved : SolvedStructure, optional
         The structure with its modes and K^-1, if they are known.
@@ -214,7 +214,7 @@ class LinearSystem:
         squares : (K,) ndarray
             The squared angular frequencies of the K modes [1/s^2].
         shapes : (n, K) ndarray
-            Mode shapes with a modal mass of 1.
+            The mode shapes with a modal mass of 1.
         """
         n = self.displacement_count
         mass = self.mass[:n, :n]
@@ -435,12 +435,12 @@ class LinearSystem:
         levels : (L, k) array, optional
             The value of each load at each level; by default each load is a level of its own.
         memory, previous_level : arrays, optional
-            Memory of the laws at the end of an earlier path, and the values (k,) of the loads
+            The memory of the laws at the end of an earlier path, and the values (k,) of the loads
             there; by default the laws were never loaded.
         offset : (N,) array, optional
-            Displacements that drives prescribe, which are added to those under the loads.
+            The displacements that drives prescribe, which are added to those under the loads.
         fixed_row : (N,) array, optional
-            Row of a point that is held, so that the forces of laws do not move it.
+            The row of a point that is held, so that the forces of laws do not move it.
         output_rows : (C, N) array, optional
             Rows whose values are returned instead of displacements and states.
         time : float, optional

@@ -55,9 +55,9 @@ class Motion:
         Internal forces after the first-order lag (time constant `system.relaxation`) with which the
         modes without inertia follow them.
     held_samples : int
-        Number of samples before the release, at which the structure is held in its shape.
+        The number of samples before the release, at which the structure is held in its shape.
     holding_force : (n,) ndarray, optional
-        Force that holds the release point until the release [N].
+        The force that holds the release point until the release [N].
     """
 
     system: LinearSystem
@@ -154,7 +154,7 @@ class Motion:
         Returns
         -------
         values, rates : (N, C) arrays
-            That part of each output, and its time derivative. The derivative of the third
+            This part of each output, and its time derivative. The derivative of the third
             derivative of the coordinates is left out of the rates.
         """
         rows_by_derivative = rows_in_coordinates(equations, self.system.shapes_with_drives)
@@ -302,7 +302,7 @@ def _with_held_samples(
     begin : InitialMotion
         The state at the release, which is that of the held shape.
     held_count, count : int
-        Number of samples before the release, and of all samples.
+        The number of samples before the release, and of all samples.
     """
     laws = motion.port_forces.shape[1]
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
@@ -339,7 +339,7 @@ def _integrate_from(
     system, excitation, laws
         The system, its loads and prescribed motions, and the internal forces.
     first_time : float
-        Time of the state `begin` [s].
+        The time of the state `begin` [s].
     stamps : (N,) array
         Times at which the motion is computed [s].
     begin : InitialMotion
@@ -412,7 +412,7 @@ def _linear_steps(
     boundaries : Boundaries
         The K + 1 boundaries of the steps.
     port_displacements : (K + 1, J) array
-        Displacements of the laws' ports under the loads, in the modes without inertia [m].
+        The displacements of the laws' ports under the loads, in the modes without inertia [m].
     """
     time = boundaries.time
     begin_force, end_force = equivalent_ramps(

@@ -115,7 +115,7 @@ class PortScaleEstimator:
         Parameters
         ----------
         displacements : (L, N) array
-            Displacements of all unknowns, one row for each load level [m].
+            The displacements of all unknowns, one row for each load level [m].
         is_fitted : bool
             Whether the trial is fitted (dynamic and not held out).
         """
@@ -130,9 +130,9 @@ class PortScaleEstimator:
         Parameters
         ----------
         motion : Motion
-            Motion in a dynamic trial of T samples.
+            The motion in a dynamic trial of T samples.
         measured_force : float
-            Largest force that a channel measured in it [N].
+            The largest force that a channel measured in it [N].
         is_fitted : bool
             Whether the trial is fitted.
 
@@ -193,8 +193,8 @@ class PortScaleEstimator:
         Parameters
         ----------
         static_stiffness : sequence of float
-            Static stiffness of each port [N/m or N m/rad]; zero if it is not known and has to be
-            computed from the modes.
+            The static stiffness of each port [N/m or N m/rad]; zero if it is not known and has to
+            be computed from the modes.
         only_driven : bool
             Whether every trial is computed in time from recorded inputs. The computed motion is
             then complete: a port whose speed never changes its sign in it never reverses.
@@ -229,7 +229,7 @@ class PortScaleEstimator:
         static_stiffness : float
             Its static stiffness [N/m or N m/rad]; zero if it has to be computed from the modes.
         force : float
-            Its force scale from the trials [N or N m]; zero if nothing acted there.
+            The scale of the force at the port [N or N m]; zero if nothing acted there.
         """
         system = self.system
         fitted_displacement = float(self.fitted_displacement[port_index])

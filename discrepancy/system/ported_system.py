@@ -26,7 +26,7 @@ def ported_system(
     equations : sequence of OutputEquation
         The equation of each of the C outputs.
     shapes : (N, M) array
-        Shapes of the coordinates q, the columns of u = shapes q.
+        The shapes of the coordinates q, the columns of u = shapes q.
 
     Returns
     -------

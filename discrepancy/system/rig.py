@@ -52,9 +52,9 @@ class ControlLoop:
     measured : (4, N) ndarray
         Rows of the measured quantity, in the form of `OutputEquation.rows`.
     direction : (N,) ndarray
-        Load for a controller output of one.
+        The load for a controller output of one.
     error_integral : (N,) ndarray
-        Row of the unknown that is the integral of the error; zero without an integral gain.
+        The row of the unknown that is the integral of the error; zero without an integral gain.
     """
 
     section: ControllerSection
@@ -118,7 +118,7 @@ class Rig:
     Attributes
     ----------
     factors : mapping of str to float
-        Factors of the terms by name.
+        The factors of the terms by name.
     matrices : mapping of str to (N, N) ndarray
         Matrices by kind, and their parts by name.
     loops : mapping of str to ControlLoop
@@ -162,11 +162,11 @@ def build_rig(
     description : LumpedDescription
         The content of the model file.
     factors : mapping of str to float
-        Factors of the terms by name, from the values of the parameters.
+        The factors of the terms by name, from the values of the parameters.
     state : SystemState
         The structural patch and the temperature.
     places : sequence of PlaceSection
-        Places of masses in the order of their stations.
+        The places of masses in the order of their stations.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def _apply_patch(
     description : LumpedDescription
         The file's content, for the lever of the root.
     places : sequence of PlaceSection
-        Places of masses in the order of their stations.
+        The places of masses in the order of their stations.
     mass, stiffness : (n, n) arrays
         Matrices that are changed in place.
     """

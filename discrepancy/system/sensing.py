@@ -58,7 +58,7 @@ def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial,
     Parameters
     ----------
     trial : Trial
-        Trial with the stamps that its user gave.
+        The trial with the stamps that its user gave.
     patch : ModelPatch
         Patch whose time windows are given in these stamps; the windows are shifted too.
     """
@@ -90,10 +90,10 @@ def observe(
     Parameters
     ----------
     model : Model
-        Model that responds to the structure, force and load primitives of the patch. Sensors that
-        it has built in act before those of the patch.
+        The model that responds to the structure, force and load primitives of the patch. Sensors
+        that it has built in act before those of the patch.
     campaign : Campaign
-        Campaign with the channels that the trial names.
+        The campaign with the channels that the trial names.
     trial : Trial
         The trial, of which only the inputs and the sample times are used.
     patch : ModelPatch

@@ -317,7 +317,7 @@ class WingModel(SystemModel):
     name : str
         The name of the model in messages and reports.
     prior : mapping of str to (float, float)
-        Mean and standard deviation of the calibrated parameters, by the names of
+        The mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
     design : WingDesign, optional
         The design from which the arrays were made.

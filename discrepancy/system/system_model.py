@@ -53,7 +53,7 @@ class SystemModel(Model):
         Load place whose stiffness and modal mass are the natural ones; None: that of the first
         trial.
     cache_size : int
-        Number of systems that are kept; one of a wing takes 2 MB.
+        The number of systems that are kept; one of a wing takes 2 MB.
     """
 
     port_rows: Mapping[str, FloatArray]
@@ -91,7 +91,7 @@ class SystemModel(Model):
         state : SystemState
             The state of the system.
         change : ModelPatch
-            Load primitives that move the place.
+            The load primitives that move the place.
         """
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
@@ -427,7 +427,7 @@ class SystemModel(Model):
         Parameters
         ----------
         estimator : PortScaleEstimator
-            Collects the motions of the ports; changed in place.
+            The object that collects the motions of the ports; it is changed in place.
         campaign : Campaign
             The campaign: its trials, channels and noise records.
         is_held : bool

@@ -79,7 +79,7 @@ class RecordedHistory:
         time : (N,) ndarray
             The times of the samples [s].
         derivative : int
-            Order of the time derivative. Without a smooth course it is 0 or 1.
+            The order of the time derivative. Without a smooth course it is 0 or 1.
         """
         if self.hold is Hold.SMOOTH:
             # a load keeps its first and last value outside of the record; a motion goes on
