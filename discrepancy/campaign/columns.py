@@ -73,7 +73,7 @@ class LaboratoryColumn:
 
     @property
     def title(self) -> str:
-        """Name of the column in the campaign."""
+        """The name of the column in the campaign."""
         return self.head if self.is_channel else self.role.removeprefix(INPUT)
 
     def cells_in_si(self, decimal: str) -> tuple[str, ...]:
@@ -242,7 +242,7 @@ def gain_deviation(head: str, answer: str) -> float | str:
 
 
 def degrees_celsius(answer: str) -> float:
-    """Return the option `--reference-temperature` [degC].
+    """Return the temperature that the option `--reference-temperature` states [degC].
 
     Raise CampaignFileError if it is not a number.
     """

@@ -122,7 +122,7 @@ class LaboratoryImport:
         return self._deviations.assumed
 
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
-        """Return the import with one more answer.
+        """Return a new import that takes one more answer of the user into account.
 
         Parameters
         ----------
@@ -333,7 +333,7 @@ class LaboratoryImport:
         return units_of_columns(self.columns, self.kinds)
 
     def _trial_table(self, file: str) -> dict[str, Any]:
-        """Return the table `[[trial]]` of a file."""
+        """Return the table `[[trial]]` that `campaign.toml` needs for the trial in a file."""
         load_places = self.answers.get("load-place", {})
         hold = None
         for column in self.columns:

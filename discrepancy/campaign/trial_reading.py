@@ -258,7 +258,7 @@ def _channels_of_trial(
 def _read_channel(
     channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
-    """Read a channel's column of a trial.
+    """Read the readings of a channel from the table of a trial.
 
     An empty cell is replaced by interpolation and marked as not used, and a remark says so. Rows in
     the key `left_out` of the trial are marked as not used, too.

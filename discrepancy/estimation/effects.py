@@ -16,7 +16,7 @@ from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
 from .laws import LawForce, force_and_tangents
-from .linearised import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
+from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
 
 HALF_DIFFERENCE = 0.02
 """Half the difference of an unknown in a derivative by it; unknowns are standard normal."""

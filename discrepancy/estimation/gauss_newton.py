@@ -25,14 +25,8 @@ from discrepancy.missing_force.process_search import prior_log_density
 from discrepancy.missing_force.trial import PortedTrial
 
 from .laws import LawForce
-from .linearised import (
-    LawArguments,
-    LinearisedForce,
-    LinearisedSensorErrors,
-    LinearisedTrial,
-    SmoothedTrial,
-    Trajectory,
-)
+from .linearised import LinearisedTrial, SmoothedTrial
+from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
 
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""

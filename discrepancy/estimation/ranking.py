@@ -17,13 +17,13 @@ from discrepancy.missing_force.trial import PortedTrial
 
 from .estimator import SPEED_WINDOWS
 from .gauss_newton import EstimatorStart
-from .linearised import Trajectory
 from .refinement import (
     estimate_extended_hypothesis,
     hypothesis_of_estimate,
     laws_and_estimator,
     refine_hypotheses,
 )
+from .trajectory import Trajectory
 
 MOST_SAMPLES_OF_FIRST_ROUND = 3000
 """Number of samples of all trials together to which records are thinned in the first round. It is

@@ -20,7 +20,8 @@ from discrepancy.missing_force.trial import PortedTrial
 from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimator import COARSE_FACTORS, SPEED_WINDOWS, MotionEstimator
 from .gauss_newton import EstimatorStart, MotionEstimate
-from .linearised import SmoothedTrial, Trajectory
+from .linearised import SmoothedTrial
+from .trajectory import Trajectory
 
 MOST_REFINED = 4
 """Largest number of hypotheses that are estimated together with the motion, the most probable

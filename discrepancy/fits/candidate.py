@@ -55,7 +55,7 @@ class EffectTerm:
 
     @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
-        """The fitted parameters, in order."""
+        """The parameters of the effect that are fitted: its own, then those of a free shape."""
         if self.free_shape:
             return (*self.effect.parameters, *self.effect.shape)
         return self.effect.parameters
@@ -210,7 +210,7 @@ class Candidate:
         return np.concatenate([term.start_values() for term in self.terms])
 
     def with_term(self, term: EffectTerm) -> "Candidate":
-        """Return the candidate with one more effect."""
+        """Return the candidate that has one more effect than this one."""
         return Candidate((*self.terms, term))
 
     def subset_of_terms(

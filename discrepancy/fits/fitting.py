@@ -107,7 +107,7 @@ class CandidateFit(FitState):
 
     @property
     def chi_square(self) -> float:
-        """The sum of squared standardised residuals."""
+        """The sum of the squared residuals of all channels, in units of the noise variance."""
         return float(self.squares_by_channel.sum())
 
 

@@ -493,7 +493,7 @@ def _outcome_of_comparison(
     gates: tuple[Gate, ...] = (),
     resembles: tuple[str, ...] = (),
 ) -> VerdictOutcome:
-    """Return a verdict that lists all hypotheses.
+    """Return a verdict that lists all hypotheses of a comparison with their probabilities.
 
     Parameters
     ----------

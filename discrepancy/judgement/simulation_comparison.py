@@ -189,7 +189,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         return self._free_shape_fits.get(hypothesis.candidate.key)
 
     def start_point(self, hypothesis: CandidateFit) -> Point:
-        """Return the fitted point of a hypothesis."""
+        """Return the values of all unknowns of a hypothesis, at which the simulation was fitted."""
         return hypothesis.point
 
     def check_fit(self, hypothesis: CandidateFit) -> Gate:

@@ -42,7 +42,7 @@ class OmnibusTest:
 
 
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
-    """Group the channels by their noise record.
+    """Group the channels that share one noise record.
 
     Channels with equal stated noise share one record, so that their variance tests are not
     independent. A recorded noise belongs to its own channel. Channels without a noise record are

@@ -74,7 +74,7 @@ class TrialsOfKind(NamedTuple):
     def disagreement(
         self, subject: str, dependence: str, phrase: str, share: float, p_value: float
     ) -> Disagreement:
-        """Return a finding in these trials.
+        """Return the record of a finding on these trials, with the sentence that tells it.
 
         Parameters
         ----------

@@ -83,7 +83,7 @@ class FittedTrial:
 
     @property
     def used(self) -> BoolArray:
-        """Samples that are used, (N, C)."""
+        """Whether each of the N samples of C channels is compared with the model, (N, C)."""
         return self.trial.used
 
     @cached_property

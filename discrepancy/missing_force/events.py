@@ -84,7 +84,8 @@ class EventSearch(EventTrials):
     def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
         """Return the information of each trial on the shared unknowns, given forces and paths."""
         return [
-            SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)
+            SwitchedRecord(self, number, forces).products(is_on)
+            for number, is_on in enumerate(paths)
         ]
 
     def fit_forces(
@@ -155,10 +156,10 @@ class EventSearch(EventTrials):
         """
         new_paths = list(paths)
         products = self.products(forces, paths)
-        for number, on in enumerate(paths):
+        for number, is_on in enumerate(paths):
             products_of_others = products[:number] + products[number + 1 :]
             record = SwitchedRecord(self, number, forces, products_of_others)
-            better_path: BoolArray | None = on
+            better_path: BoolArray | None = is_on
             for _ in range(2 * MOST_EVENTS):
                 if better_path is None:
                     break
@@ -208,16 +209,16 @@ class Events:
 
         A change is the moment at which the force of events begins or ends.
         """
-        on = self.paths[trial_index]
+        is_on = self.paths[trial_index]
         time = self.search.trials[trial_index].time
         # divide the intervals of a short record, so that a change may lie between samples
-        substeps = max(1, CHANGE_GRID_SIZE // len(on))
+        substeps = max(1, CHANGE_GRID_SIZE // len(is_on))
         record = self.switched_record(trial_index, substeps)
-        fine_path = np.repeat(on, substeps)[: (len(on) - 1) * substeps + 1]
-        times_of_changes = np.zeros((len(change_samples(on)), 3))
+        fine_path = np.repeat(is_on, substeps)[: (len(is_on) - 1) * substeps + 1]
+        times_of_changes = np.zeros((len(change_samples(is_on)), 3))
         for change in range(len(times_of_changes)):
             samples, log_evidence = record.evidence_of_change_samples(fine_path, change)
-            sample_times = np.interp(samples / substeps, np.arange(len(on)), time)
+            sample_times = np.interp(samples / substeps, np.arange(len(is_on)), time)
             # posterior density of the time of the change, integrated by the trapezoidal rule; its
             # quantiles are found by inverse interpolation
             density = np.exp(log_evidence - log_evidence.max())
@@ -272,7 +273,7 @@ def find_events(
     if stride > 1:
         best_events = _refine_to_all_samples(best_events, stride)
         steady = _refine_to_all_samples(steady, stride)
-    has_changes = any(len(change_samples(on)) for on in best_events.paths)
+    has_changes = any(len(change_samples(is_on)) for is_on in best_events.paths)
     if has_changes and best_events.score > max(least_score, steady.score):
         return best_events
     return steady
@@ -298,8 +299,8 @@ def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
         coarse_events.search.linear_trials, coarse_events.search.port, coarse_events.search.process
     )
     paths = [
-        np.repeat(on, stride)[: len(trial.time)]
-        for on, trial in zip(coarse_events.paths, search.trials, strict=True)
+        np.repeat(is_on, stride)[: len(trial.time)]
+        for is_on, trial in zip(coarse_events.paths, search.trials, strict=True)
     ]
     events_in_all_samples = Events(search, coarse_events.forces, paths, -np.inf)
     # `events_in_all_samples` refers to `paths`, which is changed here: the changes of each trial

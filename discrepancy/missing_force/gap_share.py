@@ -56,7 +56,7 @@ class GapShare:
 
     @property
     def value(self) -> float:
-        """The share over all blocks."""
+        """The share of the gap that the hypothesis explains, over all blocks together."""
         return float(
             _share_of(self.squares_before.sum(), self.squares_after.sum(), self.noise_squares.sum())
         )

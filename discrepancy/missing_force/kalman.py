@@ -150,7 +150,7 @@ def filter_forward(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the filtered state before some samples, from the readings since sample `first_sample`.
 
-    The readings of the sample before a queried one are the last ones that its state contains.
+    The state at a queried sample contains the readings up to the sample before it.
 
     Parameters
     ----------

@@ -279,7 +279,7 @@ class PortedTrial:
 
     @cached_property
     def fine_time(self) -> FloatArray:
-        """The fine stamps (F,) [s]."""
+        """The times (F,) of the fine stamps, which are the ends of all substeps [s]."""
         return subdivide(self.time, self.substeps)
 
     def port_motion(

@@ -86,7 +86,7 @@ class FittedCandidates:
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
     def best(self) -> CandidateFit:
-        """Return the most probable candidate."""
+        """Return the fit of the most probable candidate among the compared fits."""
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:

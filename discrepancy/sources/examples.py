@@ -391,7 +391,7 @@ def _simulate_readings(
     gains: Mapping[str, float],
     generator: np.random.Generator,
 ) -> Trial:
-    """Return a trial with simulated readings.
+    """Return a trial whose readings are simulated by the model, with noise.
 
     Parameters
     ----------

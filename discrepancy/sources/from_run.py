@@ -214,7 +214,7 @@ def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, re
 
 
 def _flight_remarks(is_used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
-    """Return the remarks on a flight.
+    """Return the remarks on a flight: its length, its noise, and its lost readings.
 
     Parameters
     ----------

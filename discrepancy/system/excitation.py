@@ -29,7 +29,7 @@ class Load(NamedTuple):
     derivative: int = 0
 
     def values_at(self, time: FloatArray) -> FloatArray:
-        """Return the values (T,) at times [s]."""
+        """Return the values (T,) of the load at T times [s]."""
         return self.history.values_at(time, self.derivative)
 
 

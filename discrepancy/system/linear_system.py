@@ -55,7 +55,7 @@ class ModalFrequencies(Protocol):
 
     @property
     def frequency(self) -> FloatArray:
-        """Frequencies (M,) [Hz]."""
+        """The natural frequencies (M,) of the M modes [Hz]."""
 
 
 class SolvedStructure(Protocol):
@@ -63,11 +63,11 @@ class SolvedStructure(Protocol):
 
     @property
     def modes(self) -> ModalFrequencies:
-        """Modes with inertia."""
+        """The natural frequencies of the modes that have inertia."""
 
     @property
     def mode_shapes(self) -> FloatArray:
-        """Mass-normalised shapes (n, M) of these modes."""
+        """The mass-normalised shapes (n, M) of the M modes with inertia."""
 
     def static(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (n,) or (n, k)."""
@@ -140,12 +140,12 @@ class LinearSystem:
 
     @property
     def unknown_count(self) -> int:
-        """Number N of unknowns."""
+        """The number N of unknowns: displacements, then states of first order."""
         return len(self.mass)
 
     @property
     def displacement_count(self) -> int:
-        """Number n of displacements."""
+        """The number n of the unknowns that are displacements."""
         return self.unknown_count - self.state_count
 
     @property
@@ -256,7 +256,7 @@ class LinearSystem:
 
     @property
     def shapes(self) -> FloatArray:
-        """Mass-normalised shapes (N, M) of the modes."""
+        """The mass-normalised shapes (N, M) of the M modes in N unknowns."""
         return self.modes.shapes
 
     @property
@@ -347,7 +347,7 @@ class LinearSystem:
 
     @cached_property
     def _inverse_cholesky(self) -> FloatArray:
-        """L^-1 of the stiffness L L^T."""
+        """The inverse L^-1 of the Cholesky factor of the stiffness K = L L^T."""
         try:
             return np.linalg.inv(np.linalg.cholesky(self.stiffness))
         except np.linalg.LinAlgError as cause:

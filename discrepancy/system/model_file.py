@@ -66,7 +66,7 @@ class ModelDescription(Section):
 
     @classmethod
     def parse(cls, content: object, source: str = "the model") -> Self:
-        """Check the content of a file.
+        """Check the content of a model file, and return its description.
 
         Raises
         ------

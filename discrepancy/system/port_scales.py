@@ -216,7 +216,7 @@ class PortScaleEstimator:
     def _port_scale(
         self, port_index: int, static_stiffness: float, force: float, *, only_driven: bool
     ) -> PortScale:
-        """Return the scale of one port.
+        """Return the typical force, displacement and stiffness of one port.
 
         There are three cases: a port that a mode without stiffness moves, or no mode at all, is
         scaled by the forces and motions of the trials; a port on springs that drives alone move,

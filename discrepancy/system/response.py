@@ -53,7 +53,7 @@ class Conditions:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """All conditions as a hashable value."""
+        """All conditions as one hashable value, under which a response is kept in a cache."""
         return (
             self.parameters.tobytes(),
             self.initial.tobytes(),

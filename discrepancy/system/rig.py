@@ -35,7 +35,7 @@ class OffsetInput(NamedTuple):
 
     @property
     def values(self) -> FloatArray:
-        """The values (N,) that truly acted."""
+        """The values (N,) that truly acted: the recorded values plus the constant [SI]."""
         return self.recorded.values + self.offset
 
 

@@ -59,15 +59,15 @@ class StructureWithMatrices(SolvedStructure, Protocol):
 
     @property
     def mass(self) -> FloatArray:
-        """Mass matrix (n, n)."""
+        """The mass matrix (n, n) of the structure."""
 
     @property
     def stiffness(self) -> FloatArray:
-        """Stiffness matrix (n, n)."""
+        """The stiffness matrix (n, n) of the structure."""
 
     @property
     def mode_count(self) -> int:
-        """Number of modes with inertia."""
+        """The number of modes that have inertia."""
 
     @property
     def rigid_ports(self) -> frozenset[str]:
@@ -278,7 +278,7 @@ def _linear_system(
     rayleigh: Iterable[float],
     ports: Mapping[str, FloatArray],
 ) -> LinearSystem:
-    """Return a structure as a linear system.
+    """Return the linear system of a structure in a given state.
 
     Parameters
     ----------

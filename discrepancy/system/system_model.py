@@ -217,7 +217,7 @@ class SystemModel(Model):
         return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
 
     def simulate_motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
-        """Return the motion in a dynamic trial.
+        """Simulate a dynamic trial, and return its motion.
 
         Raises
         ------

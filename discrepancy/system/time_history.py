@@ -22,7 +22,7 @@ class LoadHistory(Protocol):
 
     @property
     def hold(self) -> Hold | None:
-        """How the load is interpolated between samples."""
+        """The way in which the load is interpolated between its samples."""
 
     @property
     def jump_times(self) -> FloatArray:

@@ -6,8 +6,8 @@ import pytest
 from discrepancy.estimation.effects import EffectLaws
 from discrepancy.estimation.estimator import MotionEstimator
 from discrepancy.estimation.gauss_newton import EstimatorStart
-from discrepancy.estimation.linearised import Trajectory
 from discrepancy.estimation.refinement import refine_hypotheses, unknowns_of_model_laws
+from discrepancy.estimation.trajectory import Trajectory
 from discrepancy.fits.candidate import Candidate
 from discrepancy.missing_force.naming import ForceSearch
 from tests.discrepancy.missing_force.test_force import CART, CART_IN_AIR, available, blind
