@@ -473,24 +473,24 @@ def sample(
             )
         else:
             library_grid = grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
-        sampled = sample_library(
+        sampling_outcome = sample_library(
             library_grid, out, workers=workers, resume=resume, replace_existing=replace
         )
-    _print_library(sampled)
+    _print_library(sampling_outcome)
 
 
-def _print_library(sampled: "SamplingOutcome") -> None:
+def _print_library(outcome: "SamplingOutcome") -> None:
     """Print the file of an observation library, its shape, and the effort of the sampling.
 
     The effort is the number of processes, the time, and, after an interruption, the number of
     blocks that were kept and not sampled again.
     """
-    library = sampled.library
+    library = outcome.library
     shape = " x ".join(map(str, library.values.shape))
     kept_blocks = ""
-    if sampled.kept_blocks:
-        kept_blocks = f", {sampled.kept_blocks} of {sampled.block_count} blocks kept"
+    if outcome.kept_blocks:
+        kept_blocks = f", {outcome.kept_blocks} of {outcome.block_count} blocks kept"
     terminal.say(
-        f"{sampled.path}: {shape} (draws, states, controls, sensors), {sampled.workers} processes, "
-        f"{sampled.seconds:.1f} s{kept_blocks}, FMU {library.fmu_hash[:12]}"
+        f"{outcome.path}: {shape} (draws, states, controls, sensors), {outcome.workers} processes, "
+        f"{outcome.seconds:.1f} s{kept_blocks}, FMU {library.fmu_hash[:12]}"
     )
