@@ -260,7 +260,7 @@ class Search(FittedCandidates):
     # ---------------------------------------------------------------- exact fits
 
     def fit_best_exactly(
-        self, rough_fits: Sequence[CandidateFit], least_allowed_score: float
+        self, rough_fits: Sequence[CandidateFit], floor_score: float
     ) -> list[CandidateFit]:
         """Fit the best of some rough fits to convergence, and return them, the best first.
 
@@ -268,17 +268,15 @@ class Search(FittedCandidates):
         ----------
         rough_fits : sequence of CandidateFit
             The rough fits, the best first.
-        least_allowed_score : float
+        floor_score : float
             The score below which no candidate is fitted to convergence.
         """
         if not rough_fits:
             return []
         best_score = self.score(rough_fits[0])
         # far from the truth, the scores after few steps are only roughly in order
-        margin = max(
-            SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - least_allowed_score)
-        )
-        least_score = max(best_score - margin, least_allowed_score)
+        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor_score))
+        least_score = max(best_score - margin, floor_score)
         promising_fits = [
             fit for fit in rough_fits[: SEARCH.most_exact_fits] if self.score(fit) > least_score
         ]
@@ -316,9 +314,8 @@ class Search(FittedCandidates):
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
         rough_fits = self.fit_one_more_effect(self.no_effect, self.effects)
-        self.fit_best_exactly(
-            rough_fits, self.score(self.no_effect) - SEARCH.largest_single_deficit
-        )
+        floor_score = self.score(self.no_effect) - SEARCH.largest_single_deficit
+        self.fit_best_exactly(rough_fits, floor_score)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
@@ -389,12 +386,10 @@ class Search(FittedCandidates):
         """
         if not self.is_unexplained() and not self.best().candidate.has_free_shape:
             return
-        single_effect_fits = [
-            fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1
-        ]
-        if not single_effect_fits:
+        single_fits = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
+        if not single_fits:
             return
-        leading_fit = max(single_effect_fits, key=self.score)
+        leading_fit = max(single_fits, key=self.score)
         if self._is_in_optimum_of_estimate(leading_fit):
             return
         (leading_term,) = leading_fit.candidate.terms
@@ -442,9 +437,8 @@ class Search(FittedCandidates):
                 effect for effect in self.effects if effect.identifier not in present_identifiers
             ]
             rough_fits = self.fit_one_more_effect(current_fit, other_effects)
-            exact_fits = self.fit_best_exactly(
-                rough_fits, current_score - SEARCH.largest_longer_set_deficit
-            )
+            floor_score = current_score - SEARCH.largest_longer_set_deficit
+            exact_fits = self.fit_best_exactly(rough_fits, floor_score)
             if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
             current_fit = exact_fits[0]

@@ -214,7 +214,7 @@ class LumpedModel(DescribedModel, SystemModel):
             offset_inputs[recorded_input.name] = OffsetInput(recorded_input, offset)
         return offset_inputs
 
-    def _section_of(self, trial: Trial, recorded_input: RecordedInput) -> InputSection:
+    def _section_of(self, trial: Trial, record: RecordedInput) -> InputSection:
         """Return the section [[input]] of the model for an input that a trial records.
 
         Raises
@@ -223,26 +223,22 @@ class LumpedModel(DescribedModel, SystemModel):
             If the model has no such input, or one of another quantity, or if a motion or state that
             is prescribed goes in steps or corners.
         """
-        section = self._inputs.get(recorded_input.name)
+        section = self._inputs.get(record.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {recorded_input.name!r}, which "
+                f"The trial {trial.name!r} records the input {record.name!r}, which "
                 f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
         motion_chain = section.quantity.motion_chain
-        if (
-            recorded_input.quantity is not section.quantity
-            and recorded_input.quantity not in motion_chain
-        ):
+        if record.quantity is not section.quantity and record.quantity not in motion_chain:
             raise ModelError(
-                f"The input {recorded_input.name!r} of {self.quoted_name} is "
-                f"{section.quantity.value}, but the trial {trial.name!r} records "
-                f"{recorded_input.quantity.value}."
+                f"The input {record.name!r} of {self.quoted_name} is {section.quantity.value}, "
+                f"but the trial {trial.name!r} records {record.quantity.value}."
             )
-        if section.is_prescribed and recorded_input.hold not in (None, Hold.SMOOTH):
+        if section.is_prescribed and record.hold not in (None, Hold.SMOOTH):
             prescribed = "state" if section.prescribes_state else "motion"
             raise ModelError(
-                f"The input {recorded_input.name!r} of the trial {trial.name!r} is a {prescribed} "
+                f"The input {record.name!r} of the trial {trial.name!r} is a {prescribed} "
                 f"that {self.name!r} prescribes, which no drive makes in steps or corners: leave "
                 "`reference` and `hold` out."
             )
