@@ -33,6 +33,7 @@ from fe.runtime.patch import (
     ModulusTemperature,
     PointMass,
     Primitive,
+    RegionStiffnessLoss,
     RootCompliance,
     Washout,
 )
@@ -50,6 +51,8 @@ POISSON = 0.3
 GRAVITY = 9.80665
 LOAD_STATION = 1.65  # m, of the place "tip_load"
 DAMPING_RATIO = 0.006
+REGIONS = {"inner": (0.2, 0.4), "outer": (0.8, 1.1)}
+"""First and last station [m] of the damage regions of `CantileverWithRegions`."""
 GAUGES = {"strain[0]": 0.25, "strain[1]": 0.85, "strain[2]": 1.35}  # m
 STEP = LENGTH / ELEMENTS
 SIZE = 2 * ELEMENTS + 1  # root rotation, then displacement and rotation of each node
@@ -165,7 +168,7 @@ class Cantilever(Model):
     name = "cantilever"
     ports = tuple(PORTS)
     shows_ports = False
-    stations = 0.0, LENGTH
+    stations: tuple[float, float] | None = (0.0, LENGTH)
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -222,6 +225,30 @@ class Cantilever(Model):
         sheared = [name.endswith(ACROSS[1]) for name, _ in outputs]
         values[:, sheared] = torque[:, None] * 2.0 * SKIN / TORSIONAL_STIFFNESS
         return Response(values, rates)
+
+
+class CantileverWithRegions(Cantilever):
+    """The cantilever as a structure that can lose stiffness in its damage regions alone."""
+
+    name = "cantilever with regions"
+    regions = tuple(REGIONS)
+    stations = None
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the structure can carry a primitive: all but a loss anywhere along its length."""
+        return primitive is not LocalStiffnessLoss
+
+    def _respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the response of a trial, with losses of regions as losses over their stretches."""
+        primitives: list[Primitive] = []
+        for primitive in patch:
+            if isinstance(primitive, RegionStiffnessLoss):
+                begin, end = REGIONS[primitive.region]
+                primitive = LocalStiffnessLoss(primitive.loss, begin, end - begin)
+            primitives.append(primitive)
+        return super()._respond(trial, outputs, ModelPatch(tuple(primitives)), conditions)
 
 
 def _motion(

@@ -1,4 +1,4 @@
-"""Write the pages of docs/effects from the catalogue, hand-written paragraphs, and pictures.
+"""Write the pages of docs/reference/effects from the catalogue, paragraphs and pictures.
 
 ``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they
 are.
@@ -10,7 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.effect_pictures import FLOWS, draw, picture_of, picture_patch, picture_setting
+from benchmarks.effect_pictures import (
+    FLOWS,
+    REGION_LOSSES,
+    draw,
+    picture_of,
+    picture_patch,
+    picture_setting,
+)
 from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import KIND_NAMES
@@ -35,7 +42,7 @@ def range_of(prior: Prior) -> str:
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
-    structure = "Tank" if tank else "Cantilever"
+    structure = "tank" if tank else "cantilever"
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = []
@@ -44,7 +51,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         rows.append(f"- {p.symbol} (`{p.name}`{unit}): {p.description}; {range_of(p.prior)}.")
     free = [
         f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, "
-        f"in the family {range_of(s.prior)}."
+        f"and in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
     parameters = ", ".join(f"{name} {value:g}" for name, value in values.items())
@@ -65,9 +72,13 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         *([text["unit"], ""] if text["unit"] else []),
         f"![{effect.identifier}](images/{effect.identifier}.png)",
         "",
-        f"{structure}: {parameters}" + (f", place `{place}`." if place else "."),
+        f"The picture shows the effect on a {structure}: {parameters}"
+        + (f", place `{place}`." if place else "."),
         "",
         "## Confused with",
+        "",
+        "These effects look similar. Each line says which measurement separates the two:",
+        "",
         *(
             f"- [`{confused}`]({confused}.md): {text['tell'][confused]}"
             for confused in effect.confusable
@@ -102,7 +113,7 @@ def pages() -> dict[str, str]:
         f"{effect.identifier}.md": page(
             effect,
             texts[effect.identifier],
-            picture_setting(effect) if effect.identifier in FLOWS else beam,
+            picture_setting(effect) if effect.identifier in (*FLOWS, *REGION_LOSSES) else beam,
         )
         for effect in library()
     }

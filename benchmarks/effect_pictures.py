@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from benchmarks.cantilever import Cantilever, campaign
+from benchmarks.cantilever import Cantilever, CantileverWithRegions, campaign
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.catalogue.entry import Effect, Setting
@@ -21,6 +21,8 @@ FloatArray = NDArray[np.float64]
 RESOLUTION = 88.0
 FLOWS = ("outflow", "overflow")
 """Effects that act on a store, not on a structure."""
+REGION_LOSSES = ("region_stiffness_loss",)
+"""Effects on a structure that can lose stiffness in its damage regions alone."""
 
 # Factor and unit of each quantity in a picture.
 UNITS = {
@@ -289,6 +291,7 @@ PICTURES: dict[str, Picture] = {
     "local_stiffness_loss": Picture(
         {"loss": 0.3, "start_ratio": 0.4, "length_ratio": 0.15}, (ratios("up"), load_line("g1"))
     ),
+    "region_stiffness_loss": Picture({"loss": 0.3}, (ratios("up"), load_line("g0")), "inner"),
     "temperature_dependent_modulus": Picture(
         {"coefficient": 4e-3}, (load_line("tip", ("warm",)), ratios("up", "warm"))
     ),
@@ -383,10 +386,12 @@ def picture_of(effect: Effect) -> Picture:
 
 
 def picture_setting(effect: Effect | None = None) -> Setting:
-    """Return the setting of a picture: the cantilever, or for flows a tank."""
+    """Return the setting of a picture: a cantilever, or for flows a tank."""
     if effect is not None and effect.identifier in FLOWS:
         return tank_setting()
-    cantilever_campaign, model = campaign(), Cantilever()
+    has_regions = effect is not None and effect.identifier in REGION_LOSSES
+    cantilever_campaign = campaign()
+    model = CantileverWithRegions() if has_regions else Cantilever()
     return Setting(cantilever_campaign, model, model.scales(cantilever_campaign))
 
 

@@ -1,4 +1,4 @@
-"""Accuracy of begin and end of events: `python -m benchmarks.event_moments [--count 200]`.
+"""Accuracy of the beginning and end of events: `python -m benchmarks.event_moments [--count 200]`.
 
 Records of 300 to 2,000 samples of noise, white or of correlation 0.5, half of them with a jitter of
 2 % of the interval. In each an event of 5 to 20 noise deviations (rms) begins at any moment, also
@@ -47,7 +47,7 @@ def event(generator: np.random.Generator, kind: str, count: int, size: float) ->
 def record(
     generator: np.random.Generator, kind: str | None
 ) -> tuple[FloatArray, FloatArray, tuple[float, ...]]:
-    """Return times (N,) and residuals (N,) of a record, and the true begin and end of its event."""
+    """Return times (N,) and residuals (N,) of a record, and the true ends of its event."""
     count = int(generator.integers(300, 2001))
     time = np.arange(count, dtype=np.float64) * 0.01
     if generator.random() < 0.5:

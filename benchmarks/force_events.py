@@ -1,4 +1,4 @@
-"""Accuracy of begin and end of temporary forces: `python -m benchmarks.force_events DIR`.
+"""Accuracy of the beginning and end of temporary forces: `python -m benchmarks.force_events DIR`.
 
 Rigs of three kinds by equations written out here and a general integrator: a heated block, two
 tanks, a mass on a spring. In each record something acts for a while, once or twice: a brief power
@@ -48,7 +48,7 @@ class Case:
     folder : Path
         Folder of the campaign.
     windows : tuple of (float, float)
-        Begin and end of each event [s].
+        Beginning and end of each event [s].
     length : float
         Duration of the record [s].
     """

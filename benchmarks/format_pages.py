@@ -67,8 +67,10 @@ def _page_of(file_format: FileFormat) -> str:
     title = file_format.title[:1].upper() + file_format.title[1:]
     name = Path(file_format.page).stem.replace("_", " ")
     head = (
-        f"{_NOTE}\n# {title}\n\nThe keys; [{name}](../../{file_format.page}) explains their use. "
-        f"JSON Schema: `uav-twin schema {file_format.name}`; all formats: [list](index.md).\n\n"
+        f"{_NOTE}\n# {title}\n\nThis page lists the keys of the format. The page "
+        f"[{name}](../../{file_format.page}) explains how they are used. `uav-twin schema "
+        f"{file_format.name}` prints the JSON Schema. There is a [list of all "
+        "formats](index.md).\n\n"
     )
     return head + format_page(file_format.schema(), file_format.notation)
 

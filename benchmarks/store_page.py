@@ -39,9 +39,9 @@ _INTRODUCTION = """\
 <!-- Written by `python -m benchmarks.store_page` from `twin_master/store/run.toml`. -->
 # Stores of runs and fleets
 
-What `run.nc` of a run or a watch and `fleet.zarr` of a fleet contain. What they share has the same
-groups, variables, axes, labels and units. In a store of a fleet every variable has the axis `twin`
-before its others.
+This page lists the contents of `run.nc` of a run or a watch, and of `fleet.zarr` of a fleet. Where
+both have the same contents, they have the same groups, variables, axes, labels and units. In a
+store of a fleet every variable has the axis `twin` before its others.
 
 ```python
 import uav_twin
@@ -55,10 +55,10 @@ fleet.sel(region="z1")["north"]["filtered"]["mean"]    # (twin, step)
 fleet["north"].sel(twin="north-3")["observed"]["strain"]    # (step, sensor)
 ```
 
-A word in upper case stands for a name of the run: ROLE is what is observed, such as `strain`,
-FACTOR a factor of the state, such as `z1`. A unit in upper case is that of the scenario or binding.
-Where sensors have different units, the unit is `see sensor_unit`. Every variable has its unit and
-meaning in `.attrs["units"]` and `.attrs["long_name"]`.
+A word in upper case stands for a name of the run: ROLE is the observed quantity, such as `strain`,
+and FACTOR a factor of the state, such as `z1`. A unit in upper case is that of the scenario or
+binding. Where sensors have different units, the unit is `see sensor_unit`. Every variable has its
+unit and meaning in `.attrs["units"]` and `.attrs["long_name"]`.
 
 Stores of fleets of earlier versions are read in this layout, with one sentence for each file.
 """

@@ -142,7 +142,7 @@ def read_lengths(path: Path) -> Lengths:
     ------
     ExperimentFileError
         If the file is missing, empty, lacks a column or a row, names a length twice, has a row
-        whose number of cells is not that of its header, or a cell that is no number.
+        whose number of cells is not that of its header, or a cell that is not a number.
     ExperimentDataError
         If a value is not positive and finite, or the lengths are in another unit.
     """

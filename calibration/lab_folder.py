@@ -49,7 +49,7 @@ def lab_table(path: Path | str, name: Path) -> TextTable:
     Raises
     ------
     ExperimentFileError
-        If there is no such file, or it is no table.
+        If there is no such file, or it is not a table.
     """
     path = Path(path)
     if not path.exists():

@@ -116,8 +116,9 @@ def apply_verdict(
     if path.suffix == ".toml":
         if not has_laws_only:
             raise ModelError(
-                f"{path}: only laws at the ports of a lumped model can stand in its own file; give "
-                "--out with the ending .json, which is taken wherever a model is."
+                f"{path}: only laws at the ports of a lumped model can be written into its own "
+                "file; give --out with the ending .json, which can be given wherever a model is "
+                "expected."
             )
         atomic_write_text(path, _lumped_text(choice, patch))
     else:
@@ -149,7 +150,7 @@ def _check_destination(
     sources = (choice.file, *choice.beneath, choice.path or "", verdict_file, patch_file)
     if path.exists() and path.resolve() in {Path(source).resolve() for source in sources}:
         raise FileNotWrittenError(
-            f"{path} is what the patched model is made of: choose another --out."
+            f"{path} is a file from which the patched model is made: choose another --out."
         )
     refuse_existing(path, replace=replace)
 
@@ -166,11 +167,11 @@ def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> 
     """Return how certain the effects of a patch are, as the end of a sentence."""
     certainty = {
         VerdictKind.NAMED: "named",
-        VerdictKind.NAMED_IN_PART: "named in part: what is left has no name",
+        VerdictKind.NAMED_IN_PART: "named in part: the remainder has no name",
         VerdictKind.FAMILY: "of which the family is named, not the law",
         VerdictKind.GROUP: (
-            "one of a group that the data cannot tell apart: no name (of "
-            f"{', '.join(stored.verdict.group)})"
+            "one of a group that the data cannot tell apart, and not a name (group: "
+            "{', '.join(stored.verdict.group)})"
         ),
         VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
     }
@@ -213,7 +214,7 @@ def _patch_to_apply(
     if member is not None and (not is_group or member not in verdict.group):
         members = ", ".join(map(repr, verdict.group)) if is_group else "no group"
         raise DiscrepancyError(
-            f"--member {member!r} is none of {file}, which has {members}: leave it out."
+            f"--member {member!r} is not in the group of {file}, which has {members}: leave it out."
         )
     if stored.proof is not None and stored.proof.has_grown:
         raise DiscrepancyError(
@@ -229,7 +230,9 @@ def _patch_to_apply(
     elif verdict.kind in files.APPLIED:
         hypothesis = _hypothesis(verdict, member)
     if hypothesis is None:
-        reason = _NOTHING_TO_APPLY.get(verdict.kind, "it lacks what it names")
+        reason = _NOTHING_TO_APPLY.get(
+            verdict.kind, "the effects that the verdict names are missing from the file"
+        )
         raise DiscrepancyError(f"{file} gives nothing to apply: {reason}.")
     residuals_file = file.parent / RESIDUALS_NAME
     channels: dict[str, str] = {}
@@ -246,12 +249,10 @@ def _patch_to_apply(
 
 
 _NOTHING_TO_APPLY = {
-    VerdictKind.NOTHING_MISSING: "nothing is missing, and the model stands as it is",
-    VerdictKind.BELOW_LIMIT: "what may be missing is too small to tell from noise",
-    VerdictKind.DATA_ERROR: "the data are at fault; mend them first",
-    VerdictKind.UNEXPLAINED: (
-        "its residuals show no hypothesis with which the error is less than without it"
-    ),
+    VerdictKind.NOTHING_MISSING: "nothing is missing, and the model needs no change",
+    VerdictKind.BELOW_LIMIT: "an effect may be missing, but it cannot be distinguished from noise",
+    VerdictKind.DATA_ERROR: "the data contain a fault; correct them first",
+    VerdictKind.UNEXPLAINED: ("none of its hypotheses makes the error of the model smaller"),
 }
 """Why a verdict gives nothing to apply."""
 
@@ -365,8 +366,8 @@ def pack_patched(
     """
     if choice.design is None:
         raise ModelError(
-            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with "
-            "the ending .json, which is taken wherever a model is."
+            f"{path}: only a wing is packed with its effects; for {choice.label} give --out with "
+            "the ending .json, which can be given wherever a model is expected."
         )
     effect_tables = []
     for stored_effect in patch.effects:

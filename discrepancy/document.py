@@ -33,8 +33,8 @@ PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in
 or second)."""
 
 _MEANING_OF_VALUE = {
-    "along_chord": "How much further aft the force acts.",
-    "along_span": "How much further outboard the force acts.",
+    "along_chord": "Distance by which the force acts further aft.",
+    "along_span": "Distance by which the force acts further outboard.",
     "amplitude": "Change of the zero after `time`.",
     "angle": "Angle by which the gauge is turned.",
     "channel": 'Name of the channel, or "*" for all channels of `quantity`.',
@@ -64,8 +64,9 @@ _MEANING_OF_VALUE = {
     "port": "Name of the port.",
     "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
     "rate": "Relative change in each unit of time.",
-    "reference_displacement": "Displacement by which that of the law is divided.",
-    "reference_velocity": "Speed by which that of the law is divided.",
+    "region": "Name of the damage region.",
+    "reference_displacement": "Displacement by which the displacement of the law is divided.",
+    "reference_velocity": "Speed by which the speed of the law is divided.",
     "run": "Label of the run.",
     "side": "Sign of the displacement on which the law acts; 0 for both.",
     "sine": "Amplitude of the sine.",
@@ -109,11 +110,11 @@ def _number(value: object) -> float:
     if value is None or isinstance(value, str):
         if value not in _WORDS:
             raise ValueError(
-                f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came'
+                f'a number, null, "Infinity" or "-Infinity" is expected, but {value!r} was given'
             )
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise ValueError(f"a finite number is expected, and {value!r} came")
+        raise ValueError(f"a finite number is expected, but {value!r} was given")
     return float(value)
 
 
@@ -329,7 +330,7 @@ def read_document(
     content = read_json(path, VerdictFileError)
     schema_of_file = content.pop("schema", None) if isinstance(content, dict) else None
     if schema_of_file != schema and schema_of_file not in older:
-        what = f"of the schema {schema_of_file!r}" if schema_of_file else "no file of this kind"
+        what = f"of the schema {schema_of_file!r}" if schema_of_file else "not a file of this kind"
         raise VerdictFileError(f"{path} is {what}, but {schema!r} is needed.")
     if schema_of_file != schema:
         content = {**absent, **content}

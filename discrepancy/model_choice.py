@@ -127,7 +127,7 @@ def _choose(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix not in ("", ".toml"):
         shipped_names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
         raise ModelError(
-            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped "
+            f"{path} is not a model: a calibration (.nc), a wing design, a structure or a lumped "
             "model (.toml), a patch (.json), or the name of a shipped lumped model "
             f"({comma_list(shipped_names)}) is expected."
         )
@@ -152,7 +152,7 @@ def _choose(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _refuse_near_structure(name: str) -> None:
-    """Refuse a name that is no lumped model, but like that of a shipped structure."""
+    """Refuse a name that is not a lumped model, but like that of a shipped structure."""
     question = did_you_mean(name, structure_files())
     if question and not (SHIPPED_MODELS / f"{name}.toml").exists():
         raise ModelError(f"There is no model {name!r}.{question}")
@@ -212,8 +212,8 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
         model_file = Path(file).parent / model_file.name
         if not model_file.exists():
             raise ModelError(
-                f"The model {origin.model_file}, on which {file} rests, is gone: put it back "
-                f"there, or beside {Path(file).name}."
+                f"The model {origin.model_file}, on which {file} is based, does not exist any "
+                f"more: put it back there, or into the folder of {Path(file).name}."
             )
     is_shipped_wing = not origin.model_file
     choice = choose_model(None if is_shipped_wing else model_file, progress)

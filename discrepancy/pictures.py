@@ -43,7 +43,7 @@ def plot_missing_force(
     Raises
     ------
     ValueError
-        If no force is missing, or none can be determined; or if another number of panels came.
+        If no force is missing, or none can be determined; or if another number of panels was given.
     """
     from reporting import figures as style
 

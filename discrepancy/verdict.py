@@ -19,7 +19,7 @@ class VerdictKind(StrEnum):
     NOTHING_MISSING = "nothing missing"  # the model explains the data
     NAMED = "named"  # one effect, or a set of effects
     NAMED_IN_PART = (
-        "named in part"  # they close most of the gap; the rest is no noise and has no name
+        "named in part"  # they close most of the gap; the rest is not a noise and has no name
     )
     FAMILY = "family"  # an effect of this family with a shape of its own
     GROUP = "group"  # one of a group that these data cannot separate
@@ -51,7 +51,8 @@ class GapWindow:
     channels : tuple of str
         Names of the channels that show the gap.
     begin, end : Moment or None
-        Begin and end of the window; None if it begins with the first sample, or ends with the last.
+        Beginning and end of the window; None if it begins with the first sample, or ends with the
+        last.
     first, last : float
         Times of the first and the last sample of the record [s].
     size : float
@@ -144,7 +145,7 @@ class Hypothesis:
     Attributes
     ----------
     effects : tuple of NamedEffect
-        Effects of the hypothesis; empty for 'none', the model as it is.
+        Effects of the hypothesis; empty for 'none', the unchanged model.
     log_evidence : float
         ln p(data | hypothesis) by Laplace's approximation [nat].
     probability : float
@@ -315,7 +316,7 @@ class ForceAtPort:
 
 @dataclass(frozen=True)
 class UnfittedRecord:
-    """A record that the model is not fitted to: the fit leaves more than the signal's own variance.
+    """A record that the model does not fit: its residuals vary more than the signal itself.
 
     `left` is the rms residual, `varies` the standard deviation of the readings about their mean
     [channel's unit].
@@ -333,7 +334,7 @@ class UnfittedRecord:
 
 @dataclass(frozen=True)
 class MovedUnknown:
-    """A parameter, gain or zero that a fit without effects moves far from what is stated.
+    """A parameter, gain or zero that a fit without effects moves far from its stated value.
 
     Attributes
     ----------
@@ -358,9 +359,51 @@ class MovedUnknown:
     unit: str
 
 
+class SensorValue(StrEnum):
+    """What is estimated of a channel."""
+
+    GAIN = "gain"
+    ZERO = "zero"
+
+
+@dataclass(frozen=True)
+class SensorEstimate:
+    """The gain of a channel or its zero in a trial, fitted in the hypothesis of the verdict.
+
+    Attributes
+    ----------
+    channel : str
+        Name of the channel.
+    kind : SensorValue
+        "gain" or "zero". A gain is given by its relative error.
+    trial : str
+        Name of the trial in which the channel has this zero; empty for a gain, which is the same in
+        all trials.
+    value, deviation : float
+        Fitted value and its posterior standard deviation [unit of the entry]. The stated value is
+        zero.
+    stated_deviation : float
+        Stated standard deviation of the value; infinite if the value was not stated [unit of the
+        entry].
+    deviations : float
+        Fitted value in stated standard deviations; not a number if the value was not stated [1].
+    unit : str
+        Unit in SI; "1" for a gain.
+    """
+
+    channel: str
+    kind: SensorValue
+    trial: str
+    value: Number
+    deviation: Number
+    stated_deviation: Number
+    deviations: Number
+    unit: str
+
+
 @dataclass(frozen=True)
 class NotFitted:
-    """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
+    """An effect that was not fitted, the reason, and the largest predicted `gain` [nat]."""
 
     identifier: str
     """Identifier of the effect in the catalogue."""
@@ -438,6 +481,13 @@ class Verdict:
     moved : tuple of MovedUnknown
         Parameters, gains and zeros that the fit without any effect moves by more than two of their
         stated standard deviations, the farthest first.
+    moved_within_prior : tuple of MovedUnknown
+        Unknowns that the fit without any effect moves by one to two of their stated standard
+        deviations, if these are so wide that the move is at least 2 % of the stated value (for a
+        zero, of the largest reading) and three posterior standard deviations.
+    sensors : tuple of SensorEstimate
+        Gains of the channels, and their zeros in each fitted trial, in the hypothesis that stands
+        for the verdict.
     """
 
     kind: VerdictKind
@@ -460,6 +510,8 @@ class Verdict:
     force: ForceAtPort | None = None
     unfitted: tuple[UnfittedRecord, ...] = ()
     moved: tuple[MovedUnknown, ...] = ()
+    moved_within_prior: tuple[MovedUnknown, ...] = ()
+    sensors: tuple[SensorEstimate, ...] = ()
 
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]

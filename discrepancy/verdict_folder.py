@@ -46,7 +46,7 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
     """
     restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
+        raise FileNotWrittenError(f"{folder} exists and is not a folder: choose another --out.")
     if not folder.is_dir():
         return
     names = {path.name for path in folder.iterdir()}
@@ -54,8 +54,8 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
         return
     if not (folder / files.VERDICT_NAME).is_file():
         raise FileNotWrittenError(
-            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose "
-            "another --out."
+            f"{folder} exists and holds no {files.VERDICT_NAME}, so that it was left unchanged: "
+            "choose another --out."
         )
     if not replace_it:
         raise FileNotWrittenError(

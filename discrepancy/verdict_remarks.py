@@ -32,8 +32,9 @@ def implausible_value_remarks(problem: Problem, fit: CandidateFit) -> list[str]:
     for subject, value, precision in zip(names, values, precisions, strict=True):
         if precision > 0.0 and abs(value) > IMPLAUSIBLE_DEVIATIONS:
             remarks.append(
-                f"{subject} lies {abs(value):.1f} of its stated deviations off in the hypothesis "
-                "of the verdict, which rests on that deviation: check it."
+                f"{subject} differs from its stated value by {abs(value):.1f} stated standard "
+                "deviations in the hypothesis of the verdict, which depends on this standard "
+                "deviation: check it."
             )
     return remarks
 
@@ -91,6 +92,6 @@ def effects_not_fitted(
                 place_clause = "along the missing force" if along_force else "at first sight"
                 reason = f"less promising than others {place_clause}"
             else:
-                reason = f"screened out: {gain:.1f} nat at most beside the model as it is"
+                reason = f"screened out: at most {gain:.1f} nat more than the unchanged model"
             rows.append(NotFitted(identifier, reason, gain))
     return tuple(rows)

@@ -26,7 +26,8 @@ class VerdictSoFar:
     remark : str
         Limits of these figures, which are not those of a finished search.
     hypotheses : tuple of Hypothesis
-        As in verdict.json, the most probable first; one without effects is the model as it is.
+        Hypotheses as in verdict.json, the most probable first; a hypothesis without effects is the
+        unchanged model.
     origin : Origin
         Campaign, model and command.
     """
@@ -37,8 +38,8 @@ class VerdictSoFar:
 
 
 REMARK = (
-    "The search was interrupted: probabilities are among the hypotheses fitted until then, no gate "
-    "was applied, and nothing was proved on held-out trials."
+    "The search was interrupted: probabilities are relative to the hypotheses that were fitted "
+    "until then, no gate was applied, and nothing was proved on held-out trials."
 )
 
 

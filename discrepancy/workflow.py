@@ -38,6 +38,7 @@ from discrepancy.judgement.remarks import (
     sentence_with_times,
     verdict_with_untested_effects,
 )
+from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
@@ -51,6 +52,7 @@ from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
+from discrepancy.system.names_of_model import campaign_in_names_of
 from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
 from discrepancy.verdict_remarks import (
     effects_not_fitted,
@@ -182,7 +184,7 @@ def investigate(
         kind = VerdictKind.DATA_ERROR
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
-    with stage("Fitting what is known, and searching the catalogue", "name") as tell:
+    with stage("Fitting the known parameters, and searching the catalogue", "name") as tell:
         problem = problem_without_wrong_ends(campaign, model)
         campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
@@ -196,7 +198,7 @@ def investigate(
         if share > SEARCH.largest_step_error:
             remarks.append(
                 f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
-                f"{SEARCH.largest_step_error:g} that is wanted: probabilities may be too sharp."
+                f"permitted {SEARCH.largest_step_error:g}: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = search.residuals(search.no_effect)
@@ -217,7 +219,7 @@ def investigate(
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
-        with stage("Seeing the missing force", "force"):
+        with stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
                 problem, search.force_search, search.force_hypotheses, fit
             )
@@ -239,6 +241,7 @@ def investigate(
         not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
+        sensors=sensor_estimates(problem, fit),
         force=None if missing is None else missing.at_port,
     )
     return Investigation(
@@ -286,12 +289,13 @@ def _remarks(
         remarks.append(look_alikes)
     if not problem.model.parameters:
         remarks.append(
-            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or "
-            "damping a little off can be taken for an effect: give it some with their deviations."
+            f"The model {problem.model.name!r} has no uncertain parameter, so that a small error "
+            "in stiffness or damping can be mistaken for an effect: give it uncertain parameters "
+            "with their standard deviations."
         )
     if fit.candidate.terms and not fit.converged:
         remarks.append(
-            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
+            "The fit of the verdict ended before it converged: its intervals may be too narrow."
         )
     return remarks
 
@@ -313,7 +317,9 @@ def _read_input(
 def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign with outliers marked and trials held out, and the faults of its data.
+    """Return the campaign in the names of its model, with outliers marked and trials held out.
+
+    The faults of its data are returned, too.
 
     Parameters
     ----------
@@ -337,6 +343,7 @@ def check_and_prepare(
                 f"have; it has {', '.join(names) or 'none'}: correct the name, or leave "
                 f"[parameters.{parameter}] out."
             )
+    campaign = campaign_in_names_of(campaign, model)
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
@@ -372,8 +379,8 @@ def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
                 count = int(is_wrong[:, column].sum())
                 new_remarks.append(
                     f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the "
-                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far off model and "
-                    "neighbours and left out."
+                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far from both model "
+                    "and neighbours, and left out."
                 )
             trials[trial.name] = replace(trial, used=trial.used & ~is_wrong)
     if not new_remarks:

@@ -33,7 +33,7 @@ def require_one_of(value: object, allowed: Iterable[object], name: str) -> None:
     words = [choice for choice in choices if isinstance(choice, str)]
     nearest = nearest_word(value, words) if isinstance(value, str) else None
     advice = "" if nearest is None else f"; the nearest is {nearest!r}"
-    raise InvalidChoiceError(f"`{name}` must be {quoted_choices}, and {value!r} came{advice}.")
+    raise InvalidChoiceError(f"`{name}` must be {quoted_choices}, but {value!r} was given{advice}.")
 
 
 def nearest_word(word: str, known_words: Iterable[str]) -> str | None:

@@ -93,7 +93,7 @@ def _object_without_repeated_keys(pairs: list[tuple[str, object]]) -> dict[str, 
 
 
 def _refuse_number(text: str) -> NoReturn:
-    raise ValueError(f"{text[:40]} is no number in JSON")
+    raise ValueError(f"{text[:40]} is not a number in JSON")
 
 
 def _parse_finite_float(text: str) -> float:
@@ -117,7 +117,7 @@ def _parse_integer(digits: str) -> int:
         number = int(digits)
         if _SMALLEST_INTEGER <= number <= _LARGEST_INTEGER:
             return number
-    raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
+    raise ValueError(f"an integer of {len(digits)} digits, but a file may have 64 bits")
 
 
 def _null(_: float) -> None:

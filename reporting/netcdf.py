@@ -200,7 +200,7 @@ def read_groups(path: Path) -> xr.DataTree:
 
     groups = _groups_read_by_fork(path)
     if isinstance(groups, str):
-        raise DamagedFileError(f"{path} is damaged or no NetCDF file ({groups})")
+        raise DamagedFileError(f"{path} is damaged or is not a NetCDF file ({groups})")
     return xr.DataTree.from_dict(groups)
 
 

@@ -62,7 +62,7 @@ def new_panels(count: int, axes: "Axes | Sequence[Axes] | None" = None) -> "list
     Raises
     ------
     ValueError
-        If another number of panels came.
+        If another number of panels was given.
     """
     if axes is None:
         from matplotlib import pyplot
@@ -77,6 +77,6 @@ def new_panels(count: int, axes: "Axes | Sequence[Axes] | None" = None) -> "list
     panels_of_user = [axes] if isinstance(axes, MatplotlibAxes) else list(axes)
     if len(panels_of_user) != count:
         raise ValueError(
-            f"The picture has {count} panels, and {len(panels_of_user)} came as `axes`."
+            f"The picture has {count} panels, but {len(panels_of_user)} were given as `axes`."
         )
     return panels_of_user

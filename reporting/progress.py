@@ -54,7 +54,7 @@ class Progress:
         Parameters
         ----------
         description : str
-            What is done.
+            Whether variables are set or read.
         total : int, optional
             The number of units of work; None if it is not known.
         unit : str

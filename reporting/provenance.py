@@ -46,7 +46,7 @@ _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
 
 @dataclass(frozen=True)
 class Provenance:
-    """What is needed to repeat a result.
+    """The data that are needed to repeat a result.
 
     Attributes
     ----------

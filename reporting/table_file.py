@@ -38,7 +38,7 @@ def plain_number(text: str) -> float:
     Raises
     ------
     ValueError
-        If the text is no number. That includes forms that `float` accepts but measuring software
+        If the text is not a number. That includes forms that `float` accepts but measuring software
         never writes: digits of another script, and underscores between digits.
     """
     if not text.isascii() or "_" in text:
@@ -120,7 +120,7 @@ class TextTable:
         Raises
         ------
         errors.layout
-            If the table lacks the column, or a cell is no number.
+            If the table lacks the column, or a cell is not a number.
         errors.value
             If a number is NaN or infinite, or must be positive and is not.
         """
@@ -133,7 +133,7 @@ class TextTable:
             except ValueError:
                 content = repr(cell) if cell else "nothing"
                 raise self.errors.layout(
-                    f"{self._location(column, row)} must hold a number, and {content} came."
+                    f"{self._location(column, row)} must hold a number, but {content} was given."
                 ) from None
             self._check_value(value, column, row, empty_allowed=empty_allowed, positive=positive)
             values[row] = value
@@ -314,9 +314,9 @@ def _width_message(row: _Row, columns: Sequence[str], *, has_header: bool, has_c
     cells = counted(len(row.cells), "cell")
     wanted = counted(len(columns), "column")
     if has_header:
-        message = f"{cells} came, and the header has {wanted}."
+        message = f"the row has {cells}, but the header has {wanted}."
     else:
-        message = f"{cells} came, and {wanted} ({', '.join(columns)}) are expected."
+        message = f"the row has {cells}, but {wanted} ({', '.join(columns)}) are expected."
     has_more_cells = len(row.cells) > len(columns)
     if has_commas and has_more_cells and all(is_number(cell) for cell in row.cells):
         message += " A decimal comma makes two cells of a number: write it with a point."

@@ -20,6 +20,7 @@ import typer
 
 import reporting.progress
 from reporting.log import shown_log
+from reporting.words import with_short_hashes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,7 +64,7 @@ def console() -> "Console":
 
 
 def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
-    """Print a line of the result, unless `--quiet`.
+    """Print a line of the result, unless `--quiet`; a SHA-256 in it is shortened.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
         Whether the line is bold.
     """
     if not loudness.quiet:
-        typer.secho(text, fg=fg, bold=bold)
+        typer.secho(with_short_hashes(text), fg=fg, bold=bold)
 
 
 def show(blocks: "Iterable[str | TextTable]") -> None:

@@ -38,7 +38,7 @@ def read_bytes(path: Path | str, error: type[Exception], *, what: str = "file") 
     except OSError as cause:
         raise error(f"The {what} {path} cannot be read: {cause.strerror or cause}.") from cause
     except ValueError:  # the path holds a zero byte
-        raise error(f"{str(path)!r} is no name of a {what}.") from None
+        raise error(f"{str(path)!r} is not a name of a {what}.") from None
 
 
 def decoded(

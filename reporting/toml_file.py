@@ -83,7 +83,7 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> Tom
         raise error(too_deep(source)) from None
     except ValueError:  # Python turns no text of more than 4,300 digits into an integer
         raise error(
-            f"{source} holds an integer of thousands of digits; 64 bits are what TOML allows."
+            f"{source} holds an integer of thousands of digits, but TOML allows 64 bits."
         ) from None
     check_nesting(document, source, error)
     _check_integers(document, "", source, error)
@@ -137,8 +137,8 @@ def _check_integers(
             _check_integers(value, location_of_value, source, error)
         elif not -(2**63) <= value < 2**63:
             raise error(
-                f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, "
-                "and 63 beside the sign are what TOML allows."
+                f"{source}: `{location_of_value}` is an integer of {value.bit_length()} bits, but "
+                "TOML allows 63 in addition to the sign."
             )
 
 
@@ -297,6 +297,7 @@ def validate(
     *,
     what: str,
     first_index: int = 1,
+    all_faults: bool = False,
 ) -> _Model:
     """Return the content of a file as a record of a model.
 
@@ -314,6 +315,8 @@ def validate(
         What the file describes, with its article, for the message: "a lumped model".
     first_index : int
         The number of the first entry of a list in messages.
+    all_faults : bool
+        Whether the message states all faults, instead of the one that helps the user most.
 
     Raises
     ------
@@ -324,7 +327,10 @@ def validate(
     try:
         record = _validator_of(model).validate_python(content)
     except ValidationError as cause:
-        message = _validation_message(cause, model, what, first_index)
+        if all_faults:
+            message = _message_of_all_faults(cause, model, what, first_index)
+        else:
+            message = _validation_message(cause, model, what, first_index)
         full_stop = "" if message.endswith("?") else "."
         raise error(f"{source}: {message}{full_stop}") from None
     # The validator of a model returns a record of this model.
@@ -348,7 +354,7 @@ _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 
 
 def _validation_message(error: ValidationError, model: object, what: str, first_index: int) -> str:
-    """Return the message about the fault that helps the user most, of those pydantic found.
+    """Return the message about the fault, among those of pydantic, that helps the user most.
 
     Parameters
     ----------
@@ -375,6 +381,32 @@ def _validation_message(error: ValidationError, model: object, what: str, first_
     if missing[0]["type"] == MISSING_KEY and len(keys) <= 1:
         return _value_message(missing[0], first_index)
     return f"{listing(keys)} {is_or_are(len(keys))} missing"
+
+
+def _message_of_all_faults(
+    error: ValidationError, model: object, what: str, first_index: int
+) -> str:
+    """Return the message about all faults that pydantic found, one for each place in the file.
+
+    A misspelt key is reported twice, as unknown and as missing. So keys that are missing in a table
+    with unknown keys are left out. The parameters are those of `_validation_message`.
+    """
+    faults = error.errors(include_url=False)
+    unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
+    tables_with_unknown_keys = {fault["loc"][:-1] for fault in unknown}
+    messages = {}
+    for fault in unknown:
+        messages[fault["loc"]] = _unknown_keys_message([fault], model, what, first_index)
+    for fault in faults:
+        location = fault["loc"]
+        if fault["type"] in _MISSING_KEY_TYPES:
+            if location[:-1] in tables_with_unknown_keys:
+                continue
+            keys = [short_repr(key) for key in _missing_locations(fault, first_index)]
+            messages.setdefault(location, f"{listing(keys)} {is_or_are(len(keys))} missing")
+        else:
+            messages.setdefault(location, _value_message(fault, first_index))
+    return "; ".join(messages.values())
 
 
 def _unknown_keys_message(
@@ -415,7 +447,7 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
         expectation = f"{_EXPECTED_TYPES[kind]} is expected"
     else:
         expectation = small(fault["msg"])
-    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} came"
+    message = f"{prefix}{expectation}, but {short_repr(fault['input'])} was given"
     if kind in _WORD_TYPES and isinstance(fault["input"], str):
         words = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
         word = nearest_word(fault["input"], words)

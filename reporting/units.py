@@ -59,7 +59,7 @@ _WORDS_THAT_ARE_NO_UNITS = {
 """Names that pint takes for lengths and ratios, and measuring software does not."""
 
 _ERRORS_OF_THE_PARSER = (AssertionError, AttributeError, TypeError, ArithmeticError)
-"""What pint raises of texts that are no units, beside errors of its own."""
+"""What pint raises of texts that are not units, beside errors of its own."""
 
 
 class Meaning(NamedTuple):
@@ -141,7 +141,7 @@ def _pint_expression(unit: str, *, gravity: bool) -> str:
     """
     text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST_UNIT]).replace("**", "^")
     if len(unit) > _LONGEST_UNIT or len(text) > _LONGEST_UNIT:
-        raise ValueError(f"{unit!r} is no unit")
+        raise ValueError(f"{unit!r} is not a unit")
     text = _PINT_NAMES.get(text, text)
     if text == "1":
         return text
@@ -154,9 +154,9 @@ def _pint_expression(unit: str, *, gravity: bool) -> str:
         factor = _FACTOR.fullmatch(factor_text)
         is_dividend = operators[index : index + 1] == ["/"]
         if factor is None:
-            raise ValueError(f"{unit!r} is no unit")
+            raise ValueError(f"{unit!r} is not a unit")
         if not _is_unit_with_power(factor, is_first=index == 0, is_dividend=is_dividend):
-            raise ValueError(f"{unit!r} is no unit")
+            raise ValueError(f"{unit!r} is not a unit")
         if index > 0:
             expression += "/" if operators[index - 1] == "/" else "*"
         expression += _pint_factor(factor, gravity=gravity)
@@ -236,12 +236,12 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
         factor_to_grams, root_units = known_units.get_root_units(parsed)
         offset = known_units.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
-        raise ValueError(f"{unit!r} is no unit") from cause
+        raise ValueError(f"{unit!r} is not a unit") from cause
     power_of_unit: dict[str, Any] = dict(root_units._units)
     exponents = [power_of_unit.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]
     has_other_units = bool(power_of_unit)
     if has_other_units or any(exponent != int(exponent) for exponent in exponents):
-        raise ValueError(f"{unit!r} is no unit of SI")
+        raise ValueError(f"{unit!r} is not an SI unit")
     exponent_of_mass = int(exponents[0])
     factor = Fraction(str(factor_to_grams)) / Fraction(1000) ** exponent_of_mass
     if not _SMALLEST_FACTOR < abs(factor) < _LARGEST_FACTOR:

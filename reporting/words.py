@@ -98,6 +98,14 @@ def comma_list(words: Iterable[object]) -> str:
     return listed
 
 
+_LONG_HASH = re.compile(r"(SHA-256 [0-9a-f]{12})[0-9a-f]{52}")
+
+
+def with_short_hashes(text: str) -> str:
+    """Return a text for people, in which a SHA-256 has its first 12 digits; files keep all 64."""
+    return _LONG_HASH.sub(r"\1", text)
+
+
 def one_line(reason: object) -> str:
     """Return the message of a foreign error as one line without full stop."""
     return " ".join(str(reason).split()).removesuffix(".")

@@ -149,6 +149,7 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     "docs/reference/report.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/reference/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/reference/stores.md": (flown("level_turns", 22, "runs/level_turns"), flown_fleet),
+    "docs/how_to/ssp.md": ("ssp export three_fmus --out three_fmus.ssp",),
     "docs/how_to/structures.md": (bracket,),
     "docs/how_to/use_the_wing_in.md": (WING_FMU, "fmu build --kind compiled --fmi 3 --out wing3.fmu"),
     "docs/reference/verdict.md": VERDICT,

@@ -82,7 +82,10 @@ def run(
         Path | None,
         typer.Option(
             "--binding",
-            help="Which variable of the FMU plays which role; by default as in the scenario.",
+            help=(
+                "Binding file: which variable of the FMU plays which role; by default that of the "
+                "scenario."
+            ),
         ),
     ] = None,
     strain_library: Annotated[
@@ -109,13 +112,21 @@ def run(
             help="Run the FMU in this process instead of a worker.",
         ),
     ] = False,
+    no_notices: Annotated[
+        bool,
+        typer.Option(
+            "--no-notices",
+            help="Give no notices and alarms. Many seeds then fly side by side, in a small "
+            "fraction of the time.",
+        ),
+    ] = False,
     view: ViewOption = False,
     with_scenario: Annotated[
         str | None,
         typer.Option(
             "--scenario",
             autocompletion=complete_scenario,
-            help="What is flown with the SSP file that SCENARIO names.",
+            help="The scenario that is flown with the SSP file given as SCENARIO.",
         ),
     ] = None,
     no_report: NoReportOption = False,
@@ -154,6 +165,7 @@ def run(
         ssp=ssp,
         library=library,
         learnt=learnt,
+        no_notices=no_notices,
     )
     parts = TwinParts(policy, sensor_model, estimator)
     if seeds is not None:
@@ -164,11 +176,7 @@ def run(
         engine = choose_engine(workers, cluster)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
-    if workers is not None or cluster is not None:
-        raise typer.BadParameter(
-            "belongs to --seeds: one mission flies alone.",
-            param_hint="--workers" if cluster is None else "--cluster",
-        )
+    _refuse_processes_of_one_mission(workers, cluster)
     has_changes = out is not None or policy is not None or overrides != Overrides()
     if resume is None:
         folder, fly_mission = _new_mission(scenario, out, overrides, parts, replace=replace)
@@ -178,10 +186,20 @@ def run(
     _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
 
 
+def _refuse_processes_of_one_mission(workers: int | None, cluster: str | None) -> None:
+    """Refuse the options --workers and --cluster where only one mission flies."""
+    if workers is not None or cluster is not None:
+        raise typer.BadParameter(
+            "belongs to --seeds: one mission flies alone.",
+            param_hint="--workers" if cluster is None else "--cluster",
+        )
+
+
 def _wrong_use_of_seeds() -> typer.BadParameter:
     """Return the error that options do not go together with --seeds."""
     return typer.BadParameter(
-        "many seeds need a scenario, and neither --resume (repeat the command), --seed nor --view.",
+        "--seeds needs a scenario, and cannot be combined with --resume (repeat the command "
+        "instead), --seed or --view.",
         param_hint="--seeds",
     )
 
@@ -215,8 +233,8 @@ def _resumed_mission(
     loaded = None if scenario_name is None else load_scenario(scenario_name)
     if has_changes:
         raise typer.BadParameter(
-            "a run is continued with what its folder holds: give nothing beside it that would "
-            "change it.",
+            "a run is continued with the inputs in its folder: leave out options that would change "
+            "them.",
             param_hint="--resume",
         )
     return partial(
@@ -315,8 +333,8 @@ def print_outcome(outcome: "RunOutcome") -> None:
     terminal.say(f"The twin {outcome.control}.")
     if outcome.origin.differ:
         terminal.say(
-            f"Asset and twin's model differ: flown was the {outcome.origin.asset}, and the twin "
-            f"believes the {outcome.origin.model}."
+            f"Asset and twin's model differ: the asset was the {outcome.origin.asset}, and the "
+            f"twin believes the {outcome.origin.model}."
         )
     for notice in outcome.notices:
         terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
@@ -338,7 +356,7 @@ def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
 
 
 def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
-    """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
+    """Return the rows of the table of times: asset, twin, checkpoints, and their total."""
     rows = []
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")
@@ -379,7 +397,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
             *_errors_of_lower_layers(),
             *further_errors,
         )
-        # The system's refusals, such as a full disk, are no defects of the program either.
+        # The system's refusals, such as a full disk, are not defects of the program either.
         if not isinstance(error, (OSError, *our_errors)):
             raise
         sentence = str(error)

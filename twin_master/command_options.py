@@ -81,7 +81,7 @@ SeedOption = Annotated[
     typer.Option("--seed", min=0, help="Seed of the run; by default that of the scenario."),
 ]
 FleetSeedOption = Annotated[
-    int | None, typer.Option("--seed", min=0, help="Seed, in the place of that of the file.")
+    int | None, typer.Option("--seed", min=0, help="Seed, instead of the seed of the file.")
 ]
 ViewOption = Annotated[
     bool,

@@ -5,6 +5,8 @@ the scenario for the true state: eqs. (9) and (10) of Kapteyn et al. 2021 with t
 weights.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -97,7 +99,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         if self.scenario.observation.role == "modes":
             raise MissionInputError(
                 f"the scenario {self.scenario.mission.name} observes modes with a covariance, "
-                "which are no vector of sensors: take a scenario that observes sensors."
+                "which are not a vector of sensors: take a scenario that observes sensors."
             )
         source = source_of(self.scenario)
         source.check()

@@ -74,7 +74,7 @@ def watch(
         typer.Option(
             "--steps",
             min=0,
-            help="Leave an asset alone after so many steps.",
+            help="Stop watching an asset after this many steps.",
         ),
     ] = None,
     ca_file: CertificateOption = None,
@@ -447,7 +447,7 @@ Figures = dict[str, dict[str, "Estimated | int"]]
 
 
 def _figures_by_group(folders: list[Path]) -> Figures:
-    """Return the figures of each group; if there are several folders, its name has the folder."""
+    """Return the figures of each group by name; of several folders, the name has the folder."""
     from twin_master.fleet.reading import group_figures, open_fleet
 
     figures = {}

@@ -110,15 +110,17 @@ class HeartbeatRecord(TypedDict):
     """The state of a watch, which it publishes every 10 s."""
 
     state: str
-    """The words "watching", "quiet" (no step came for too long), "ended" or "lost" (an error)."""
+    """The words "watching", "quiet" (no step was received for too long), "ended" or "lost" (an
+    error).
+    """
     step: NotRequired[int]
     """The last step; of a single asset."""
     seconds_since_step: NotRequired[float]
     """Time since the last step; of a single asset [s]."""
     lag: int
-    """Number of messages that have come and are not worked off."""
+    """Number of messages that were received but not processed yet."""
     received: NotRequired[int]
-    """Number of messages that have come; of a single asset."""
+    """Number of messages that were received; of a single asset."""
     refused: int
     """Number of messages that were refused."""
     assets: NotRequired[int]
@@ -126,7 +128,7 @@ class HeartbeatRecord(TypedDict):
     steps: NotRequired[int]
     """Number of steps of all assets; of a fleet."""
     quiet: NotRequired[int]
-    """Number of assets of which no step came for too long; of a fleet."""
+    """Number of assets that have sent no step for too long; of a fleet."""
 
 
 class RejectedRecord(TypedDict):
@@ -171,7 +173,7 @@ class JournalRecord(TypedDict):
     config_hash: NotRequired[str]
     """SHA-256 of `config.json`; only in the first line."""
     step: NotRequired[int]
-    """Number of the step, from 0; of an event the last step before it."""
+    """Number of the step, from 0; for an event, the number of the last step before it."""
     observed: NotRequired[list[float | None]]
     """Readings of the sensors and, after them, of inspections; null if lost [SI]."""
     control_index: NotRequired[int]
@@ -199,23 +201,27 @@ class JournalRecord(TypedDict):
     suspicion: NotRequired[SuspicionRecord]
     """How well the model explains the sensors."""
     observation_step: NotRequired[int]
-    """Of a watch: the step that the message was about."""
+    """The step that the message was about; only in a watch."""
     control_in_force: NotRequired[int]
-    """Of a watch: index of the control of the last step, if a late message changed an earlier."""
+    """Index of the control of the last step, if a late message changed an earlier step; only in a
+    watch.
+    """
     intake: NotRequired[dict[str, object]]
-    """Of a watch: what was read of the messages, from which it resumes."""
+    """The position in the stream of messages from which the watch resumes; only in a watch."""
     settled: NotRequired[dict[str, object]]
-    """Of a watch: the state of the twin before all steps that a late message can still change."""
+    """The state of the twin before all steps that a late message can still change; only in a
+    watch.
+    """
     standing: NotRequired[dict[str, object]]
-    """Of a watch: the state of the search for causes before this line."""
+    """The state of the search for causes before this line; only in a watch."""
     quiet: NotRequired[DecisionRecord]
-    """Of a watch: the decision that was told again because no step came."""
+    """The decision that was written again because no step came; only in a watch."""
     refused: NotRequired[DecisionRecord]
-    """Of a watch: the decision that was told again because messages were refused."""
+    """The decision that was written again because messages were refused; only in a watch."""
     verdict: NotRequired[dict[str, object]]
-    """Of a watch: the verdict of a search for the cause of an alarm."""
+    """The verdict of a search for the cause of an alarm; only in a watch."""
     model: NotRequired[dict[str, object]]
-    """Of a watch: the patched model that was adopted."""
+    """The patched model that was adopted; only in a watch."""
 
 
 class FigureRecord(TypedDict):
@@ -281,7 +287,7 @@ class SummaryRecord(TypedDict):
     learnt: NotRequired[dict[str, LearntSummary]]
     """What was learnt, by the name of the quantity; only if the twin learns."""
     notices: NotRequired[list[SummaryNotice]]
-    """What the operator was told."""
+    """The notices that the operator received."""
 
 
 class FileHash(TypedDict):

@@ -50,7 +50,7 @@ def plot_belief(
     Raises
     ------
     ValueError
-        If another number of panels came.
+        If another number of panels was given.
     """
     from reporting import figures as style
 
@@ -171,12 +171,12 @@ def _tree_of(run: "xr.DataTree | HasTree") -> "xr.DataTree":
     Raises
     ------
     TypeError
-        If neither arrays nor the result of a run came.
+        If neither arrays nor the result of a run were given.
     """
     tree: object = getattr(run, "tree", run)
     if not hasattr(tree, "children"):
         raise TypeError(
-            f"A run is needed, as `uav_twin.open_run` or `uav_twin.fly` returns it, and a "
-            f"{type(run).__name__} came: open a folder with `uav_twin.open_run`."
+            "A run is needed, as `uav_twin.open_run` or `uav_twin.fly` returns it, but a "
+            f"{type(run).__name__} was given: open a folder with `uav_twin.open_run`."
         )
     return cast("xr.DataTree", tree)

@@ -64,7 +64,7 @@ def plan(
         Path | None,
         typer.Option(
             "--picture",
-            help="Draw what is done at which belief, as SVG or PNG.",
+            help="Draw the control that is chosen at each belief, as SVG or PNG.",
         ),
     ] = None,
     value_of: Annotated[
@@ -72,7 +72,10 @@ def plan(
         typer.Option(
             "--value-of",
             metavar="NAME",
-            help="Say what an action that inspects is worth, or a gauge by its number or title.",
+            help=(
+                "Compute the value of an action that inspects, or of a gauge given by its number "
+                "or title."
+            ),
         ),
     ] = None,
     seed: SeedOption = None,
@@ -255,7 +258,7 @@ def _check_names(scenario: "Scenario", names: Sequence[str]) -> None:
             actions = comma_list(inspecting or ["there is none"])
             raise MissionInputError(
                 f"--value-of names an action that inspects ({actions}) or a gauge ({titles[0]} to "
-                f"{titles[-1]}), and `{name}` came."
+                f"{titles[-1]}), but `{name}` was given."
             )
 
 
@@ -371,7 +374,8 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
     are_different = len({*candidates}) == len(candidates)
     if not are_known or not are_different:
         raise MissionInputError(
-            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
+            f"--among names different sensors ({titles[0]} to {titles[-1]}), but `{among}` was "
+            "given."
         )
     return candidates
 
@@ -396,7 +400,7 @@ def _compare_returns(
 def _print_design(record: Record, candidates: int) -> None:
     """Print the chosen sensors with their information, and what no candidate separates."""
     for sensor, information in zip(record["sensors"], record["information"], strict=True):
-        terminal.say(f"{sensor}: {information:.3f} bit with those before it.")
+        terminal.say(f"{sensor}: {information:.3f} bit together with the sensors above.")
     terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")
     for levels in record["not_separated"]:
         terminal.say(

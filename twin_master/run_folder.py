@@ -84,17 +84,18 @@ def create_run_folder(
     Raises
     ------
     RunFolderError
-        If the folder exists and is not to be replaced, or is no run folder, or if another process
-        is flying in the folder that is to be replaced.
+        If the folder exists and is not to be replaced, or is not a run folder, or if another
+        process is flying in the folder that is to be replaced.
     FileNotWrittenError
         If the disk is full or the folder cannot be written.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise RunFolderError(f"{folder} exists and is no folder: choose another --out.")
+        raise RunFolderError(f"{folder} exists and is not a folder: choose another --out.")
     is_occupied = folder.is_dir() and any(folder.iterdir())
     if is_occupied and find_config(folder, config["kind"]) is None:
         raise RunFolderError(
-            f"{folder} exists and holds something else, so it is not touched: choose another --out."
+            f"{folder} exists and holds something else, so that it was left unchanged: choose "
+            "another --out."
         )
     if is_occupied and not replace:
         raise RunFolderError(
@@ -122,7 +123,9 @@ def read_config(folder: Path) -> JsonObject:
         )
     config = find_config(folder)
     if config is None:
-        raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
+        raise NotResumableError(
+            f"{folder} is not a run folder: it holds no {CONFIG_NAME} of a run."
+        )
     required_tables = ["scenario", "scenario_file", "provenance"]
     if "inputs" in config:  # they are written once the asset is prepared
         required_tables.append("inputs")
@@ -344,4 +347,4 @@ def hold_run_folder(folder: Path, loaded: LoadedScenario | None) -> Iterator[Loc
 def restore(folder: Path, progress: Progress) -> None:
     """Put back a run whose replacement was killed after the run had been moved aside."""
     if restore_folder(folder):
-        progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")
+        progress.note(f"A replacement of {folder} was interrupted: the previous run was restored.")

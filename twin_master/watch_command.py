@@ -70,7 +70,7 @@ def watch(
         bool,
         typer.Option(
             "--resume",
-            help="Take up the watch in --out.",
+            help="Resume the watch in --out.",
         ),
     ] = False,
     replace: Annotated[
@@ -101,7 +101,7 @@ def watch(
         typer.Option(
             "--steps",
             min=0,
-            help="End after so many steps in all.",
+            help="End after this many steps in total.",
         ),
     ] = None,
     model_patch: Annotated[
@@ -123,14 +123,14 @@ def watch(
         bool,
         typer.Option(
             "--teach",
-            help="Look for the cause of an alarm, and believe what is named.",
+            help="Look for the cause of an alarm, and believe the named effect.",
         ),
     ] = False,
     allow_unknown: Annotated[
         bool,
         typer.Option(
             "--allow-unknown",
-            help="Pass over keys and columns that are no sensor.",
+            help="Ignore keys and columns that are not sensors.",
         ),
     ] = False,
     ca_file: CertificateOption = None,
@@ -142,7 +142,7 @@ def watch(
         typer.Option(
             "--last",
             min=1,
-            help="Steps, the last ones, in run.nc and report.",
+            help="Number of last steps in run.nc and report.",
         ),
     ] = 1000,
     view: ViewOption = False,

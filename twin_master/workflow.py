@@ -4,6 +4,8 @@
 which takes no time.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -299,7 +301,9 @@ def _advice_on_error(folder: Path) -> Iterator[None]:
                 "where the scenario itself is to be changed, fly the changed one with --replace."
             )
         else:
-            error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
+            error.add_note(
+                "Nothing was flown yet: correct the cause, and fly again with --replace."
+            )
         raise
 
 
@@ -383,7 +387,7 @@ def _write_report(folder: Path) -> None:
 def check_scenario(
     loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
 ) -> run_folder.JsonObject:
-    """Check a scenario and all that it names, and return what it flies and what its twin takes.
+    """Check a scenario and its files; return the asset that flies and the model of the twin.
 
     Parameters
     ----------

@@ -30,9 +30,11 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from fe.wing.operators import flapwise_bending_modes as flapwise_bending_modes
     from fmu_asset.client.session import FmiAsset as FmiAsset
     from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
+    from reporting.progress import Progress as Progress
     from scenarios import structure_files as structure_files
     from twin_master.assets.resolution import Overrides as Overrides
     from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
+    from twin_master.fleet.engine import Engine as Engine
     from twin_master.fleet.flight import fly_fleet as fly_fleet
     from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
     from twin_master.fleet.plan import ensemble as ensemble
@@ -41,9 +43,15 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.mission.preparation import prepare_twin as prepare_twin
     from twin_master.network.estimator import Carried as Carried
     from twin_master.network.estimator import Estimate as Estimate
+    from twin_master.network.estimator import Estimator as Estimator
     from twin_master.network.estimator import ExactFilter as ExactFilter
+    from twin_master.network.estimator import Learnt as Learnt
+    from twin_master.network.estimator import Notice as Notice
+    from twin_master.network.estimator import NoticeWording as NoticeWording
+    from twin_master.network.estimator import SensorModel as SensorModel
     from twin_master.network.graphical_model import GraphicalModel as GraphicalModel
     from twin_master.network.inference import filter_sequence as filter_sequence
+    from twin_master.network.planner import BeliefPolicy as BeliefPolicy
     from twin_master.network.planner import value_iteration as value_iteration
     from twin_master.network.sensor_model import GaussianSensorModel as GaussianSensorModel
     from twin_master.network.twin import Twin as Twin
@@ -52,6 +60,10 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.report.page import report_figures as report_figures
     from twin_master.report.page import write_report as write_report
     from twin_master.scenario.reading import load_scenario as load_scenario
+    from twin_master.scenario.tables import Noticing as Noticing
+    from twin_master.watch.cause_search import CauseSearch as CauseSearch
+    from twin_master.watch.cause_search import RunningSearch as RunningSearch
+    from twin_master.watch.cause_search import SearchRequest as SearchRequest
     from twin_master.watch.opening import open_run as open_run
     from twin_master.workflow import fly as fly
     from twin_master.workflow import resume as resume
@@ -77,9 +89,11 @@ _HOMES = {
     "flapwise_bending_modes": "fe.wing.operators",
     "FmiAsset": "fmu_asset.client.session",
     "build_fmu": "fmu_asset.packing.structure_fmu",
+    "Progress": "reporting.progress",
     "structure_files": "scenarios",
     "Overrides": "twin_master.assets.resolution",
     "ScenarioEnvironment": "twin_master.environment",
+    "Engine": "twin_master.fleet.engine",
     "fly_fleet": "twin_master.fleet.flight",
     "learn_from_fleet": "twin_master.fleet.learn",
     "ensemble": "twin_master.fleet.plan",
@@ -88,9 +102,15 @@ _HOMES = {
     "prepare_twin": "twin_master.mission.preparation",
     "Carried": "twin_master.network.estimator",
     "Estimate": "twin_master.network.estimator",
+    "Estimator": "twin_master.network.estimator",
     "ExactFilter": "twin_master.network.estimator",
+    "Learnt": "twin_master.network.estimator",
+    "Notice": "twin_master.network.estimator",
+    "NoticeWording": "twin_master.network.estimator",
+    "SensorModel": "twin_master.network.estimator",
     "GraphicalModel": "twin_master.network.graphical_model",
     "filter_sequence": "twin_master.network.inference",
+    "BeliefPolicy": "twin_master.network.planner",
     "value_iteration": "twin_master.network.planner",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "Twin": "twin_master.network.twin",
@@ -99,10 +119,14 @@ _HOMES = {
     "report_figures": "twin_master.report.page",
     "write_report": "twin_master.report.page",
     "load_scenario": "twin_master.scenario.reading",
+    "Noticing": "twin_master.scenario.tables",
+    "CauseSearch": "twin_master.watch.cause_search",
+    "RunningSearch": "twin_master.watch.cause_search",
+    "SearchRequest": "twin_master.watch.cause_search",
     "open_run": "twin_master.watch.opening",
-    "watch": "uav_twin.watching",
     "fly": "twin_master.workflow",
     "resume": "twin_master.workflow",
+    "watch": "uav_twin.watching",
 }
 """The module of each public name; a test compares these names with the imports above."""
 

@@ -31,8 +31,10 @@ def calibrate_campaign(
             "--model",
             show_default="the shipped wing",
             autocompletion=complete_model,
-            help="The model file of an FMU or a structure, a lumped model, a wing design: as of "
-            "`discrepancy run`.",
+            help=(
+                "The model file of an FMU or a structure, a lumped model, a wing design: the same "
+                "as for `discrepancy run`."
+            ),
         ),
     ] = None,
     out: Annotated[
@@ -153,8 +155,10 @@ def calibrate_wing(
         Path | None,
         typer.Option(
             "--data",
-            help="Lab folder with step1, step2, step3, or some of them; published figures "
-            "otherwise.",
+            help=(
+                "Laboratory folder with some or all of step1, step2 and step3; published figures "
+                "for the others."
+            ),
         ),
     ] = None,
     out: Annotated[

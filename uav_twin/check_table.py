@@ -29,5 +29,5 @@ def exit_if_broken(checks: Sequence[Check]) -> None:
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
         raise terminal.error_exit(
-            f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}."
+            f"{len(broken)} of {len(checks)} checks exceeded their limits: {'; '.join(broken)}."
         )

@@ -22,7 +22,7 @@ from uav_twin import (
 )
 
 MISSIONS = "Missions: a twin flies, plans and watches"
-MEASUREMENTS = "Measurements: what a model must be to agree with them"
+MEASUREMENTS = "Measurements: calibrate a model, and find what it lacks"
 MODELS = "Models: wings, structures and FMUs"
 
 
@@ -67,8 +67,8 @@ def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
         sources = [context.get_parameter_source(name) for name in context.params]
         if any(source is not None and source.name == "COMMANDLINE" for source in sources):
             raise typer.BadParameter(
-                "options go behind the command: "
-                f"{context.info_name} {context.invoked_subcommand} ..."
+                f"options go after the command: {context.info_name} {context.invoked_subcommand} "
+                "..."
             )
 
     # Typer reads the options of a command from its signature: use that of the function, with the
@@ -143,7 +143,7 @@ scenario_group.command("check")(scenario_command.check_scenario)
 wing_group = _add_group_command(
     "wing",
     MODELS,
-    "Say what a wing weighs and how it vibrates; verify its model.",
+    "Print the mass and the modes of a wing; verify its model.",
     wing_commands.wing,
 )
 wing_group.command("verify")(wing_commands.verify_wing)
@@ -161,7 +161,7 @@ calibrate_group.command("campaign")(calibrate_commands.calibrate_campaign)
 discrepancy_group = _add_group(
     "discrepancy",
     MEASUREMENTS,
-    "Find, name, add and prove what a model lacks beside measured data.",
+    "Find, name, add and prove what a model lacks compared with measured data.",
 )
 discrepancy_group.command("run")(discrepancy_commands.run)
 discrepancy_group.command("apply")(discrepancy_commands.apply)

@@ -52,7 +52,7 @@ def import_files(
         typer.Option(
             "--unit",
             metavar="HEAD=UNIT",
-            help="Where the head does not say it. May be given several times.",
+            help="Unit of a column whose head does not state it. May be given several times.",
         ),
     ] = None,
     quantity: Annotated[
@@ -60,7 +60,10 @@ def import_files(
         typer.Option(
             "--quantity",
             metavar="HEAD=QUANTITY",
-            help="Where a unit is of several, such as V, % and 1. May be given several times.",
+            help=(
+                "Quantity of a column whose unit belongs to several, such as V, % and 1. May be "
+                "given several times."
+            ),
         ),
     ] = None,
     scale: Annotated[
@@ -68,8 +71,10 @@ def import_files(
         typer.Option(
             "--scale",
             metavar="HEAD=SCALE",
-            help="What the cells stand for, as 200 N/V; a mere number multiplies them. "
-            "May be given several times.",
+            help=(
+                "Factor from the cells to the measured quantity, such as 200 N/V; a plain number "
+                "multiplies them. May be given several times."
+            ),
         ),
     ] = None,
     zero: Annotated[
@@ -106,8 +111,10 @@ def import_files(
         typer.Option(
             "--kind",
             metavar="[FILE=]KIND",
-            help="What was done: static, ringdown, forced, driven or flight; noise: "
-            "samples at rest. May be given several times.",
+            help=(
+                "Kind of the trial: static, ringdown, forced, driven or flight; noise for samples "
+                "at rest. May be given several times."
+            ),
         ),
     ] = None,
     release: Annotated[
@@ -115,7 +122,7 @@ def import_files(
         typer.Option(
             "--release",
             metavar="[FILE=]SIZE",
-            help="How far the point was held that was let go, as 15.5mm. May be given "
+            help="Displacement at which the release point was held, such as 15.5mm. May be given "
             "several times.",
         ),
     ] = None,
@@ -133,7 +140,10 @@ def import_files(
         typer.Option(
             "--decimal",
             metavar="[FILE=]MARK",
-            help="Point or comma, where 1,234 can be two numbers. May be given several times.",
+            help=(
+                "Decimal sign, a point or a comma, if 1,234 can mean two numbers. May be given "
+                "several times."
+            ),
         ),
     ] = None,
     interval: Annotated[
@@ -141,7 +151,7 @@ def import_files(
         typer.Option(
             "--interval",
             metavar="[FILE=]SECONDS",
-            help="Seconds between rows, where no column is a time. May be given several times.",
+            help="Seconds between rows, if no column is a time. May be given several times.",
         ),
     ] = None,
     begins: Annotated[
@@ -159,13 +169,18 @@ def import_files(
         typer.Option(
             "--held-out",
             metavar="FILE[=no]",
-            help="A file that is kept for proof, or with =no is not. May be given several times.",
+            help=(
+                "A file that is held out for the proof; =no takes it into the fit. May be given "
+                "several times."
+            ),
         ),
     ] = None,
     reference_temperature: Annotated[
         str | None,
         typer.Option(
-            "--reference-temperature", metavar="DEGC", help="Where a column is a temperature."
+            "--reference-temperature",
+            metavar="DEGC",
+            help="Temperature at which the model's parameters hold, if a column is a temperature.",
         ),
     ] = None,
     model: Annotated[
@@ -173,18 +188,18 @@ def import_files(
         typer.Option(
             "--model",
             autocompletion=complete_model,
-            help="As of `discrepancy run`: columns may be called like its outputs.",
+            help="The same as for `discrepancy run`: columns may have the names of its outputs.",
         ),
     ] = None,
     ask_nothing: Annotated[
         bool,
         typer.Option(
             "--ask-nothing",
-            help="Take the defaults, and ask nothing, as where there is no terminal.",
+            help="Take the defaults without questions, as if there were no terminal.",
         ),
     ] = False,
 ) -> None:
-    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say.
+    """Make a campaign from the files of a laboratory: show how they are read, and ask for missing information.
 
     Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
     """  # noqa: E501
@@ -306,8 +321,13 @@ def _understand_files(
     understanding = LaboratoryImport(sheets, answers)
     if model is None:
         return understanding
-    quantity_of_output = choose_model(model).model.output_quantity
-    return LaboratoryImport(understanding.sheets, answers, quantity_of_output)
+    chosen_model = choose_model(model).model
+    return LaboratoryImport(
+        understanding.sheets,
+        answers,
+        chosen_model.output_quantity,
+        chosen_model.outputs_with_quantities,
+    )
 
 
 _DECIMAL_MARKS = {".": "points", ",": "commas"}
@@ -379,7 +399,7 @@ def effects(
         cells = (effect.identifier, effect.name, effect.family, formula(effect.equation))
         rows.append([in_one_line(cell) for cell in cells])
     terminal.print_table(("id", "name", "family", "equation"), rows)
-    terminal.say(f"{counted(len(rows), 'effect')}; --show ID tells everything about one.")
+    terminal.say(f"{counted(len(rows), 'effect')}; --show ID prints everything about one of them.")
 
 
 def _print_effect(effect: "Effect") -> None:
@@ -572,7 +592,7 @@ def _parameter_values(
     if len(numbers) > len(names):
         raise CatalogueError(
             f"{identifier} has {counted(len(names), 'parameter')} ({comma_list(names)}), but "
-            f"{counted(len(numbers), 'value')} came."
+            f"{counted(len(numbers), 'value')} were given."
         )
     values = {}
     for position, number_text in enumerate(numbers):

@@ -63,8 +63,11 @@ def run(
             "--model",
             show_default="the shipped wing",
             autocompletion=complete_model,
-            help="A calibration.nc, a wing design, a structure, a lumped model or a description of "
-            "an FMU (.toml), one of them patched (.json), or the name of a shipped lumped model.",
+            help=(
+                "A calibration.nc, a wing design, a structure, a lumped model or a description of "
+                "an FMU (.toml), one of these with a patch (.json), or the name of a shipped "
+                "lumped model."
+            ),
         ),
     ] = None,
     out: Annotated[
@@ -246,7 +249,7 @@ def _assess_campaign(
     if calibrate is None:
         return separability, None
     workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU already runs in its own process
-    with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as progress:
+    with stage("Testing the workflow on simulated campaigns", calibrate, "campaigns") as progress:
         self_calibration = self_calibrate(
             tested_campaign,
             choice.model,
@@ -419,7 +422,7 @@ def check(
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart.
+    """List the faults of the data, the effects that they can show, and those that they cannot tell apart.
 
     Example: `uav-twin discrepancy check measured --model single_mass_rig`
     """  # noqa: E501
@@ -448,7 +451,7 @@ def check(
         _print_check(prepared_campaign, chosen_model, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
-            "Correct the faults above first: conclusions from these data would be wrong."
+            "Correct the faults first: conclusions from these data would be wrong."
         )
 
 
@@ -533,7 +536,7 @@ def apply(
         typer.Option(
             "--member",
             metavar="NAME",
-            help="Of a group: which; the most probable by default.",
+            help="For the verdict group: the member to apply; the most probable by default.",
         ),
     ] = None,
     replace: ReplaceOption = False,

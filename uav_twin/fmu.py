@@ -412,6 +412,15 @@ def export(
         int | None,
         typer.Option("--seed", min=0, help="Seed of the run; by default that of the scenario."),
     ] = None,
+    kind: Annotated[
+        Literal["python", "compiled"] | None,
+        typer.Option(
+            "--kind",
+            show_default="as the scenario says, or python",
+            help="What evaluates the FMUs that are packed from a design: Python, which other tools "
+            "need as well, or compiled C.",
+        ),
+    ] = None,
     replace: ReplaceOption = False,
 ) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs.
@@ -423,13 +432,43 @@ def export(
     from twin_master.scenario.reading import load_scenario
 
     checked_target(out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError)
+    _refuse_what_is_no_system(what)
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)
-        path = export_design(design, out, replace_file=replace)
+        path = export_design(design, out, kind=kind or "python", replace_file=replace)
     else:
         scenario = load_scenario(what)
-        path = export_scenario(scenario, out, seed=seed, replace_file=replace)
+        path = export_scenario(scenario, out, seed=seed, kind=kind, replace_file=replace)
     terminal.say(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+
+
+def _refuse_what_is_no_system(what: str) -> None:
+    """Refuse an FMU, an SSP file or a structure in the place of the scenario that flies it.
+
+    Raises
+    ------
+    SspError
+        If the argument is such a file; the message says which scenario flies it.
+    """
+    from fe.structure.design import is_structure
+
+    takes = "`ssp export` takes a scenario, which says what is connected, or a wing design"
+    suffix = Path(what).suffix.lower()
+    if suffix == ".fmu":
+        raise SspError(
+            f'{what} is an FMU, and {takes}: write a scenario with `[asset]`, `kind = "fmu"`, '
+            f'`file = "{what}"` and a `binding` of `uav-twin fmu bind {what}`, and export that '
+            "scenario."
+        )
+    if suffix == ".ssp":
+        raise SspError(
+            f"{what} is an SSP file already, and {takes}: see `uav-twin ssp check {what}`."
+        )
+    if is_structure(_table_of_file(what)):
+        raise SspError(
+            f"{what} is a structure, and {takes}: write a scenario with `[asset]`, `kind = "
+            f'"structure"` and `structure = "{what}"`, and export that scenario.'
+        )
 
 
 def _is_design(what: str) -> bool:
@@ -437,12 +476,17 @@ def _is_design(what: str) -> bool:
 
     It does if it is the name of the shipped design, or a TOML file with a table `planform`.
     """
+    return what == "uav_wing" or "planform" in _table_of_file(what)
+
+
+def _table_of_file(path: str) -> Mapping[str, object]:
+    """Return the table of a TOML file; empty if there is no such file, or it is not TOML."""
     from reporting.toml_file import read_toml
 
     try:
-        return what == "uav_wing" or "planform" in read_toml(what, ReportingError)
+        return read_toml(path, ReportingError)
     except ReportingError:
-        return False
+        return {}
 
 
 def check_system(file: SspArgument, *, json: JsonOption = False) -> None:

@@ -46,7 +46,10 @@ def simulate(
         Path | None,
         typer.Option(
             "--binding",
-            help="Its binding file; without one, all outputs in the FMU's units.",
+            help=(
+                "Binding file of the FMU; without one, all outputs are given in the units of the "
+                "FMU."
+            ),
         ),
     ] = None,
     inputs: Annotated[
@@ -93,21 +96,13 @@ def simulate(
     )
     from fmu_asset.client.history_files import read_histories
     from fmu_asset.client.session import FmiAsset
+    from fmu_asset.client.unset_inputs import unset_inputs_sentence
 
     _refuse_unwritable_files(out, plot, replace=replace)
-    if (binding is None) != (inputs is None):
-        raise FmuInputError(
-            "--binding and --inputs go together: one names the columns of the other."
-        )
-    if binding is not None and (stop_time is not None or step_size is not None or values):
-        raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says "
-            "these itself."
-        )
-    if interpolation is not None and inputs is None:
-        raise FmuInputError(
-            "--interpolation says how inputs go on between the rows of --inputs: give these."
-        )
+    has_experiment_options = stop_time is not None or step_size is not None or bool(values)
+    _refuse_options_that_contradict(
+        binding, inputs, interpolation, has_experiment_options=has_experiment_options
+    )
     isolated = not in_process
     # Without a binding: the default experiment of the FMU
     if binding is None:
@@ -130,7 +125,43 @@ def simulate(
     with closing(
         FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
     ) as asset:
+        unset = unset_inputs_sentence(asset.description, asset.binding, histories)
+        if unset:
+            terminal.say(f"warning: {unset}")
         _write_and_print_history(asset, run_histories(asset, steps, histories), file, out, plot)
+
+
+def _refuse_options_that_contradict(
+    binding: Path | None,
+    inputs: Path | None,
+    interpolation: str | None,
+    *,
+    has_experiment_options: bool,
+) -> None:
+    """Refuse options of `fmu simulate` that do not go together.
+
+    Parameters
+    ----------
+    binding, inputs : Path or None
+        The files of --binding and --inputs.
+    interpolation : str or None
+        The value of --interpolation.
+    has_experiment_options : bool
+        Whether --stop-time, --step-size or --set is given.
+    """
+    if (binding is None) != (inputs is None):
+        raise FmuInputError(
+            "--binding and --inputs go together: one names the columns of the other."
+        )
+    if binding is not None and has_experiment_options:
+        raise FmuInputError(
+            "--stop-time, --step-size and --set are for a simulation without --binding, which says "
+            "these itself."
+        )
+    if interpolation is not None and inputs is None:
+        raise FmuInputError(
+            "--interpolation says how inputs go on between the rows of --inputs: give these."
+        )
 
 
 def simulate_system(
@@ -166,7 +197,7 @@ def simulate_system(
         typer.Option(
             "--iterations",
             min=1,
-            help="How often a step of a circle of components is made at most.",
+            help="Largest number of iterations of a step if components form a loop.",
         ),
     ] = 1,
     delay: Annotated[
@@ -265,7 +296,9 @@ def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
-        raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
+        raise FmuInputError(
+            f"--interpolation must be zero-order or linear, but {kind!r} was given."
+        )
     return binding.with_header(interpolation=kind)
 
 

@@ -101,6 +101,8 @@ class ImportDialogue:
         has_questions = self.open_count > 0
         if has_questions:
             terminal.say(f"{counted(self.open_count, 'question')} to answer. {HOW_TO_ANSWER}")
+            if self.understanding.outputs_sentence:
+                terminal.say(self.understanding.outputs_sentence)
         while self.open_count > 0:
             self._ask_next()
         return has_questions

@@ -66,7 +66,7 @@ ModelOption = Annotated[
         "--model",
         show_default="the shipped wing",
         autocompletion=complete_model,
-        help="As of `discrepancy run`.",
+        help="The same as for `discrepancy run`.",
     ),
 ]
 ModeCountOption = Annotated[int, typer.Option("--modes", min=1, max=50, help="Number of modes.")]

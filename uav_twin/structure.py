@@ -122,7 +122,7 @@ def info(
     memory_limit: MemoryLimitOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it.
+    """Print the parts, masses, modes and responses to the loads of a structure.
 
     Example: `uav-twin structure info bracket --modes 3`
     """
@@ -204,7 +204,10 @@ def field(
         typer.Option(
             "--at",
             metavar="NAME=VALUE",
-            help="A parameter, loss, mass or control that is not nominal; may come again.",
+            help=(
+                "Value of a parameter, loss, mass or control that is not nominal; may be given "
+                "several times."
+            ),
         ),
     ] = None,
     replace: ReplaceOption = False,
@@ -254,7 +257,7 @@ def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) 
                 f"{name} from {low:g} to {high:g}" for name, (low, high) in ranges.items()
             ]
             raise typer.BadParameter(
-                f"NAME=VALUE is expected, each name once, but {text!r} came; there are "
+                f"NAME=VALUE is expected, each name once, but {text!r} was given; there are "
                 f"{comma_list(known_ranges)}. Give a value inside, or widen its range in the "
                 "structure file.",
                 param_hint="--at",

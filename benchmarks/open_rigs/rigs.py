@@ -417,7 +417,7 @@ def support(truth: Truth, course: Course, stamps: FloatArray, *, order: int) -> 
     motion = body(truth, course, stamps, m, SCALES["support"], known_force, shaken=shaken)
     support_mass = truth.parameter("mass", 0.8)
     acceleration = np.array([shaken(t) for t in stamps])
-    # A push comes from outside: it is no force between support and body
+    # A push comes from outside: it is not a force between support and body
     internal = motion.law + (motion.disturbance if truth.disturbance == "law" else 0.0)
     force = support_mass * acceleration - c * motion.v - k * motion.x - internal
     return np.column_stack((motion.x, force))

@@ -65,7 +65,7 @@ def draw_effect() -> Drawing:
     """Draw the residual of the held-out release, before and after friction is named."""
     investigation = notebook("name_an_effect", "investigate(").names["investigation"]
     curves = (
-        (investigation.before, REFERENCE, "model as it was"),
+        (investigation.before, REFERENCE, "unchanged model"),
         (investigation.after, PAST, "with friction"),
     )
     with publication_style():

@@ -14,7 +14,7 @@ VARIABLES = {
         None,
         None,
         None,
-        "temperature less the reference temperature",
+        "temperature minus the reference temperature temperature",
     ),
 }
 

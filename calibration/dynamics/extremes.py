@@ -87,8 +87,8 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
     record = fit.record
     if record.lowest is None or record.highest is None:
         raise ExperimentDataError(
-            f"{record.source}: the record has no lowest and highest values; "
-            "only one read off a plot does."
+            f"{record.source}: the record has no lowest and highest values; only a record read off "
+            "a plot has them."
         )
     lowest = record.lowest
     highest = record.highest

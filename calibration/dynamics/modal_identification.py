@@ -8,6 +8,8 @@ squares with the modes common to all channels; the covariance is that of the lea
 white noise of its own on each channel.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args
@@ -124,8 +126,8 @@ def _centred_record(acceleration: ArrayLike) -> Float:
         record = record[:, None]
     if record.ndim != 2 or not np.all(np.isfinite(record)):
         raise ExperimentDataError(
-            "a record of accelerations must be finite numbers, one row for each sample; "
-            "lost values must be cut out or filled before."
+            "a record of accelerations must be finite numbers, one row for each sample; remove or "
+            "fill lost values first."
         )
     return np.asarray(record - record.mean(axis=0))
 
@@ -134,7 +136,7 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
     """Refuse bands (M, 2) [Hz] that are empty, overlap, or exceed half the sampling rate [Hz]."""
     if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
         raise ExperimentDataError(
-            "each band is its least and its largest frequency [Hz], above zero."
+            "each band must be two positive frequencies [Hz], the lower one first."
         )
     highest = 0.5 * sampling_rate
     if limits.max() > highest:
@@ -144,13 +146,16 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
         )
     if 2 * len(limits) > LARGEST_ORDER:
         raise ExperimentDataError(
-            f"{LARGEST_ORDER // 2} modes are identified at most, and {len(limits)} are asked for."
+            f"{LARGEST_ORDER // 2} modes are identified at most, but {len(limits)} were asked for."
         )
     ascending = limits[np.argsort(limits[:, 0])]
     starts = ascending[1:, 0]
     ends_of_previous = ascending[:-1, 1]
     if np.any(starts < ends_of_previous):
-        raise ExperimentDataError("bands overlap, and one mode could be found in two: part them.")
+        raise ExperimentDataError(
+            "bands overlap, so that one mode could be found in two of them: give bands that do not "
+            "overlap."
+        )
 
 
 def _refuse_dead_accelerometers(record: Float) -> None:
@@ -158,8 +163,8 @@ def _refuse_dead_accelerometers(record: Float) -> None:
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(
-            f"accelerometer {dead[0] + 1} of the record shows one value throughout: "
-            "leave it out, or mend it."
+            f"accelerometer {dead[0] + 1} of the record shows the same value throughout: leave it "
+            "out, or repair it."
         )
 
 
@@ -191,8 +196,8 @@ def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
     needed = blocks * 2 * lags
     if len(record) < needed:
         raise ExperimentDataError(
-            f"the record has {len(record)} samples; {needed} are needed to tell modes and their "
-            "covariance: record longer, or take a smaller sampling rate."
+            f"the record has {len(record)} samples; {needed} are needed to estimate modes and "
+            "their covariance: record longer, or sample more slowly."
         )
 
 
@@ -336,8 +341,9 @@ class _AmbientIdentification:
         if group_count < _FEWEST_BLOCKS:
             duration = self._block_length * BLOCKS / self._sampling_rate
             raise ExperimentDataError(
-                f"a mode dies away in {decay_time:.3g} s, and the record of {duration:.3g} s holds "
-                f"that less than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
+                f"a mode decays within {decay_time:.3g} s, and the record of {duration:.3g} s is "
+                f"less than {_FEWEST_BLOCKS} times as long, too short for a covariance: record "
+                "longer."
             )
         used_correlations = self._block_correlations[: group_count * blocks_per_group]
         groups = used_correlations.reshape(group_count, blocks_per_group, *self._correlation.shape)

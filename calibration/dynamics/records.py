@@ -115,7 +115,9 @@ def _refuse_uneven_time(record: RingDownRecord) -> None:
 def _refuse_constant_signal(record: RingDownRecord) -> None:
     """Refuse a record whose signal never changes."""
     if np.ptp(record.signal) == 0.0:
-        raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
+        raise ExperimentDataError(
+            f"{record.source}: the signal is constant, so that it is not a ring-down."
+        )
 
 
 def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name: str) -> None:
@@ -176,7 +178,7 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
 
 
 def find_records(path: Path) -> tuple[Path, ...]:
-    """Return the files that `read_records` reads: all files of the best kind that there is.
+    """Return the files that `read_records` reads: all files of the kind that it prefers.
 
     Raises
     ------

@@ -295,7 +295,7 @@ def _refuse_steady(record: RingDownRecord) -> None:
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
-    """Refuse modes that are no decaying oscillations.
+    """Refuse modes that are not decaying oscillations.
 
     Parameters
     ----------

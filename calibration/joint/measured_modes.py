@@ -49,8 +49,8 @@ def modal_readings(
     for name, value, deviation in zip(MODAL, values, deviations, strict=True):
         if not deviation > 0.0:
             raise ExperimentDataError(
-                f"ring-down: {name} comes out as {value:g} without any uncertainty; "
-                "give records as they were measured, noise and all."
+                f"ring-down: {name} is estimated as {value:g} without any uncertainty; give the "
+                "records as they were measured, with their noise."
             )
         readings.append(FigureReading(name, "ring-down", value, deviation))
     return tuple(readings)

@@ -344,9 +344,9 @@ def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
         fraction = float(np.mean(np.abs(e - limit) < margin))
         if fraction > _LARGEST_FRACTION_AT_LIMIT:
             raise OutsideValidityError(
-                f"{fraction:.0%} of the joint posterior of e is pressed against {limit:g}, where "
-                "the model ends: load test and frequencies contradict each other; check them, or "
-                "allow the model a larger error of its frequencies."
+                f"{fraction:.0%} of the joint posterior of e lies at {limit:g}, the limit of the "
+                "model: load test and frequencies contradict each other; check them, or allow the "
+                "model a larger error of its frequencies."
             )
 
 

@@ -175,7 +175,7 @@ def read_published_results(path: Path) -> PaperSamples:
     Raises
     ------
     ExperimentFileError
-        If the file is missing, empty, lacks a column, or has a cell that is no number.
+        If the file is missing, empty, lacks a column, or has a cell that is not a number.
     ExperimentDataError
         If a value is not positive and finite.
     """

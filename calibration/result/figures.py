@@ -140,7 +140,7 @@ def _limits(samples: Sequence[Float]) -> tuple[float, float]:
     Parameters
     ----------
     samples : sequence of (N,) arrays
-        The sets. Outliers of the first are left out; the others are shown completely.
+        The sets. Outliers of the first set are left out; the other sets are shown completely.
     """
     first_set, *other_sets = samples
     low, high = np.quantile(first_set, [0.002, 0.998])

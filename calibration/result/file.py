@@ -75,7 +75,7 @@ def result_bytes(calibration: Calibration) -> bytes:
 
 
 def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
-    """Return samples (N, F) of all figures as a group with one chain, as ArviZ expects it."""
+    """Return samples (N, F) of the calibrated quantities as a dataset in the layout of ArviZ."""
     return xr.Dataset(
         {
             figure.name: (
@@ -100,7 +100,7 @@ def load_calibration(path: Path | str) -> Calibration:
     groups, root = _read(path)
     schema = root.get("schema")
     if schema != SCHEMA:
-        kind = f"of the schema {str(schema)!r}" if schema else "no calibration file"
+        kind = f"of the schema {str(schema)!r}" if schema else "not a calibration file"
         raise CalibrationRecordError(
             f"{path} is {kind}, but {SCHEMA!r} is needed; calibrate again with this version."
         )
@@ -118,7 +118,7 @@ def load_calibration(path: Path | str) -> Calibration:
 def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
     """Refuse a folder with another calibration, before the work on a new one begins.
 
-    A file that is no calibration may be replaced.
+    A file that is not a calibration may be replaced.
 
     Parameters
     ----------
@@ -132,11 +132,11 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
     Raises
     ------
     FileNotWrittenError
-        If the path is no folder, or the folder holds the calibration of another asset or of another
-        kind.
+        If the path is not a folder, or the folder holds the calibration of another asset or of
+        another kind.
     """
     if folder.exists() and not folder.is_dir():
-        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
+        raise FileNotWrittenError(f"{folder} exists and is not a folder: choose another --out.")
     file = folder / FILE_NAME
     try:
         existing = load_calibration(file)
@@ -152,7 +152,7 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
         existing_kind = FROM_LABORATORY if existing_is_wing else FROM_CAMPAIGN
         new_kind = FROM_LABORATORY if wing else FROM_CAMPAIGN
         raise FileNotWrittenError(
-            f"{file} is the calibration of {asset} {existing_kind}, and one {new_kind} was asked "
+            f"{file} is the calibration of {asset} {existing_kind}, but one {new_kind} was asked "
             "for: choose another --out, one for each kind of calibration."
         )
 
@@ -186,7 +186,7 @@ def _sample_columns(group: xr.Dataset, names: list[str]) -> Float:
 def _read(path: Path) -> tuple[Groups, Root]:
     """Return the groups and the root attributes of a calibration file."""
     if not path.is_file():
-        state = "no file" if path.exists() else "not there"
+        state = "not a file" if path.exists() else "missing"
         raise CalibrationRecordError(
             f"{path} is {state}; give the {FILE_NAME} that `uav-twin calibrate --out DIR` leaves."
         )
@@ -194,7 +194,7 @@ def _read(path: Path) -> tuple[Groups, Root]:
         tree = _tree(path, hashlib.sha256(path.read_bytes()).digest())
     except DamagedFileError as error:
         raise CalibrationRecordError(
-            f"{path} is damaged or no calibration file: it cannot be read as NetCDF; "
+            f"{path} is damaged or is not a calibration file: it cannot be read as NetCDF; "
             "calibrate again."
         ) from error
     groups = {name: tree[name].to_dataset() for name in tree.children}

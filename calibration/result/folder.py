@@ -143,7 +143,9 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     for sentence in result.findings:
         page.add_notice(sentence)
     if not result.findings:
-        page.add_paragraph("Noise and priors allow what is left, and every parameter is told.")
+        page.add_paragraph(
+            "The residuals agree with noise and priors, and the data determine every parameter."
+        )
     parameter_columns, titles = drawn_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
@@ -161,21 +163,23 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         "prior_and_posterior",
         corner_figure(titles, [posterior_set, prior_set]),
         title="Prior and posterior",
-        caption="The same with samples of the prior; the histograms have scales of their own.",
+        caption=(
+            "The same figure with samples of the prior. The histograms have scales of their own."
+        ),
     )
     add_figure(page, prior_and_posterior, folder)
     add_titled_table(page, parameters_table(result))
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
-    page.add_section("What is left of the readings")
+    page.add_section("Residuals of the readings")
     if result.readings:
         readings = ReportFigure(
             "readings",
             readings_figure(result),
             title="Readings",
             caption=(
-                "The model before and after the calibration, and what was measured with its 95 % "
-                "interval. The vertical scale of each panel is free."
+                "The model before and after the calibration, and the measured values with 95 % "
+                "intervals. Each panel has a vertical scale of its own."
             ),
         )
         add_figure(page, readings, folder)

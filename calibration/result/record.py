@@ -513,7 +513,7 @@ def check_name(asset: str) -> str:
     has_good_length = 0 < len(asset) <= LONGEST_NAME
     if not (has_good_length and asset.isprintable() and asset.strip()):
         raise CalibrationRecordError(
-            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, "
-            f"and {asset!r} came."
+            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, but "
+            f"{asset!r} was given."
         )
     return asset

@@ -47,8 +47,8 @@ def parameters_table(result: Calibration) -> TitledTable:
     ]
     caption = (
         f"Mean ± standard deviation. The posterior is {PROCEDURES[result.procedure]}; "
-        f"calibration.nc has {len(result.samples)} samples of it. Left of the prior: the standard "
-        "deviation of the posterior as a fraction of that of the prior."
+        f"calibration.nc has {len(result.samples)} samples of it. Posterior over prior: the "
+        "standard deviation of the posterior as a fraction of that of the prior."
     )
     if result.information is not None:
         caption += f" Information gained: {result.information:.2f} nat."
@@ -77,7 +77,7 @@ def readings_table(result: Calibration) -> TitledTable:
             ),
         ),
         number_cells(
-            "model less reading, in standard deviations",
+            "model minus reading, in standard deviations",
             lambda reading: f"{result.score(reading):+.1f}",
         ),
     ]
@@ -118,7 +118,7 @@ def _rms_text(rms: float) -> str:
 
 
 def origin_table(result: Calibration) -> TitledTable:
-    """Return the table of where a calibration comes from."""
+    """Return the table of the origin of a calibration."""
     versions = result.provenance["versions"].items()
     items = {
         "asset": result.asset,

@@ -39,7 +39,7 @@ def headline(result: Calibration) -> str:
 
 
 def printed_calibration(result: Calibration) -> Iterator[str | Table]:
-    """Yield what is printed of a calibration: lines and tables."""
+    """Yield the printed lines and tables of a calibration."""
     yield headline(result)
     yield tables.parameters_table(result).table
     yield from correlation_lines(result)

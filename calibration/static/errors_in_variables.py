@@ -242,9 +242,10 @@ def _refuse_posterior_outside(posterior: ScalarPosterior, curve: StiffnessCurve)
     outside = 1.0 - float(below_upper - below_lower)
     if outside > _LARGEST_PROBABILITY_OUTSIDE:
         raise OutsideValidityError(
-            f"the posterior e = {posterior.mean:.4g} +- {posterior.standard_deviation:.2g} lies to "
-            f"{outside:.2%} outside [{curve.lower:g}, {curve.upper:g}], where {curve.name} may be "
-            "trusted; build the model for a wider range of e, or check units and prior."
+            f"{outside:.2%} of the posterior e = {posterior.mean:.4g} +- "
+            f"{posterior.standard_deviation:.2g} lies outside [{curve.lower:g}, {curve.upper:g}], "
+            f"the range in which {curve.name} holds; build the model for a wider range of e, or "
+            "check units and prior."
         )
 
 

@@ -151,7 +151,7 @@ def read_measurements(path: Path) -> LoadDisplacementData:
     ------
     ExperimentFileError
         If the file is missing, empty, lacks a column, has a row whose number of cells is not that
-        of its header or a cell that is no number, or repeats a row in a loading run.
+        of its header or a cell that is not a number, or repeats a row in a loading run.
     ExperimentDataError
         If a value is not positive and finite, or load over displacement shows other units.
     """

@@ -95,11 +95,11 @@ class WingCalibration:
 
 
 def _check_request(procedure: KeptProcedure, seed: int) -> None:
-    """Refuse an unknown procedure, and a seed that is no whole number of 63 bits."""
+    """Refuse an unknown procedure, and a seed that is not a whole number of 63 bits."""
     require_one_of(procedure, get_args(KeptProcedure), "procedure")
     if seed not in range(2**63):
         raise CalibrationRecordError(
-            f"`seed` must be a whole number from 0 to 2^63 - 1, and {seed!r} came."
+            f"`seed` must be a whole number from 0 to 2^63 - 1, but {seed!r} was given."
         )
 
 

@@ -120,15 +120,16 @@ def read_weighed_mass(file: Path) -> FigureReading:
     Raises
     ------
     ExperimentFileError
-        If the file cannot be read, lacks a column, has not exactly one row, or a cell is no number.
+        If the file cannot be read, lacks a column, has not exactly one row, or a cell is not a
+        number.
     ExperimentDataError
         If a value is not a positive finite number of grams, or looks like kg or mg.
     """
     table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
         raise ExperimentFileError(
-            f"{file} needs a header `mass,standard_deviation` and one row in grams, "
-            f"and {len(table)} came."
+            f"{file} needs a header `mass,standard_deviation` and one row in grams, but "
+            f"{len(table)} rows were given."
         )
     mass = float(table.numbers("mass", "a weighing", positive=True)[0])
     deviation = float(table.numbers("standard_deviation", "a weighing", positive=True)[0])
@@ -239,7 +240,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         require_one_of(targets, get_args(Targets), "targets")
     path = Path(path)
     if not path.is_dir():
-        state = "no folder" if path.exists() else "not there"
+        state = "not a folder" if path.exists() else "missing"
         raise ExperimentFileError(
             f"{path} is {state}; give the folder that holds step1, step2 and step3."
         )

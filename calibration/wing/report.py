@@ -117,7 +117,7 @@ def _add_sections(
 
 
 def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
-    """Add to a page where the measurements of each step come from.
+    """Add the origin of the measurements of each step to a page.
 
     If some steps use measurements of this wing and others published values, the latter are notices.
     """

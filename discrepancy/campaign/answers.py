@@ -75,7 +75,7 @@ class Questionnaire:
             return ""
         if choices and answer not in choices:
             raise CampaignFileError(
-                f"--{option} must be {listing(choices, 'or')}, and {answer!r} came."
+                f"--{option} must be {listing(choices, 'or')}, but {answer!r} was given."
             )
         return answer
 
@@ -130,5 +130,5 @@ def check_subjects(answers: Answers, heads: Collection[str], files: Collection[s
         for name in answers.get(option, {}).keys() - allowed_subjects:
             expected_subjects = listing(map(repr, filter(None, subjects)), "or")
             raise CampaignFileError(
-                f"--{option} must be NAME=... about {expected_subjects}, and {name!r} came."
+                f"--{option} must be NAME=... about {expected_subjects}, but {name!r} was given."
             )

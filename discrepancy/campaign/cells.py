@@ -102,7 +102,7 @@ def _seconds_of_cell(cell: str, place: str) -> Decimal:
                 fraction_of_second = Decimal(f"0{fraction.replace(',', '.')}")
                 return whole_seconds - _offset_seconds(offset) + fraction_of_second
     raise CampaignFileError(
-        f"{place}: {cell!r} is no time, or has a date that can be read in two ways: write it as "
+        f"{place}: {cell!r} is not a time, or has a date that can be read in two ways: write it as "
         "10:15:02.5, 2026-03-31 10:15:02.5 or 31.3.2026 10:15:02.5."
     )
 

@@ -28,7 +28,7 @@ class Hold(StrEnum):
 
 @dataclass(frozen=True)
 class NoiseRecord:
-    """What is known of the noise of a channel; the table `noise` of a channel in a file.
+    """The noise of a channel and how well it is known; the table `noise` of a channel in a file.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Channel(InTables):
     output : str
         Output of the model that it is compared with, such as "strain[17]" or "tip_displacement".
     noise : NoiseRecord or None
-        Its noise; without it no absolute statement about a fit can be made.
+        Its noise; without it, the size of the residuals of a fit cannot be judged.
     gain_deviation : float
         Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
         unknown scale (one of them is then the scale of the release amplitudes).

@@ -41,7 +41,7 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
     contradict = by_name is not None and by_position is not None and by_name != by_position
     stamped_heads = by_position if by_name is None else by_name
     if stamped_heads is None or contradict:
-        reason = "neither names nor places say it"
+        reason = "neither the names nor the places of the columns show it"
         if contradict:
             reason = "names and places contradict each other"
         raise CampaignFileError(

@@ -127,7 +127,7 @@ def merge_clocks(
     if unread_titles:
         raise CampaignFileError(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
-            f"{unread_titles[0]!r} are known, and a load must be known while a channel is read."
+            f"{unread_titles[0]!r} are known, but a load must be known whenever a channel is read."
         )
     remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
     if not clocks_are_equal:
@@ -278,7 +278,7 @@ def _rest_samples_in_order(
             )
             cells[column.title] = tuple(column_cells)
     lines = tuple(clocks[0].times.sheet.lines[row] for row in longest.rows)
-    remark = f"{_stamped_columns_text(clocks)}: samples at rest stand in their order"
+    remark = f"{_stamped_columns_text(clocks)}: samples at rest are kept in their order"
     return MergedTable(cells, lines, remark)
 
 
@@ -299,8 +299,8 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
         for row, cell in enumerate(column.cells_in_si(decimal)):
             if cell and not cells[row]:
                 raise CampaignFileError(
-                    f"{sheet.name}, line {sheet.lines[row]}: {column.head!r} has a reading and "
-                    f"{clock.times.head!r} no time: give it, or leave the reading out."
+                    f"{sheet.name}, line {sheet.lines[row]}: {column.head!r} has a reading, but "
+                    f"{clock.times.head!r} has no time: give the time, or leave the reading out."
                 )
     printed_times = [cells[row] for row in rows]
     seconds = np.array([float(cell) for cell in printed_times])

@@ -1,7 +1,7 @@
 """What each column of a laboratory's table is: its role, unit and quantity."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from discrepancy.campaign.answers import Questionnaire
@@ -47,6 +47,8 @@ class ColumnReader:
         The kind of trial of each file, by the name of the file.
     quantity_of : callable or None
         Returns the quantity of a model's output. Without it any name can be that of an output.
+    outputs : sequence of str
+        The model's outputs with quantity and unit, as a refusal lists them.
     """
 
     def __init__(
@@ -54,10 +56,12 @@ class ColumnReader:
         questionnaire: Questionnaire,
         kinds: Mapping[str, str],
         quantity_of: OutputQuantity | None,
+        outputs: Sequence[str] = (),
     ) -> None:
         self.kinds = kinds
         self._questionnaire = questionnaire
         self._quantity_of = quantity_of
+        self._outputs = outputs
 
     def read_column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
         """Return a column of a table by its head and the unit that the file states."""
@@ -78,13 +82,14 @@ class ColumnReader:
     def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
         """Return the record of a column of readings; ask the user for a role or unit it lacks."""
         role = self._determine_role(sheet, head, unit)
+        self._check_role(sheet, head, role)
         if not unit and role != LEFT_OUT:
-            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
+            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a plain number")
         if not unit or role == LEFT_OUT:
             return LaboratoryColumn(sheet, head, role, unit)
         try:
             if role == "temperature" and unit == "K":
-                raise ValueError("a temperature must be in degC, and 'K' came")
+                raise ValueError("a temperature must be in degC, but 'K' was given")
             is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN
             is_output = is_driven and self._output_quantity(role) is not None
             if role == "force" and is_driven and not is_output:
@@ -118,6 +123,22 @@ class ColumnReader:
             quantity=quantity,
             to_si=factor_to_si(quantity, unit),
         )
+
+    def _check_role(self, sheet: Sheet, head: str, role: str) -> None:
+        """Refuse the role of a column if it is neither an input nor an output of the model.
+
+        The unit of the column is not needed for this. So a wrong role is refused before the user is
+        asked for the unit.
+        """
+        is_open = not role or self._quantity_of is None
+        if is_open or role == LEFT_OUT or role in _UNITS_OF_INPUT_COLUMNS or INPUT in role:
+            return
+        if self._output_quantity(role) is None:
+            it_has = f"; it has {listing(self._outputs)}" if self._outputs else ""
+            raise CampaignFileError(
+                f"{sheet.name}, column {head!r}: the model has no output {role!r}{it_has}; say "
+                "another."
+            )
 
     def _output_quantity(self, role: str) -> Quantity | None:
         """Return the quantity of a model output; None if it does not exist or there is no model."""
@@ -161,19 +182,12 @@ class ColumnReader:
 
         If the unit fits several quantities and neither an answer nor the model decides, the user is
         asked, and the result is None.
-
-        Raises
-        ------
-        ValueError
-            If the role is no output of the model.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
         quantities = possible_quantities(unit, answer)
         if self._quantity_of is not None and role and INPUT not in role:
             modelled = self._quantity_of(role)
-            if modelled is None:
-                raise ValueError(f"the model has no output {role!r}")
-            if modelled in quantities:
+            if modelled is not None and modelled in quantities:
                 quantities = (modelled,)
         # a length is taken as a displacement rather than as a level, and a unit of strain as strain
         # rather than as a plain number

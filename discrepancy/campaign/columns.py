@@ -153,7 +153,8 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     amount = AMOUNT.fullmatch(scale)
     if amount is None or float(amount[1]) == 0.0 or not isfinite(float(amount[1])):
         raise CampaignFileError(
-            f"--scale of {head!r} must be a number and units such as 200 N/V, and {scale!r} came."
+            f"--scale of {head!r} must be a number and units such as 200 N/V, but {scale!r} was "
+            "given."
         )
     amount_text, ratio_of_units = amount.groups()
     if not ratio_of_units:
@@ -165,8 +166,8 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
         factor = conversion_factor(unit or per, per)
     except ValueError:
         raise CampaignFileError(
-            f"--scale of {head!r} is for cells in {per}, and they are in {unit}: give one for "
-            f"{unit}, or say --unit {head}={per}."
+            f"--scale of {head!r} is for cells in {per}, but they are in {unit}: give one for "
+            f"{unit}, or give --unit {head}={per}."
         ) from None
     return unit or per, reading_unit, float(amount_text) * factor
 
@@ -202,7 +203,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
     if amount is None or not 0.0 <= float(amount[1]) < np.inf:
         raise CampaignFileError(
             f"--zero of {column.head!r} must be a standard deviation such as 0.1{column.read_in} "
-            f"or 1%, {EXACT} or {FREE}, and {answer!r} came."
+            f"or 1%, {EXACT} or {FREE}, but {answer!r} was given."
         )
     assert column.quantity is not None
     amount_text, unit = amount.groups()
@@ -234,8 +235,8 @@ def gain_deviation(head: str, answer: str) -> float | str:
     amount = AMOUNT.fullmatch(answer)
     if amount is None or amount[2] not in ("", "%") or not 0.0 <= float(amount[1]) < np.inf:
         raise CampaignFileError(
-            f"--gain of {head!r} must be a standard deviation such as 2%, {EXACT} or {FREE}, "
-            f"and {answer!r} came."
+            f"--gain of {head!r} must be a standard deviation such as 2%, {EXACT} or {FREE}, but "
+            f"{answer!r} was given."
         )
     amount_text, percent = amount.groups()
     return float(amount_text) / 100.0 if percent else float(amount_text)
@@ -250,7 +251,7 @@ def degrees_celsius(answer: str) -> float:
         return float(answer)
     except ValueError:
         raise CampaignFileError(
-            f"--reference-temperature must be in degC, and {answer!r} came."
+            f"--reference-temperature must be in degC, but {answer!r} was given."
         ) from None
 
 
@@ -271,11 +272,11 @@ def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
     """
     if answer is not None:
         if answer not in list(Quantity):
-            raise ValueError(f"a quantity is {listing(Quantity, 'or')}, and {answer!r} came")
+            raise ValueError(f"a quantity is {listing(Quantity, 'or')}, but {answer!r} was given")
         return (Quantity(answer),)
     quantities = quantities_of(unit)
     if not quantities:
-        raise ValueError(f"{unit!r} is no unit of a quantity that is measured here")
+        raise ValueError(f"{unit!r} is not a unit of a measured quantity")
     return quantities
 
 
@@ -290,7 +291,8 @@ def sampling_interval(answer: str) -> float:
     amount = AMOUNT.fullmatch(answer)
     if amount is None or amount[2] not in ("", "s") or not 0.0 < float(amount[1]) < np.inf:
         raise CampaignFileError(
-            f"--interval must be a positive number of seconds such as 0.01, and {answer!r} came."
+            f"--interval must be a positive number of seconds such as 0.01, but {answer!r} was "
+            "given."
         )
     return float(amount[1])
 
@@ -311,7 +313,7 @@ def release_in_si(answer: str) -> dict[str, Any]:
                 displacement = float(amount_text) * factor_to_si(quantity, unit)
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
     raise CampaignFileError(
-        f"--release must be a length or a voltage such as 15.5mm, and {answer!r} came."
+        f"--release must be a length or a voltage such as 15.5mm, but {answer!r} was given."
     )
 
 

@@ -54,6 +54,8 @@ class LaboratoryImport:
         by the column or file that they are about.
     quantity_of : callable, optional
         Returns the quantity of a model's output. Without it any name can be that of an output.
+    outputs : sequence of str
+        The model's outputs with quantity and unit, as questions and refusals list them.
 
     Raises
     ------
@@ -66,16 +68,19 @@ class LaboratoryImport:
         sheets: Sequence[Sheet],
         answers: Answers,
         quantity_of: OutputQuantity | None = None,
+        outputs: Sequence[str] = (),
     ) -> None:
         self.sheets = sheets
         self.answers = answers
         self._quantity_of = quantity_of
+        self._outputs = outputs
         self._questionnaire = Questionnaire(answers)
         self._clocks: dict[str, MergedTable] = {}
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
             raise CampaignFileError(
-                f"Two files have one name of {listing(names)}: rename one; trials have it."
+                f"Two files have the same name among {listing(names)}: rename one, because trials "
+                "are named after their files."
             )
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
         check_subjects(answers, [*heads], names)
@@ -83,7 +88,7 @@ class LaboratoryImport:
         self.kinds = {name: self._kind_of_file(name) for name in names}
         self._noise_file = self._only_noise_file()
         self.decimals = {sheet.name: self._decimal_mark(sheet) for sheet in sheets}
-        reader = ColumnReader(self._questionnaire, self.kinds, quantity_of)
+        reader = ColumnReader(self._questionnaire, self.kinds, quantity_of, outputs)
         self.columns: list[LaboratoryColumn] = []
         for sheet in sheets:
             for head, unit in zip(sheet.heads, sheet.units, strict=True):
@@ -121,6 +126,15 @@ class LaboratoryImport:
         """The remark on zeros and gains that nobody stated; empty if all are stated."""
         return self._deviations.assumed
 
+    @property
+    def outputs_sentence(self) -> str:
+        """The outputs that a column can measure; empty if the role of every column is known."""
+        if not any(option == "column" for option, _ in self.questions):
+            return ""
+        if self._outputs:
+            return f"The model has the outputs {listing(self._outputs)}."
+        return "To have the outputs of your model listed, give --model."
+
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
         """Return a new import that takes one more answer of the user into account.
 
@@ -134,7 +148,8 @@ class LaboratoryImport:
             The answer that the user gave.
         """
         of_option = {**self.answers.get(option, {}), subject: answer}
-        return LaboratoryImport(self.sheets, {**self.answers, option: of_option}, self._quantity_of)
+        answers = {**self.answers, option: of_option}
+        return LaboratoryImport(self.sheets, answers, self._quantity_of, self._outputs)
 
     # ---------------------------------------------------------------- files
 
@@ -147,7 +162,7 @@ class LaboratoryImport:
         files = [name for name, kind in self.kinds.items() if kind == NOISE]
         if len(files) > 1:
             raise CampaignFileError(
-                f"Noise is read from one file, and {listing(files)} came: give one of them."
+                f"Noise is read from one file, but {listing(files)} were given: give one of them."
             )
         return files[0] if files else None
 
@@ -173,15 +188,15 @@ class LaboratoryImport:
         if any(column.role == "time" for column in columns):
             if self._questionnaire.stated_answer("interval", sheet.name) is not None:
                 raise CampaignFileError(
-                    f"{sheet.name} has a column of times, and --interval came for it: leave one of "
-                    "them out."
+                    f"{sheet.name} has a column of times, but --interval was given for it, too: "
+                    "leave one of them out."
                 )
             return None
         # while the role of a column is not known, it may be the time
         roles_are_known = all(column.role for column in columns)
         if not roles_are_known or self.kinds[sheet.name] not in _RECORDED_IN_TIME:
             return None
-        expected_answer = "seconds between its rows, as no column is a time"
+        expected_answer = "seconds between its rows, because no column is a time"
         answer = self._questionnaire.ask("interval", sheet.name, expected_answer)
         return sampling_interval(answer) if answer else None
 
@@ -196,8 +211,8 @@ class LaboratoryImport:
             return None
         choices = [*map(str, Start)]
         expected_answer = (
-            f"how it begins, {listing(choices, 'or')}: at rest under what acts at first, under "
-            "nothing, or not"
+            f"how it begins, {listing(choices, 'or')}: at rest under the first loads, at rest "
+            "without loads, or in an unknown state"
         )
         answer = self._questionnaire.ask_or_assume(
             Start.SETTLED.value, "begins", file, expected_answer, choices
@@ -215,7 +230,7 @@ class LaboratoryImport:
                     f"--held-out is for trials, and {file} holds samples at rest."
                 )
             return False
-        expected_answer = "whether it is kept for proof and not fitted, yes or no"
+        expected_answer = "whether it is held out for the proof and not fitted, yes or no"
         answer = self._questionnaire.ask_or_assume(
             "no", "held-out", file, expected_answer, ("yes", "no")
         )
@@ -223,7 +238,7 @@ class LaboratoryImport:
 
     def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
-        expected_answer = "how far the point was held that was let go, such as 15.5mm"
+        expected_answer = "displacement at which the release point was held, such as 15.5mm"
         answer = self._questionnaire.ask("release", file, expected_answer)
         return release_in_si(answer or "1m")
 
@@ -268,7 +283,8 @@ class LaboratoryImport:
             those of the laboratory's files.
         """
         if self.questions:
-            raise CampaignFileError(missing_answers(self.questions))
+            message = f"{missing_answers(self.questions)} {self.outputs_sentence}"
+            raise CampaignFileError(message.rstrip())
         trial_files = [file for file in self.kinds if file != self._noise_file]
         content: dict[str, Any] = {
             "format": FORMAT,
@@ -310,7 +326,8 @@ class LaboratoryImport:
             }
             if tables.setdefault(column.title, table) != table:
                 raise CampaignFileError(
-                    f"{column.title!r} is something else in {column.sheet.name}."
+                    f"{column.title!r} has another quantity or unit in {column.sheet.name} than in "
+                    "another file: rename one."
                 )
         return [*tables.values()]
 

@@ -89,7 +89,7 @@ def _variables(path: Path) -> Iterator[tuple[str, object]]:
         content = _hdf5_content(path) if _is_hdf5(path) else _content_before_hdf5(path)
     except Exception as cause:  # the libraries raise almost any error for damaged files
         raise CampaignFileError(
-            f"{path} cannot be read as a MATLAB file ({one_line(cause)}): save it anew with "
+            f"{path} cannot be read as a MATLAB file ({one_line(cause)}): save it again with "
             "save('FILE.mat', '-v7')."
         ) from cause
     for name, value in content.items():

@@ -46,8 +46,8 @@ def pre_trigger_record(
         )
     if np.ptp(samples) == 0.0:
         raise CampaignDataError(
-            f"{source}: all samples of the channel {name!r} are {samples[0]!r}, which is no noise; "
-            "record it with the amplifier on, or state its standard deviation."
+            f"{source}: all samples of the channel {name!r} have the same value, so that there is "
+            "no noise in them; record it with the amplifier on, or state its standard deviation."
         )
     mean = float(np.mean(samples))
     deviation = float(np.std(samples, ddof=1))

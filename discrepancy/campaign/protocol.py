@@ -81,7 +81,8 @@ def _checked_fault(word: str) -> str:
     """Return the name of an acceptable fault; raise ValueError for any other word."""
     if word not in ACCEPTABLE:
         raise ValueError(
-            f"{word!r} is no fault that can be accepted; these are {', '.join(ACCEPTABLE)}"
+            f"{word!r} is not a fault that can be accepted; those that can are "
+            f"{', '.join(ACCEPTABLE)}"
         )
     return word
 

@@ -82,8 +82,8 @@ def _check_inside(name: str) -> None:
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
         raise CampaignFileError(
-            f"The file {name!r} must lie in the campaign's folder: give its place in there, with "
-            "forward slashes."
+            f"The file {name!r} must lie in the campaign's folder: give its path within that "
+            "folder, with forward slashes."
         )
 
 
@@ -176,7 +176,7 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Raises
     ------
     CampaignFileError
-        If a trial of an event does not exist or is no record in time, two events have moments of
+        If a trial of an event does not exist or is not a record in time, two events have moments of
         one name, or an event begins again before it is over.
     CampaignDataError
         If a moment lies outside the record of its trial.
@@ -211,7 +211,7 @@ def _check_trial_of_event(
     if not trial.is_dynamic:
         raise CampaignFileError(
             f"{source}: the event {event.name!r} is in the trial {name!r}, which is "
-            f"{trial.kind.value} and has no course in time."
+            f"{trial.kind.value}: its rows have no time."
         )
 
 
@@ -248,7 +248,7 @@ def _check_occurrences(events: Sequence[Event], trial: str, source: str) -> None
         if event.until is None:
             raise CampaignFileError(
                 f"{source}: the event {event.name!r} happens several times in the trial {trial!r}, "
-                f"and that at {event.time:g} s has no end: give it `until`."
+                f"and the one at {event.time:g} s has no end: give it `until`."
             )
         if following.time < event.until:
             raise CampaignFileError(
@@ -303,8 +303,8 @@ def _read_channels(
             if noise is not None:
                 remarks.append(
                     f"The noise of the channel {channel.name!r} is taken from repeated trials "
-                    f"({noise.degrees_of_freedom:.0f} degrees of freedom): what changes from trial "
-                    "to trial is in it."
+                    f"({noise.degrees_of_freedom:.0f} degrees of freedom): it includes what "
+                    "changes from trial to trial."
                 )
         channels[channel.name] = replace(channel, column=channel.table_column, noise=noise)
     return channels
@@ -371,11 +371,11 @@ def trial_remarks(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) ->
 
 
 _BEGINS = {
-    Start.SETTLED: "taken to begin at rest under what acts at the first sample",
-    Start.STILL: "taken to begin at rest under nothing",
-    Start.UNKNOWN: "begun in a state that is fitted",
+    Start.SETTLED: "taken to begin at rest under the loads of the first sample",
+    Start.STILL: "taken to begin at rest without loads",
+    Start.UNKNOWN: "taken to begin in a state that is fitted",
 }
-_ASSUMED = ' (assumed: say `begins`, "settled", "still" or "unknown")'
+_ASSUMED = ' (assumed; set `begins` to "settled", "still" or "unknown")'
 
 
 def _remarks_on_begins(trials: tuple[Trial, ...]) -> list[str]:

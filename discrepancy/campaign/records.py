@@ -66,7 +66,7 @@ class TrialKeys:
     run : str
         Label of the run (set-up) that the trial belongs to.
     held_out : bool
-        True: not used to find or fit anything, only for proof.
+        True if the trial is used only for the proof, and not to find or to fit anything.
     noise_factor : float
         Standard deviation of the noise in this trial over that of the channels' noise records, as
         known from the acquisition (averaging, another range) [1].

@@ -121,8 +121,8 @@ def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput
         if hold not in (None, records.Hold.SMOOTH):
             raise ValueError(
                 f"the input {recorded_input.name!r} is a motion, which no drive makes in steps or "
-                "corners: leave `hold` out, or say smooth, or reference = true where it is what a "
-                "controller shall follow"
+                "corners: leave `hold` out, set it to smooth, or set reference = true if a "
+                "controller follows the motion"
             )
         hold = records.Hold.SMOOTH
     return replace(recorded_input, offset_deviation=deviation, hold=hold)
@@ -167,7 +167,7 @@ class TrialSection(records.TrialKeys):
     ] = field(default_factory=dict)
     """Rows that do not count, counted from 1, by the name of the channel."""
     begins: records.Start | None = None
-    """How a forced or driven trial began; by default settled under what acts first."""
+    """How a forced or driven trial began; by default at rest under the first loads."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -186,29 +186,31 @@ class TrialSection(records.TrialKeys):
         if len(value) != 2:
             raise ValueError(
                 "`load_place` must be a name or [y, x] (m from the root, fraction of the chord), "
-                f"and {comma_list(map(str, value))} came"
+                f"but {comma_list(map(str, value))} was given"
             )
         return tuple(value)
 
     def __post_init__(self) -> None:
         kind = self.kind
         if self.release is not None and kind is not records.TrialKind.RINGDOWN:
-            raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
+            raise ValueError(
+                f"the trial {self.name!r} is not a ring-down and cannot have a `release`"
+            )
         recorded_in_time = (records.TrialKind.FORCED, records.TrialKind.DRIVEN)
         if self.begins is not None and kind not in recorded_in_time:
             raise ValueError(
                 f"the trial {self.name!r} is {kind.value}, and `begins` is for forced and driven "
-                "ones; a ring-down says it by its `release`"
+                "ones; a ring-down states it by its `release`"
             )
         if self.hold is not None and kind is not records.TrialKind.FORCED:
             raise ValueError(
                 f"the trial {self.name!r} is {kind.value}, and its `hold` is for the force of a "
-                "forced one: say that of a driven one in its [[input]]"
+                "forced one: for a driven trial, set it in its [[input]]"
             )
         for region, loss in self.health.items():
             if region != "deviation" and loss > 1.0:
                 raise ValueError(
-                    f"the loss of {region!r} is a fraction from 0 to 1, and {loss:g} came"
+                    f"the loss of {region!r} is a fraction from 0 to 1, but {loss:g} was given"
                 )
 
 
@@ -240,7 +242,7 @@ class CampaignSection(Section):
     input: Annotated[
         tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_input_in_si)], ...], LIST
     ] = ()
-    """What drives a driven trial, or a static trial of an FMU."""
+    """Inputs of a driven trial, or of a static trial of an FMU."""
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
     """The records."""
     event: Annotated[tuple[Event, ...], LIST] = ()
@@ -280,7 +282,7 @@ class CampaignSection(Section):
         no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*have_inputs)
         yield (
             no_trial_has_inputs,
-            '[[input]] is for trials of the kind "driven" or "static", and there is none',
+            '[[input]] is for trials of the kind "driven" or "static", but there is none',
         )
         repeated = _first_repeated(recorded_input.table_column for recorded_input in self.columns)
         readers = "channel or input" if self.input else "channel"
@@ -304,7 +306,7 @@ class CampaignSection(Section):
                 in_kelvin.add(recorded_input.unit == "K")
         yield (
             len(in_kelvin) > 1,
-            "temperatures are given in degC and in K: give all of them in one of the two",
+            "temperatures are given in degC and in K: use one of the two units for all of them",
         )
 
     def _unknown_channels(self) -> Iterator[Fault]:
@@ -337,12 +339,12 @@ class CampaignSection(Section):
             logger_count = "more than one" if name in logged else "none"
             yield (
                 logged.count(name) != 1,
-                f"{name!r} must be on one of the `loggers`, and it is on {logger_count}",
+                f"{name!r} must be on one of the `loggers`, but it is on {logger_count}",
             )
         loggers_of_inputs = [names for names in self.loggers.values() if inputs.intersection(names)]
         yield (
             len(loggers_of_inputs) > 1,
-            "all inputs must be on one of the `loggers`, and they are on several",
+            "all inputs must be on one of the `loggers`, but they are on several",
         )
 
 

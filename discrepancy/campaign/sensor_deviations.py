@@ -117,4 +117,7 @@ class SensorDeviations:
             phrases.append(f"the {noun} of {listing(gains)} to {ASSUMED_GAIN.replace('%', ' %')}")
         if not phrases:
             return ""
-        return f"Zeros and gains that nobody stated are assumed to be known: {listing(phrases)}."
+        return (
+            "Zeros and gains without a stated standard deviation are assumed to be known: "
+            f"{listing(phrases)}."
+        )

@@ -32,7 +32,7 @@ from reporting.words import counted, one_line
 MATLAB = ".mat"
 EXCEL = (".xlsx", ".xlsm")
 OTHER_FORMATS = {
-    ".xls": ("an Excel file of before 2007", "save it as .xlsx or as CSV"),
+    ".xls": ("an Excel file in the format before 2007", "save it as .xlsx or as CSV"),
     ".ods": ("an OpenDocument spreadsheet", "save it as .xlsx or as CSV"),
     ".tdms": (
         "a LabVIEW TDMS file",
@@ -319,8 +319,8 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
             book.close()
     except Exception as cause:  # openpyxl raises almost any error for damaged files
         raise CampaignFileError(
-            f"{path} cannot be read as an Excel workbook ({one_line(cause)}): save it anew, or as "
-            "CSV."
+            f"{path} cannot be read as an Excel workbook ({one_line(cause)}): save it again, or "
+            "save it as CSV."
         ) from cause
     filled = [title for title, rows in sheets.items() if rows]
     is_clear = sheet_name in sheets if sheet_name else len(filled) == 1

@@ -167,7 +167,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     if width == 1:
         _check_no_empty_lines(rows, body, place)
     lines_below = [line for line, _ in rows[last_row + 1 :]]
-    remark = f"; what stands from {lines_below[0]} on is left out" if lines_below else ""
+    remark = f"; everything from {lines_below[0]} on is left out" if lines_below else ""
     names = [cell.lstrip("# ") for cell in head[:width]]
     padded_units = [*units, *[""] * width][:width]
     return TableLayout(names, padded_units, [rows[index] for index in body], remark)
@@ -213,9 +213,9 @@ def _check_names(head: Sequence[str], width: int, place: str) -> None:
     named_columns = sum(map(bool, head))
     if 2 * named_columns <= width or len(head) < width:
         raise CampaignFileError(
-            f"{place}: {counted(width, 'cell')} came, and the row above names "
-            f"{counted(named_columns, 'column')}: a table needs a name over each, and between "
-            "commas a decimal comma makes two cells of a number."
+            f"{place}: the rows have {counted(width, 'cell')}, but the row above names "
+            f"{counted(named_columns, 'column')}: each column needs a name, and a decimal comma "
+            "splits a number between commas into two cells."
         )
 
 
@@ -246,9 +246,9 @@ def _check_other_rows(
             continue
         cells = short_repr(listing(filter(None, row)))
         raise CampaignFileError(
-            f"{place} {line}: numbers must stand under {head[core[0]]!r} and the other names, and "
-            f"{cells} came; leave the cell of a reading empty that is to be left out, and remove "
-            "what is no row of the table."
+            f"{place} {line}: numbers are expected under {head[core[0]]!r} and the other names, "
+            f"but the line has {cells}; leave the cell of a reading empty if it shall be left out, "
+            "and remove lines that do not belong to the table."
         )
 
 

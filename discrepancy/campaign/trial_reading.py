@@ -30,7 +30,7 @@ from reporting.words import counted, is_or_are
 
 LATEST_FIRST_SAMPLE = 1.5
 """Latest time of the first sample after a release from rest, in sampling intervals."""
-_REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
+_REPEATED = "leave one out, or distinguish repeated readings by a column `time`"
 
 
 def read_trial(
@@ -386,6 +386,6 @@ def _check_range(
     if rows_outside.size:
         row = int(rows_outside[0])
         raise CampaignFileError(
-            f"{table.name}, line {table.lines[row]}: {column} is {expected_range}, and "
-            f"{values[row]:g} came."
+            f"{table.name}, line {table.lines[row]}: {column} is {expected_range}, but "
+            f"{values[row]:g} was given."
         )

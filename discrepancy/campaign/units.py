@@ -98,6 +98,13 @@ def conversion_factor(unit: str, si: str) -> float:
     return float(factor / si_factor)
 
 
+def quantity_with_unit(quantity: Quantity) -> str:
+    """Return a quantity with its SI unit for a sentence, such as "displacement in m"."""
+    name = quantity.value.replace("_", " ")
+    si = UNITS[quantity].si
+    return f"{name} without a unit" if si == "1" else f"{name} in {si}"
+
+
 @cache
 def factor_to_si(quantity: Quantity, unit: str) -> float:
     """Return the factor from a unit to the SI unit of a quantity.
@@ -112,7 +119,9 @@ def factor_to_si(quantity: Quantity, unit: str) -> float:
     except ValueError:
         usual = listing(UNITS[quantity].usual, "or")
         name = quantity.value.replace("_", " ")
-        raise ValueError(f"{name} must have a unit such as {usual}, and {unit!r} came") from None
+        raise ValueError(
+            f"{name} must have a unit such as {usual}, but {unit!r} was given"
+        ) from None
 
 
 def _factor_to_si(quantity: Quantity, unit: str) -> float:

@@ -148,7 +148,7 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
     for need in section.needs:
         if need not in NEEDS:
             raise CatalogueError(
-                f"{place}: 'needs' has {need!r}, but known are {', '.join(NEEDS)}."
+                f"{place}: 'needs' has {need!r}, but the known ones are {', '.join(NEEDS)}."
             )
     places = section.places
     if isinstance(places, str):
@@ -189,7 +189,7 @@ def _check_acts_on_dynamic_trials(
         if kind in kinds_without_time:
             raise CatalogueError(
                 f"{time_dependent[0].place} asks for the time of trials, but 'acts_on' has "
-                f"{kind.value!r}, whose rows are no course in time."
+                f"{kind.value!r}, whose rows have no time."
             )
 
 
@@ -319,7 +319,9 @@ def _parse_primitive(
     """
     kind = str(row.get("kind"))
     if kind not in PRIMITIVES:
-        raise CatalogueError(f"{place}: 'kind' is {kind!r}, but known are {', '.join(PRIMITIVES)}.")
+        raise CatalogueError(
+            f"{place}: 'kind' is {kind!r}, but the known ones are {', '.join(PRIMITIVES)}."
+        )
     primitive = PRIMITIVES[kind]
     types = primitive.value_types()
     window_keys = ("begin", "end") if primitive.can_act_in_windows else ()
@@ -333,7 +335,8 @@ def _parse_primitive(
         for key, value in row.items():
             if key not in allowed_keys:
                 raise CatalogueError(
-                    f"{place} has the unknown key {key!r}; known are {', '.join(allowed_keys)}."
+                    f"{place} has the unknown key {key!r}; the known keys are "
+                    f"{', '.join(allowed_keys)}."
                 )
             text = value if isinstance(value, str) else repr(value)
             if key == "kind":

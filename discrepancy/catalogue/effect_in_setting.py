@@ -167,7 +167,7 @@ class EffectInSetting:
         return self.force_ports(lambda scale: scale.turns)
 
     def targets(self, place: str) -> "tuple[Target, ...]":
-        """Return what a place stands for: the ports, channels, runs or loggers of the primitives.
+        """Return the ports, channels, runs or loggers that a place stands for.
 
         Parameters
         ----------

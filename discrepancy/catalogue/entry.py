@@ -132,7 +132,7 @@ class ShapeParameter:
     Attributes
     ----------
     name, symbol, description : str
-        Those of an `EffectParameter`.
+        The keys of an `EffectParameter`.
     canonical : float
         Value in the named effect [1].
     prior : Prior

@@ -200,7 +200,7 @@ def check_effects(effects: Iterable[Effect]) -> None:
             if confusable not in counts or confusable == effect.identifier:
                 raise CatalogueError(
                     f"The effect {effect.identifier!r} names {confusable!r} as confusable, which "
-                    "is no other effect of the catalogue."
+                    "is not another effect of the catalogue."
                 )
 
 

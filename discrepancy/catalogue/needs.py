@@ -14,7 +14,7 @@ from discrepancy.catalogue.effect_in_setting import DYNAMIC, EffectInSetting
 from discrepancy.catalogue.places import NO_PLACES, NO_TURNING_PORT, places_of
 from discrepancy.system.interface import Model
 from discrepancy.system.response import ACROSS
-from fe.runtime.patch import SENSORS, PortForce
+from fe.runtime.patch import SENSORS, PortForce, RegionStiffnessLoss
 
 Kinds = frozenset[TrialKind]
 
@@ -63,6 +63,8 @@ def _no_law(effect: EffectInSetting) -> str | None:
         reason = f"cannot carry the primitive {primitive.kind!r}"
         if issubclass(primitive, PortForce) and not model.ports:
             reason = NO_PORT
+        if primitive is RegionStiffnessLoss:
+            reason = "has no damage region"
         return _sentence_on_model(model, reason)
     return None
 

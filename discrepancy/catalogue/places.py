@@ -16,7 +16,7 @@ from discrepancy.catalogue.effect_in_setting import (
     Names,
 )
 from discrepancy.catalogue.entry import Setting
-from fe.runtime.patch import EVERY_CHANNEL
+from fe.runtime.patch import EVERY_CHANNEL, LocalStiffnessLoss, RegionStiffnessLoss
 
 
 def _with_place_of_all(names: Names) -> Names:
@@ -46,6 +46,18 @@ def _held_ports(effect: EffectInSetting) -> Names:
     A free port (of a body that falls or rolls) has no zero of displacement.
     """
     return effect.force_ports(lambda scale: not scale.free)
+
+
+def _damage_regions(effect: EffectInSetting) -> Names:
+    """Return the damage regions whose loss of stiffness is a hypothesis of its own.
+
+    There is none in a model that can lose stiffness anywhere along its length, as a wing can: that
+    loss includes those of the regions.
+    """
+    model = effect.setting.model
+    if model.supports(LocalStiffnessLoss) or not model.supports(RegionStiffnessLoss):
+        return ()
+    return model.regions
 
 
 def _calibrated_channels(effect: EffectInSetting) -> Names:
@@ -153,6 +165,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of forces": EffectInSetting.force_ports,
     "held ports": _held_ports,
     "turning ports": lambda effect: effect.turning_ports,
+    "damage regions": _damage_regions,
     "skins at ports": _skins_at_ports,
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
@@ -175,14 +188,19 @@ def places_of(effect: EffectInSetting) -> Names:
 
 _NO_STRAIN = "The campaign has no strain channel."
 NO_TURNING_PORT = (
-    "No port has a motion that turns: one that goes one way shows no memory and no zero."
+    "No port moves back and forth, and a motion in one direction shows neither hysteresis nor a "
+    "rest position."
 )
 _NO_STATE = "The model has no port of a state (a level, a charge), at which a flow could act."
 NO_PLACES = {
     "strain channels": _NO_STRAIN,
     "strain channels, or all": _NO_STRAIN,
-    "held ports": "Nothing holds a port of the model, so that no place is its zero.",
+    "held ports": "No port of the model is held by a stiffness, so that none has a rest position.",
     "turning ports": NO_TURNING_PORT,
+    "damage regions": (
+        "The model can lose stiffness anywhere along its length, so that local_stiffness_loss is "
+        "compared instead."
+    ),
     "ports of states": _NO_STATE,
     "ports of states, or all": _NO_STATE,
     "calibrated channels": (

@@ -17,6 +17,8 @@ from fe.runtime.patch import EVERY_CHANNEL
 
 LARGEST_SHARE = 0.9
 """Largest friction force at a port, as a fraction of its elastic force."""
+LARGEST_LOSS = 0.9
+"""Largest stiffness loss of a damage region if the model states none."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,24 @@ def _largest_release(context: BuildContext) -> float:
     return max(releases, default=0.0) or 1.0
 
 
+def _largest_region_loss(context: BuildContext) -> float:
+    """Return the largest further loss of stiffness of the damage region that the place names.
+
+    The losses that the campaign states and the further loss multiply. Together they may reach the
+    largest loss for which the model holds.
+    """
+    region = context.target.name
+    model = context.setting.model
+    largest_loss = min(model.largest_losses.get(region, LARGEST_LOSS), LARGEST_LOSS)
+    stated_losses = [
+        float(np.max(trial.health[:, trial.regions.index(region)], initial=0.0))
+        for trial in context.setting.campaign.trials
+        if region in trial.regions
+    ]
+    largest_stated_loss = max(stated_losses, default=0.0)
+    return max(1.0 - (1.0 - largest_loss) / (1.0 - largest_stated_loss), 0.0)
+
+
 def _station_of_end(end: int, context: BuildContext) -> float:
     """Return the station of an end of the model [m]: 0 for its root, 1 for its tip."""
     stations = context.setting.model.stations or (0.0, 0.0)
@@ -198,6 +218,7 @@ SCALES: dict[str, Callable[[BuildContext], float]] = {
     "largest_reading": _largest_reading,
     "largest_release": _largest_release,
     "sampling_interval": _sampling_interval,
+    "region_largest_loss": _largest_region_loss,
     "number": lambda context: context.target.number,
     "port_displacement": lambda context: context.port.displacement,
     "port_stiffness": lambda context: context.port.stiffness,

@@ -124,7 +124,7 @@ def _describe_copy(
     Returns
     -------
     str
-        The phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is no copy.
+        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is not a copy.
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)

@@ -101,7 +101,7 @@ def _acceptance_clause(fault: DataFault) -> str:
     if fault.channel:
         tables.append(f"the [[channel]] {fault.channel!r}")
     section = f"in {' or '.join(tables)}" if tables else "at the top of campaign.toml"
-    return f'if the data are right, say accept = ["{fault.kind.value}"] {section}'
+    return f'if the data are right, set accept = ["{fault.kind.value}"] {section}'
 
 
 def samples_text(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:

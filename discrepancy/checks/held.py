@@ -139,8 +139,8 @@ def stuck_spans(
       that the readings change by single digits just before and after the run. The run is a failure
       if the readings jump on both sides of it. If they jump on one side only, it is a failure if
       another record moves during the run and no other run is of comparable length.
-    - A run is no failure if the other records rest during it, if there is a second run at the same
-      value (a dead zone), or if runs of comparable length fill a third of its surroundings (a
+    - A run is not a failure if the other records rest during it, if there is a second run at the
+      same value (a dead zone), or if runs of comparable length fill a third of its surroundings (a
       square wave, pauses).
 
     Parameters

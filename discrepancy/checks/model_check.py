@@ -81,9 +81,9 @@ def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[
         names = ", ".join(f"{name!r} ({ratio:.0%})" for name, ratio in undetermined.items())
         noun = "parameters" if len(undetermined) > 1 else "parameter"
         sentence = (
-            f"The records do not tell the calibrated {noun} {names}, which keep that share of the "
-            "prior deviation: an effect that resembles them cannot be told from them; record where "
-            "they act, or state them more narrowly."
+            f"The records do not determine the calibrated {noun} {names} (in brackets: posterior "
+            "over prior standard deviation): an effect that acts like them cannot be "
+            "distinguished from them; record trials in which they act, or state narrower priors."
         )
         yield DataFault(FaultKind.UNOBSERVABLE, sentence)
 
@@ -211,8 +211,8 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
         table = "[[trial]]" if force_is_open else "[[input]]"
         sentence = (
             f"In the trial {trial.name!r} straight lines and curves between the samples of {names} "
-            f"differ by {largest:.2g} noise deviations (rms) in {channel!r}: say what it did, hold "
-            "= "
+            f"differ by {largest:.2g} noise deviations (rms) in {channel!r}: state what it did by "
+            "hold = "
             f'"smooth", "zero_order" or "linear" in its {table}, or record it faster.'
         )
         yield DataFault(FaultKind.BETWEEN_SAMPLES, sentence, trial=trial.name)
@@ -349,15 +349,15 @@ def _sign_faults(
     ]
     if len(reversed_channels) == len(scales_of_channels) > 1:
         sentence = (
-            "All channels move against the model: check the sign of the forces, which are positive "
-            "upwards."
+            "All channels move in the opposite direction to the model: check the sign of the "
+            "forces, which are positive upwards."
         )
         yield DataFault(FaultKind.SIGN, sentence)
         return
     for name in reversed_channels:
         sentence = (
-            f"The channel {name!r} moves against the model in every trial: reverse its sign (as "
-            "the model has it: displacement upwards, the wing's strain positive where upward load "
-            "compresses the upper skin), or correct its `output`."
+            f"The channel {name!r} moves in the opposite direction to the model in every trial: "
+            "reverse its sign (as the model has it: displacement upwards, the wing's strain "
+            "positive where upward load compresses the upper skin), or correct its `output`."
         )
         yield DataFault(FaultKind.SIGN, sentence, name)

@@ -159,7 +159,7 @@ def sample_outliers(
     weight_norm = float(np.linalg.norm(even_weights(polynomial.width, polynomial.degree)))
     rounding = quantum_of(values[is_used] / largest_reading) * 12.0**-0.5 * weight_norm
 
-    # readings within the noise are no outliers
+    # readings within the noise are not outliers
     noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
     is_suspect, cleaned_record = _find_suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours

@@ -64,8 +64,8 @@ def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
         if trial.is_dynamic and fraction > LARGEST_SHARE:
             sentence = (
                 f"{fraction:.1%} of the readings of {name!r} in the trial {trial.name!r} are "
-                f"outliers, and at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose "
-                "wire, radio link) and repeat the trial, or leave the channel out of it."
+                f"outliers, and at most {LARGEST_SHARE:.0%} may be left out: remove the cause "
+                "(loose wire, radio link) and repeat the trial, or leave the channel out of it."
             )
             yield DataFault(FaultKind.OUTLIERS, sentence, name, trial.name)
 
@@ -78,9 +78,9 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     record = channel.noise
     if record is None:
         sentence = (
-            f"The channel {channel.name!r} has no noise record, so whether a model explains it "
-            "cannot be said: add samples at rest, repeats, or a standard deviation and its degrees "
-            "of freedom."
+            f"The channel {channel.name!r} has no noise record, so that it cannot be judged "
+            "whether a model explains it: add samples at rest, repeats, or a standard deviation "
+            "and its degrees of freedom."
         )
         yield DataFault(FaultKind.NO_NOISE_RECORD, sentence, channel.name)
         return

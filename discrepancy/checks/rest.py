@@ -47,8 +47,9 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
             file = f" of {channel.noise.file}" if channel.noise.file else ""
             sentence = (
                 f"The noise record of the channel {name!r}, the column "
-                f"{channel.table_column!r}{file}, {motion}: what moves counts as noise and hides "
-                "as much of an effect; leave those samples out, or record it while nothing moves."
+                f"{channel.table_column!r}{file}, {motion}: the motion counts as noise, and hides "
+                "effects of the same size; leave those samples out, or record it while nothing "
+                "moves."
             )
             yield DataFault(FaultKind.MOVES_AT_REST, sentence, name)
 

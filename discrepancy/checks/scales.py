@@ -235,8 +235,8 @@ def swapped_channels(
 def swap_fault(first_channel: str, second_channel: str) -> DataFault:
     """Return the fault of two channels that are swapped."""
     sentence = (
-        f"The channels {first_channel!r} and {second_channel!r} fit the model clearly better "
-        "exchanged: see which wire or column is which, and exchange their `column` or `output`."
+        f"The channels {first_channel!r} and {second_channel!r} fit the model clearly better if "
+        "they are exchanged: check wires and columns, and exchange their `column` or `output`."
     )
     return DataFault(FaultKind.SWAPPED, sentence, first_channel)
 

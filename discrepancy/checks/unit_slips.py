@@ -142,7 +142,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
     if len(trials_of_channels) > 1 and common_slip is not None:
         sentence = (
             f"All channels of all trials are about {common_slip.factor:.6g} times what the model "
-            f"says {common_slip}: check the units of forces (N), load factors (1) and release "
+            f"predicts {common_slip}: check the units of forces (N), load factors (1) and release "
             "displacements, or of the channels"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence)
@@ -188,8 +188,8 @@ def _slips_in_trial(
     if common_slip is not None:
         sentence = (
             f"All channels of the trial {trial.name!r} are about {common_slip.factor:.6g} times "
-            f"what the model says {common_slip}, and those of other trials are not: check the unit "
-            "of its force, load factor, release displacement or inputs"
+            f"what the model predicts {common_slip}, and those of other trials are not: check the "
+            "unit of its force, load factor, release displacement or inputs"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
         yield from _grade_slip(fault, common_slip, agreeing=len(keys))
@@ -263,7 +263,7 @@ def _channel_faults(
     trials_text = f" in the trial {first_trial.name!r}" if is_in_one_of_several else ""
     sentence = (
         f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model "
-        f"says{trials_text} {slip}: correct its `unit`, or convert the column"
+        f"predicts{trials_text} {slip}: correct its `unit`, or convert the column"
     )
     trial_name = first_trial.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
@@ -291,4 +291,6 @@ def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[Data
     if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):
         yield replace(fault, sentence=f"{sentence}; no physical effect is that large.")
     elif slip.ratio >= DOUBTFUL_FACTOR or agreeing > 1:
-        yield replace(fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or mend the model.")
+        yield replace(
+            fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or correct the model."
+        )

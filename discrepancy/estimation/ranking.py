@@ -56,7 +56,8 @@ def rank_by_missing_force(
     effects : sequence of Effect
         The effects that may be missing in the model.
     on_progress : callable
-        The function to which progress is reported, as a line of text.
+        The function that receives a line for the progress display, such as the comparison that
+        runs.
     """
     thinned_search = search_in_thinned_records(search)
     if thinned_search is None:
@@ -106,7 +107,8 @@ def _rank_in_thinned_records(
     effects : sequence of Effect
         The effects that may be missing in the model.
     on_progress : callable
-        The function to which progress is reported, as a line of text.
+        The function that receives a line for the progress display, such as the comparison that
+        runs.
     """
 
     def score(hypothesis: ForceHypothesis) -> float:

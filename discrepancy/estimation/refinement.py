@@ -60,12 +60,7 @@ def refine_hypotheses(
         The number of effects that were compared. The prior probability of a set of effects is
         smaller if there are more of them.
     on_progress : callable
-        The function to which progress is reported, as a line of text.
-
-    Returns
-    -------
-    list of ForceHypothesis
-        All hypotheses, the most probable first. Some of them are replaced by their estimates.
+        The function that receives a line for the progress display: the estimate that runs.
     """
 
     def score(hypothesis: ForceHypothesis) -> float:

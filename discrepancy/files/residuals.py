@@ -27,6 +27,7 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.system.load_change import DEFAULT_PLACE
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.json_file import JsonRecord
@@ -116,7 +117,7 @@ def read_residuals(path: Path) -> ResidualSet:
             return _residual_set(tree)
     except _DAMAGED as error:
         raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({type(error).__name__}: "
+            f"{path} is damaged or is not a file of residuals ({type(error).__name__}: "
             f"{one_line(error)}); write it again."
         ) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
@@ -205,7 +206,7 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
     for table, record in records.items():
         for name, description in _ARRAYS[table].items():
             values = getattr(record, name)
-            if values is not None:
+            if values is not None and values.size:  # without regions there is no health
                 attributes = {key: text for key, text in description.items() if key != "dimensions"}
                 variables[name] = (description["dimensions"], values, attributes)
     attributes_of_trial: dict[str, object] = {
@@ -214,13 +215,16 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
         "run": trial.run,
         "start": trial.start,
         "held_out": int(trial.held_out),
-        "load_place": json.dumps(trial.load_place),
         "regions": json.dumps(trial.regions),
     }
+    if trial.load_place != DEFAULT_PLACE or trial.release is not None or np.any(trial.force != 0.0):
+        attributes_of_trial["load_place"] = json.dumps(trial.load_place)
     if trial.release is not None:
         attributes_of_trial["release"] = json.dumps(astuple(trial.release))
     units = [UNITS[channels[name].quantity].si for name in trial.channels]
     coordinates = {"channel": ("channel", list(trial.channels)), "unit": ("channel", units)}
+    if trial.regions:
+        coordinates["region"] = ("region", list(trial.regions))
     dataset = xr.Dataset(variables, coords=coordinates, attrs=attributes_of_trial)
     return dataset.set_coords("time")
 
@@ -239,11 +243,15 @@ def _fitted_trial(group: xr.Dataset) -> FittedTrial:
         If an array of the trial is not finite.
     """
     attributes = group.attrs
-    arrays: dict[str, Any] = {name: group[name].values for name in _ARRAYS["trial"]}
+    arrays: dict[str, Any] = {
+        name: group[name].values for name in _ARRAYS["trial"] if name in group
+    }
+    for name in ("health", "health_deviation"):
+        arrays.setdefault(name, np.zeros((len(arrays["time"]), 0)))
     for name, values in arrays.items():
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
-    load_place = json.loads(attributes["load_place"])
+    load_place = json.loads(attributes.get("load_place", json.dumps(DEFAULT_PLACE)))
     if not isinstance(load_place, str):
         load_place = (float(load_place[0]), float(load_place[1]))
     release = None

@@ -40,8 +40,8 @@ OLDER_SCHEMAS = tuple(f"uav-twin verdict {number}" for number in (1, 2, 3, 4))
 They lack keys of this one, which have defaults. Their fractions have another definition and are
 left out."""
 OLD_SHARE = (
-    "The file is of an earlier version, whose share divided the error after by the doubt of the "
-    "posterior too; run its command again."
+    "The file is of an earlier version, which also divided the error with the effects by the "
+    "uncertainty of the posterior; run its command again."
 )
 """Why the proof of an older file has no share."""
 

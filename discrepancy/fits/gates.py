@@ -60,16 +60,16 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     worst_test = min(tests, key=lambda test: test.p_value, default=NamedTest("", np.nan))
     statistic = min(worst_test.p_value * len(tests), 1.0)
     passed = True if has_variance_test else None
-    reason = "What is left agrees with the noise records."
+    reason = "The residuals agree with the noise records."
     if not tests:
         reason = f"{cause}: the fit cannot be judged."
     elif statistic < ABSOLUTE_FIT_LEVEL:
         passed = False
-        reason = f"More is left than noise and priors allow: {worst_test.name}."
+        reason = f"The residuals are larger than noise and priors allow: {worst_test.name}."
     elif not has_variance_test:
         reason = (
-            f"{cause}: only priors and the whiteness of what is left could be judged, and they "
-            "agree."
+            f"{cause}: only the priors and the whiteness of the residuals could be judged, and "
+            "both agree with the fit."
         )
     return Gate("absolute fit", passed, statistic, ABSOLUTE_FIT_LEVEL, reason)
 
@@ -146,10 +146,10 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         p_value = float(
             chi2.sf(parameter_deviations @ parameter_deviations, parameter_deviations.size)
         )
-        tests.append(NamedTest("calibrated parameters beside their priors", p_value))
+        tests.append(NamedTest("calibrated parameters outside their priors", p_value))
     if gain_deviations.size:
         p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
-        tests.append(NamedTest("gains beside their priors", p_value))
+        tests.append(NamedTest("gains outside their priors", p_value))
     for term, values in fit.candidate.split_by_term(fit.effect):
         # the values of free shape parameters follow those of the effect, and are not tested
         for parameter, scaled_value in zip(term.effect.parameters, values.tolist(), strict=False):
@@ -157,7 +157,7 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
             is_uniform = parameter.prior.shape == "uniform"
             if parameter.magnitude or is_uniform:
                 continue
-            name = f"{parameter.name} of {term.effect.identifier} beside its prior"
+            name = f"{parameter.name} of {term.effect.identifier} outside its prior"
             tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1))))
     return tests
 

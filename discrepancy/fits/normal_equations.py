@@ -31,7 +31,8 @@ def check_finite(values: FloatArray) -> FloatArray:
     """
     if not np.all(np.isfinite(values)):
         raise FitError(
-            "The model gives values or derivatives that are not finite where a fit has come to."
+            "The model gives values or derivatives that are not finite at a point that a fit has "
+            "reached."
         )
     return values
 

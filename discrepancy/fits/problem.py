@@ -86,7 +86,7 @@ class Problem:
     campaign : Campaign
         The trials and noise records.
     model : Model
-        The model as it is.
+        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
 
@@ -117,7 +117,8 @@ class Problem:
     def __init__(self, campaign: Campaign, model: Model, setting: Setting) -> None:
         if not campaign.fitted:
             raise CampaignDataError(
-                f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
+                f"The campaign {campaign.name!r} has no trial to fit: all are held out; hold out "
+                "fewer."
             )
         self.campaign = campaign
         self.setting = setting

@@ -34,7 +34,7 @@ Forces = Annotated[
 
 
 class FmuInputsSection(Section):
-    """`[inputs]`: what a trial sets; each name is one of the binding's, or a variable of the FMU.
+    """`[inputs]`: the inputs that a trial sets, by names of the binding or of the FMU.
 
     Attributes
     ----------
@@ -80,8 +80,8 @@ class StaticSection(Section):
     Attributes
     ----------
     settle : bool
-        False: the FMU is quasi-static, and a step gives the equilibrium. True: its motion is
-        followed until it rests.
+        False if the FMU is quasi-static, so that a step gives the equilibrium; true if its motion
+        is followed until it rests.
     step : float
         Communication step [s].
     limit : float
@@ -145,7 +145,7 @@ Variable = Annotated[Name, Field(default_factory=lambda section: section.get("na
 
 
 class FmuOutputSection(NamedSection):
-    """`[[output]]`: what a channel's `output` names; `{a..b}` stands for the numbers a to b."""
+    """`[[output]]`: an output for channels; `{a..b}` stands for the numbers from a to b."""
 
     variable: Variable
     """Name in the binding or in the FMU, in which `{a..b}` stands for the numbers a to b; by
@@ -227,7 +227,7 @@ class FmuModelDescription(ModelDescription):
         Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
         `effect.<id>.<number>`).
     superposition : bool
-        Whether motions are superposed where the FMU proves to be linear; False: every motion is
+        Whether motions are superposed if the FMU proves to be linear; if false, every motion is
         stepped.
     isolated : bool
         Whether the FMU runs in a process of its own.
@@ -260,8 +260,8 @@ class FmuModelDescription(ModelDescription):
             why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
             yield (
                 kind not in CARRIED,
-                f"effects.{kind} is not a primitive that an FMU can carry itself{why}; known are "
-                f"{', '.join(CARRIED)}",
+                f"effects.{kind} is not a primitive that an FMU can carry itself{why}; the known "
+                f"ones are {', '.join(CARRIED)}",
             )
         inputs = self.inputs
         lacks_temperature = inputs.temperature_reference is not None and inputs.temperature is None

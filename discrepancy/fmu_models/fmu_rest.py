@@ -131,6 +131,10 @@ class FmuAtRest(IdentifiedFmu):
         step = self.description.static.step
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
+    def largest_input(self, variable: str) -> float:
+        """Return the largest value of an input of the FMU that a trial sets [SI]."""
+        return self.asset.input_range("load", variable)[1]
+
     def port_flexibility(self, state: OperatingPoint) -> FloatArray:
         """Return the flexibility (P, P): displacement of each port (row) per force (column)."""
         if not self.ports:

@@ -85,7 +85,7 @@ class IdentifiedFmu(FmuRuns):
     ports, port_inputs : list of str
         Names of the ports, and inputs of their forces.
     displacement_columns, velocity_columns : list of int
-        Columns of the ports' displacements and velocities; -1 for a velocity that is no output.
+        Columns of the ports' displacements and velocities; -1 for a velocity that is not an output.
     release_variables : list of str
         Parameter or input that releases the FMU, and the parameter of its velocity.
     """
@@ -338,9 +338,9 @@ class IdentifiedFmu(FmuRuns):
         amount = float(solution.root)
         if not abs(missing_displacement(amount)) <= 1e-6 * abs(displacement):
             raise ModelError(
-                f"Nothing that [release] names puts {release.output!r} of the FMU model "
-                f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or "
-                "output there."
+                f"No parameter or force in [release] moves {release.output!r} of the FMU model "
+                f"{self.description.name!r} to {displacement:g} m; correct displacement, hold or "
+                "output in [release]."
             )
         return release_values | {name: amount}
 

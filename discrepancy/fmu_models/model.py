@@ -24,7 +24,15 @@ from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
-from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import (
+    SENSORS,
+    LoadGain,
+    LoadPlace,
+    ModelPatch,
+    PortForce,
+    Primitive,
+    RegionStiffnessLoss,
+)
 from fe.runtime.port_laws import PortLaws, port_laws
 from fmu_asset.client.runs import OperatingPoint
 from fmu_asset.client.state_space import FmuStateSpace
@@ -89,9 +97,11 @@ class FmuModel(DescribedModel):
             section.name: self.variables.variable(section.variable) for section in description.input
         }
         self.load_places = tuple(self._force_inputs)
-        limits = [
-            self.fmu.asset.input_range("load", name)[1] for name in self._force_inputs.values()
-        ]
+        limits = [self.fmu.largest_input(name) for name in self._force_inputs.values()]
+        self.largest_losses = {
+            region: self.fmu.largest_input(self.variables.variable(name))
+            for region, name in inputs.regions.items()
+        }
         self.largest_force = 0.5 * min(limits, default=np.inf)
         mean = Conditions(self.prior_mean())
         self.fmu.nominal_point = self._operating_point(
@@ -114,6 +124,8 @@ class FmuModel(DescribedModel):
             return True
         if primitive is LoadGain:
             return bool(inputs.force)
+        if primitive is RegionStiffnessLoss:
+            return bool(self.regions)
         if primitive is LoadPlace:
             return bool(inputs.force) and inputs.bending_moment is not None
         return issubclass(primitive, PortForce) and bool(self.ports)
@@ -371,9 +383,9 @@ class FmuModel(DescribedModel):
             or self._has_jumping_port_speed(system)
         ):
             raise ModelError(
-                f"The FMU model {self.name!r} does not tell by its answers to single forces how "
-                "its ports move; it is not linear, or they are too few or too rough, or speeds "
-                "jump with forces."
+                f"The FMU model {self.name!r} does not show by its responses to single forces how "
+                "its ports move: it is not linear, the responses are too short or too rough, or "
+                "speeds jump with forces."
             )
         system = system.in_coordinates_of(mean_system)
         # rows that give positions and speeds (derivatives of order 0 and 1) of the ports
@@ -483,7 +495,7 @@ class FmuModel(DescribedModel):
         names = self.variables
         # inputs
         sections = self.description.inputs
-        losses = self.region_losses(trial, conditions.health)
+        losses = self.region_losses(trial, conditions.health, patch)
         row_losses = losses[min(row, len(losses) - 1)]
         inputs: dict[str, float] = {}
         for name, loss in zip(sections.regions.values(), row_losses, strict=True):

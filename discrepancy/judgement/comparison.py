@@ -188,9 +188,9 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the reason why a hypothesis may not be named; empty if it may be named."""
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
-            return "it describes readings, causes nothing and leaves more than noise"
+            return "it describes readings but no physical cause, and leaves more than noise"
         if candidate.has_free_shape and len(candidate.terms) > 1:
-            return "beside another law a shape of its own imitates nearly anything"
+            return "beside another law, a law with a free shape can imitate nearly anything"
         fitted_share = self.gap_share(hypothesis, held_out=False)
         if _is_share_too_small(fitted_share, self.least_low_end):
             return (
@@ -202,9 +202,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             return f"in trials that were not fitted it leaves {unexplained_text}"
         implausible = self._implausible_unknowns(hypothesis)
         if implausible:
-            return (
-                f"it needs {implausible} far beside their priors: are these what you would bet on?"
-            )
+            return f"it needs {implausible} far outside their priors: check these priors"
         return self.failed_check_reason(hypothesis)
 
     def _implausible_unknowns(self, hypothesis: HypothesisT) -> str:

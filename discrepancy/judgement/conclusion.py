@@ -238,7 +238,7 @@ class Conclusion:
         other_names = ", ".join(effect.name for effect in effects if not effect.shape)
         beside_clause = f", beside {other_names}" if other_names else ""
         sentence = (
-            f"An effect of the family {family} is missing, with a shape of its own{beside_clause}."
+            f"An effect of the family {family} is missing, with a fitted shape{beside_clause}."
         )
         return self.build_outcome(
             VerdictKind.FAMILY,
@@ -414,8 +414,8 @@ def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
     """
     nearest_clause = f"; the nearest are {', '.join(names[:4])}" if names else ""
     return (
-        "Something may be missing, but too small for these data to tell from noise"
-        f"{noise_clause}{nearest_clause}."
+        "Something may be missing, but it is too small for these data to distinguish from "
+        f"noise{noise_clause}{nearest_clause}."
     )
 
 

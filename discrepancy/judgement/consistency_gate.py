@@ -89,18 +89,18 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     tests = score_tests(problem, fit, directions_by_test(problem, fit))
     if not tests:
         reason = (
-            "No trial under a stated load, or too few readings: what is left cannot be judged by "
-            "load."
+            "No trial has a stated load, or there are too few readings: it cannot be tested "
+            "whether the residuals follow the load."
         )
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
     worst_test = min(tests, key=lambda test: test.p_value)
     statistic = min(1.0, worst_test.p_value * len(tests))
     passed = statistic >= CONSISTENCY_LEVEL
     if passed:
-        reason = "What is left follows neither loads, runs nor the effect's own channel."
+        reason = "The residuals follow neither loads, runs nor the effect's own channel."
     else:
         reason = (
-            f"What is left follows the {worst_test.name}: χ² {worst_test.statistic:.0f} along "
+            f"The residuals follow the {worst_test.name}: χ² {worst_test.statistic:.0f} along "
             f"{counted(worst_test.count, 'direction')}, most of all {worst_test.strongest}."
         )
     return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
@@ -438,7 +438,8 @@ def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -
     trial = problem.trials[trial_index].trial
     response = fit.responses[trial_index]
     if trial.kind is TrialKind.STATIC:
-        # subtract the row of least force: temperature and the offset of a run are no response to it
+        # subtract the row of least force: temperature and the offset of a run are not responses to
+        # it
         response = response - response[np.argmin(np.abs(trial.force))]
     gains = problem.shared.gains(fit.point.shared, trial.channels)
     return np.asarray((1.0 + gains) * response)

@@ -52,10 +52,11 @@ _GAIN_NUISANCE = _Nuisance("gain_deviation", "gain", UNKNOWN_GAIN_DEVIATION)
 def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]:
     """Return a sentence for each zero or gain that the campaign wrongly states as exact.
 
-    The drop of the sum of squares by a free zero (or gain) is first estimated with all other
-    unknowns fixed. The channels of the largest drops are then fitted with the zero free, one by one
-    and then all together, since other unknowns may compensate it. A channel is reported if its
-    fit removes at least `LEAST_REMOVED_SHARE` of the misfit of all channels.
+    First it is estimated by how much the sum of squares falls if the zero (or gain) of a channel is
+    free and all other unknowns are fixed. The channels with the largest decrease are then fitted
+    with a free zero, each alone and then all together, because a change of other unknowns may have
+    the same effect as a free zero. A channel is reported if its fit removes at least
+    `LEAST_REMOVED_SHARE` of the misfit of all channels.
 
     Parameters
     ----------
@@ -86,8 +87,8 @@ def _exactness_remark(name: str, nuisance: _Nuisance, share: float) -> str:
     """Return the sentence on a channel whose exact zero or gain explains a share of the misfit."""
     return (
         f"The {nuisance.noun} of the channel {name!r} is exact in the campaign; give "
-        f"`{nuisance.key}`: left free, it closes {100.0 * share:.0f} % of the misfit of the model "
-        "without any effect."
+        f"`{nuisance.key}`: if it is fitted, the misfit of the model without any effect falls by "
+        f"{100.0 * share:.0f} %."
     )
 
 

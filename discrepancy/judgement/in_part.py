@@ -217,7 +217,7 @@ def _verdict_by_comparison(
     members = [best_hypothesis, *comparison.competing_hypotheses(best_hypothesis)]
     other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
-        reason = f"{other_count} others are as much of it: that tells nothing"
+        reason = f"{other_count} others explain as much, so that none of them can be named"
         return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
     # conditions that a name must fulfil
     if comparison.enlarges_error(best_hypothesis):
@@ -239,7 +239,10 @@ def _verdict_by_comparison(
     if all(comparison.passes_absolute_fit(member) for member in members):
         return _group_outcome(comparison, members, probability)
     names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
-    reason = f"it leaves more than noise, and these data do not tell it from {listing(names, 'or')}"
+    reason = (
+        "it leaves more than noise, and these data do not distinguish it from "
+        f"{listing(names, 'or')}"
+    )
     return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
 
 
@@ -267,7 +270,7 @@ def _named_in_part_outcome(
     if names_of_canonical:
         phrases.append(names_of_canonical)
     if family:
-        phrases.append(f"an effect of the family {family}, with a shape of its own,")
+        phrases.append(f"an effect of the family {family}, with a fitted shape,")
     # what it explains, and what remains
     share_clause = comparison.closed_share_clause(best_hypothesis)
     sentence = (
@@ -275,10 +278,9 @@ def _named_in_part_outcome(
         f"{share_clause}."
     )
     if comparison.has_held_out and not share.held_out:
-        sentence += " In the trials held out it has hardly any force."
-    sentence += (
-        f" It leaves {comparison.unexplained_text(best_hypothesis, share)}, which is unexplained."
-    )
+        sentence += " In the held-out trials it has hardly any force."
+    unexplained_text = comparison.unexplained_text(best_hypothesis, share)
+    sentence += f" It leaves {unexplained_text}, which is unexplained."
     sentence += shape_sentence(comparison, best_hypothesis)
     sentence += unproved_addition_sentence(comparison, best_hypothesis)
     return _outcome_of_comparison(
@@ -464,7 +466,7 @@ def not_named_sentence(reason: str) -> str:
     Parameters
     ----------
     reason : str
-        The reason as a clause or a sentence, such as "What is left follows the loads."
+        The reason as a clause or a sentence, such as "The residuals follow the loads."
     """
     return f"It is not named, because {small(reason.removesuffix('.'))}."
 
@@ -474,9 +476,9 @@ def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: Hypo
     effects = effects_text(named_effects(comparison.problem, hypothesis))
     opening = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
-        return f"{opening} it cannot be simulated: nothing is named."
+        return f"{opening} it cannot be simulated: no effect is named."
     share_clause = comparison.closed_share_clause(hypothesis)
-    return f"{opening} {share_clause}: nothing is named, and nothing to be applied."
+    return f"{opening} {share_clause}: no effect is named, and there is nothing to apply."
 
 
 def _outcome_of_comparison(

@@ -1,20 +1,34 @@
 """Parameters, gains and zeros that a fit moves far from their stated values.
 
 A wrong model can fit the readings by wrong calibrated values. Such an error of the model does not
-show in the residuals, but in these values.
+show in the residuals, but in these values. If the stated deviations are wide, the values need not
+even be improbable.
 """
 
 from collections.abc import Sequence
+
+import numpy as np
 
 from discrepancy.campaign.units import UNITS
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
-from discrepancy.verdict import MovedUnknown
+from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue
 from reporting.words import listing
+
+from .conclusion import calibrated_parameters
+from .sensor_estimates import sensor_estimates
 
 MOVED_DEVIATIONS = 2.0
 """Distance from the stated value, in stated deviations, above which an unknown is reported."""
+LEAST_MOVE_WITHIN_PRIOR = 1.0
+"""Distance from the stated value, in stated deviations, above which a move may use up a prior."""
+LEAST_RELATIVE_MOVE = 0.02
+"""Move, relative to the stated value of a parameter, to one for a gain, or to the largest reading
+for a zero, below which a prior is not called wide: too little for an error of the model to hide."""
+LEAST_SIGNIFICANCE = 3.0
+"""Distance from the stated value, in posterior deviations, from which the data show that an unknown
+has moved."""
 MOST_MENTIONED = 5
 """Number of moved unknowns that a sentence mentions."""
 
@@ -29,13 +43,79 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
     fit : CandidateFit
         The fit, usually that of the model without effect.
     """
-    unknowns = [
+    moved_far = [
+        unknown
+        for unknown in _stated_unknowns(problem, fit)
+        if abs(unknown.deviations) > MOVED_DEVIATIONS
+    ]
+    return tuple(sorted(moved_far, key=lambda unknown: -abs(unknown.deviations)))
+
+
+def _stated_unknowns(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+    """Return the stated and fitted values of all unknowns that have a stated deviation."""
+    return [
         *_parameter_values(problem, fit),
         *_gain_values(problem, fit),
         *_zero_and_constant_values(problem, fit),
     ]
-    moved_far = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
-    return tuple(sorted(moved_far, key=lambda unknown: -abs(unknown.deviations)))
+
+
+def unknowns_moved_within_prior(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, ...]:
+    """Return the unknowns that a fit moves far within wide stated deviations, the farthest first.
+
+    An unknown belongs to them if the fit moves it by one to two stated deviations, by at least
+    `LEAST_RELATIVE_MOVE`, and by at least `LEAST_SIGNIFICANCE` posterior deviations.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    fit : CandidateFit
+        The fit, usually that of the model without effect.
+    """
+    posterior_deviations = {
+        parameter.name: parameter.deviation for parameter in calibrated_parameters(problem, fit)
+    }
+    for estimate in sensor_estimates(problem, fit):
+        posterior_deviations[_sensor_name(estimate)] = estimate.deviation
+    reference_sizes = _reference_sizes(problem)
+    moved = []
+    for unknown in _stated_unknowns(problem, fit):
+        if unknown.name not in posterior_deviations:
+            continue
+        move = abs(unknown.value - unknown.stated)
+        least_move = max(
+            LEAST_MOVE_WITHIN_PRIOR * unknown.deviation,
+            LEAST_RELATIVE_MOVE * reference_sizes[unknown.name],
+            LEAST_SIGNIFICANCE * posterior_deviations[unknown.name],
+        )
+        if least_move <= move <= MOVED_DEVIATIONS * unknown.deviation:
+            moved.append(unknown)
+    return tuple(sorted(moved, key=lambda unknown: -abs(unknown.deviations)))
+
+
+def _sensor_name(estimate: SensorEstimate) -> str:
+    """Return the name of a gain or zero, as `MovedUnknown.name` has it."""
+    if estimate.kind is SensorValue.GAIN:
+        return f"gain of {estimate.channel}"
+    return f"zero of {estimate.channel} in {estimate.trial!r}"
+
+
+def _reference_sizes(problem: Problem) -> dict[str, float]:
+    """Return the size to which the move of each unknown is relative, by the name of the unknown.
+
+    It is the stated value of a parameter, one for a gain, and the largest reading for a zero.
+    """
+    layout = problem.shared
+    sizes = {f"gain of {channel}": 1.0 for channel in layout.gain_channels}
+    for parameter, centre in zip(problem.model.parameters, layout.centre, strict=False):
+        sizes[parameter.name] = abs(float(centre))
+    for data in problem.trials:
+        for column, channel in enumerate(data.trial.channels):
+            readings = data.trial.values[data.trial.used[:, column], column]
+            largest_reading = float(np.max(np.abs(readings), initial=0.0))
+            sizes[f"zero of {channel} in {data.trial.name!r}"] = largest_reading
+    return sizes
 
 
 def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
@@ -137,11 +217,48 @@ def moved_sentence(unknowns: Sequence[MovedUnknown]) -> str:
     """Return a sentence on the unknowns that the fit without effect moves; empty if none."""
     if not unknowns:
         return ""
+    return f"Fitted without an effect, the model moves {_moved_texts(unknowns)}."
+
+
+def hiding_sentences(
+    moved: Sequence[MovedUnknown], moved_within_prior: Sequence[MovedUnknown]
+) -> str:
+    """Return sentences on where an error of the model may hide if the model leaves noise alone.
+
+    Parameters
+    ----------
+    moved : sequence of MovedUnknown
+        The unknowns that the fit moves far from what is stated.
+    moved_within_prior : sequence of MovedUnknown
+        The unknowns that the fit moves far within wide stated deviations.
+
+    Returns
+    -------
+    str
+        The sentences; empty if the fit moves nothing.
+    """
+    sentences = []
+    if moved:
+        sentences.append(
+            f"Fitted without an effect, the model moves {_moved_texts(moved)}, where an error of "
+            "the model may hide."
+        )
+    if moved_within_prior:
+        sentences.append(
+            "Within wide stated deviations the model without an effect moves "
+            f"{_moved_texts(moved_within_prior)}: an error of the model of this size would not "
+            "show."
+        )
+    return " ".join(sentences)
+
+
+def _moved_texts(unknowns: Sequence[MovedUnknown]) -> str:
+    """Return the first unknowns in words, and how many more there are."""
     parts = [_moved_text(unknown) for unknown in unknowns[:MOST_MENTIONED]]
     unmentioned_count = len(unknowns) - MOST_MENTIONED
     if unmentioned_count > 0:
         parts.append(f"{unmentioned_count} more")
-    return f"Fitted without an effect, the model moves {listing(parts)}."
+    return listing(parts)
 
 
 def _moved_text(unknown: MovedUnknown) -> str:

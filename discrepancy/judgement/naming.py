@@ -21,8 +21,14 @@ from .conclusion import (
     is_negligible_instrument_error,
 )
 from .in_part import verdict_in_part, verdict_naming_laws_only, verdict_without_negligible_effect
-from .moved_unknowns import moved_sentence, moved_unknowns
+from .moved_unknowns import (
+    hiding_sentences,
+    moved_sentence,
+    moved_unknowns,
+    unknowns_moved_within_prior,
+)
 from .proof import check_held_out
+from .remarks import KINDS_WITHOUT_GAP
 from .rules import VerdictCase, decide_verdict, most_probable_sets
 from .verdict_checks import check_against_trials
 
@@ -45,9 +51,10 @@ def reach_verdict(
     effects : sequence of Effect
         The effects of the catalogue.
     on_progress : callable
-        The function to which progress is reported, as a line of text.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     on_search : callable
-        The function that is called with each search when the search begins.
+        The function that receives each search when it begins.
 
     Returns
     -------
@@ -59,9 +66,20 @@ def reach_verdict(
         _verdict_of_two_searches(problem, effects, on_progress, on_search)
     )
     verdict = outcome.verdict
-    unknowns = moved_unknowns(problem, outcome.search.no_effect)
-    sentence = f"{verdict.sentence} {moved_sentence(unknowns)}".strip()
-    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=unknowns))
+    no_effect = outcome.search.no_effect
+    moved = moved_unknowns(problem, no_effect)
+    moved_within_prior = unknowns_moved_within_prior(problem, no_effect)
+    if verdict.kind in KINDS_WITHOUT_GAP:
+        sentences = hiding_sentences(moved, moved_within_prior)
+    else:
+        sentences = moved_sentence(moved)
+    verdict = replace(
+        verdict,
+        sentence=f"{verdict.sentence} {sentences}".strip(),
+        moved=moved,
+        moved_within_prior=moved_within_prior,
+    )
+    return outcome._replace(verdict=verdict)
 
 
 def _verdict_of_two_searches(
@@ -78,7 +96,7 @@ def _verdict_of_two_searches(
     is_unexplained = first_outcome.verdict.kind is VerdictKind.UNEXPLAINED
     if not first_search.force_hypotheses or not is_unexplained:
         return first_outcome
-    on_progress("nothing follows the missing force: comparing whole simulations")
+    on_progress("no effect follows the missing force: comparing whole simulations")
     # the first search may have refined the time steps, so fit again
     no_effect = try_fit(problem, Candidate(), first_search.no_effect.point)
     second_search = Search(
@@ -197,9 +215,9 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     # reason 1: errors that any instrument has
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
-            f"The model explains the data but for {causes} below "
-            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of what it acts on, which is a nuisance of the "
-            "instruments and no name."
+            f"The model explains the data except for {causes} below "
+            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of the quantity; an error that small counts as "
+            "a nuisance of the instruments, and is not named."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     # reason 2: a gain that only keeps calibrated parameters within their priors
@@ -210,9 +228,10 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
     if not check_held_out(search.residuals(search.no_effect)).passed:
         return None
     sentence = (
-        "The model predicts held-out trials as it is, but with calibrated parameters beside their "
-        f"priors{_implausible_parameters_clause(search)}. An error of the instruments ({causes}) "
-        "would do as well: with one channel these data cannot tell them apart."
+        "The model predicts held-out trials as it is, but with calibrated parameters outside "
+        f"their priors{_implausible_parameters_clause(search)}. An error of the instruments "
+        f"({causes}) would explain them as well: with one channel, these data cannot distinguish "
+        "the two."
     )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     return replace(

@@ -38,7 +38,7 @@ def shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: Hypothe
             description = parameter.description.split(" (")[0]
             interval = f"{parameter.low:.2g} to {parameter.high:.2g}"
             texts.append(f"{description} {parameter.value:.2g} ({interval})")
-    return f" With a shape of its own: {', '.join(texts)}." if texts else ""
+    return f" With a fitted shape: {', '.join(texts)}." if texts else ""
 
 
 def unproved_addition_sentence(
@@ -71,6 +71,6 @@ def unproved_addition_sentence(
         if (effect.family, effect.place) not in families:
             added_effects.append(effect)
     return (
-        f" {capital(effects_text(added_effects))} may be there beside it, but is not proved: it "
+        f" {capital(effects_text(added_effects))} may be missing, too, but this is not proved: it "
         "gains less evidence than it costs."
     )

@@ -309,7 +309,7 @@ def check_held_out(residuals_after: ResidualSet) -> Gate:
     held_out_scores = compute_scores(residuals_after.held_out)
     excess = chi_square_of(residuals_after.held_out).excess
     if not isfinite(excess):
-        return _held_out_gate(None, nan, "No noise record to judge them by.")
+        return _held_out_gate(None, nan, "There is no noise record to judge them by.")
     if excess > HELD_OUT_DEVIATIONS:
         reason = f"On held-out trials χ² per sample is {chi_square_text(held_out_scores)}."
         return _held_out_gate(False, excess, reason)
@@ -395,7 +395,7 @@ def _closed_share_or_reason(
     """
     share = closed_share(residuals_before, residuals_after)
     if share is None:
-        return None, "The model as it was leaves no error at all."
+        return None, "The unchanged model leaves no error at all."
     if share.trials != "held-out":
         return share, "No trial was held out."
     chi_square_before = _chi_square_by_diagonal(residuals_before.held_out or residuals_before)
@@ -474,7 +474,7 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
 
 
 def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
-    """Return a sentence on what is left in the residuals of a model that contains the effect.
+    """Return a sentence on the residuals of a model that contains the effect.
 
     Parameters
     ----------
@@ -504,7 +504,7 @@ def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
             f"The size is that of noise ({chi_square_phrase}), but residuals are not white "
             f"(p = {scores.whiteness:.1g})."
         )
-    return f"Nothing that these data can show remains ({chi_square_phrase})."
+    return f"These data show no remaining error ({chi_square_phrase})."
 
 
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:

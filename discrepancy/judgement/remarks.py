@@ -182,20 +182,20 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     does = "does" if len(named_effects) == 1 else "do together"
     names_text = " and ".join(named_effects.values())
     remark = (
-        "A cause that the catalogue lacks and that acts on these trials as "
-        f"{names_text} {does}, within the noise, would be given the same name."
+        "A cause that is not in the catalogue would get the same name if it acts on these trials "
+        f"as {names_text} {does}, within the noise."
     )
     not_compared = (
         f"{', '.join(not_compared_similar)} {_was_or_were(not_compared_similar)} not compared."
     )
     if compared_similar:
         remark += (
-            f" Of what is known to look alike, {', '.join(compared_similar)} "
-            f"{_was_or_were(compared_similar)} compared, with less evidence"
+            f" Of the effects that are known to look similar, {', '.join(compared_similar)} "
+            f"{_was_or_were(compared_similar)} compared and had less evidence"
         )
         return f"{remark}; {not_compared}" if not_compared_similar else f"{remark}."
     if not_compared_similar:
-        return f"{remark} Of what is known to look alike, {not_compared}"
+        return f"{remark} Of the effects that are known to look similar, {not_compared}"
     return remark
 
 

@@ -171,7 +171,7 @@ class VerdictCase:
 
     @cached_property
     def tested_family_set(self) -> CheckedFit | None:
-        """The leading set with one law of free shape, and its tests; None if it may not be named.
+        """The fit and the tests of the leading set with a free shape; None if it may not be named.
 
         A free shape counts as one more effect, so the set must not have the largest size already.
         A law of free shape together with a second law could fit nearly anything.
@@ -242,7 +242,7 @@ class VerdictCase:
         for names in self.probable_sets:
             fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
             members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
-        # sets that fail the test are no members, and their probability is not counted
+        # sets that fail the test are not members, and their probability is not counted
         passing_members = [member for member in members if not member.absolute_fit.has_failed]
         probability = sum(self.probabilities[member.effect_names] for member in passing_members)
         # an effect with its canonical and with a free shape is one member
@@ -283,7 +283,7 @@ class VerdictCase:
         reason = most_probable.absolute_fit.reason
         sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
         if passing_count:
-            sentence = f"There is a gap, and {passing_count} explanations fit it alike."
+            sentence = f"There is a gap, and {passing_count} explanations fit it equally well."
         return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
@@ -356,8 +356,8 @@ class VerdictCase:
             return self._unexplained_verdict(sentence, self.probability, gates)
         if self.family_fit is not None and self.tested_family_set is None:
             reason = (
-                "one of them would need a shape of its own, and with so much freedom nearly "
-                "anything fits."
+                "one of them would need a free shape, and with that much freedom nearly anything "
+                "fits."
             )
         nearest_effects = " with ".join(self.leading_fit.candidate.identifiers)
         clause = f"{reason[0].lower()}{reason[1:]}"
@@ -371,7 +371,7 @@ class VerdictCase:
     def _unexplained_verdict(
         self, sentence: str, probability: float, gates: tuple[Gate, ...]
     ) -> VerdictOutcome:
-        """Return the verdict of an unexplained gap, with the leading set as what it resembles."""
+        """Return the verdict of an unexplained gap, with the leading set as its resemblance."""
         return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,

@@ -110,7 +110,7 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
     campaign : Campaign
         The campaign with its readings as measured.
     model : Model
-        The model as it is.
+        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
     """
@@ -177,7 +177,7 @@ def compute_separability(
         The campaign with its inputs, channels and noise records. The readings are used only to
         determine unknown initial states, see `campaign_as_predicted`.
     model : Model
-        The model as it is.
+        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
     effects : sequence of Effect

@@ -25,7 +25,7 @@ VETO_NOISE_DEVIATIONS = 5.0
 """rms residual over the noise deviation above which a channel of a held-out trial is far off."""
 VETO_PREDICTIVE_DEVIATIONS = 3.0
 """rms residual over the predictive deviation (noise and uncertainty of the fit together) that a
-channel must also exceed to be far off, since the uncertainty of the fit is no gap."""
+channel must also exceed to be far off, since the uncertainty of the fit is not a gap."""
 MOST_MENTIONED = 3
 """Largest number of records (one channel in one trial each) that a sentence mentions."""
 WHITE_SECOND_DIFFERENCES = 6.0
@@ -101,7 +101,7 @@ def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
     effects = effects_text(verdict.effects) or "the best hypothesis"
     return (
         "There is a gap without a name. The most probable explanation in the catalogue is "
-        f"{effects}, but {clause}: nothing is named, and nothing to be applied."
+        f"{effects}, but {clause}: no effect is named, and there is nothing to apply."
     )
 
 
@@ -169,8 +169,8 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
         parts.append(f"{unmentioned_count} more records")
     return (
         "The model explains the trials that were fitted, but not those held out: it misses "
-        f"{listing(parts)}. Something is missing that the fitted trials do not show: fit one like "
-        "these too."
+        f"{listing(parts)}. Something is missing that the fitted trials do not show: fit trials "
+        "like these, too."
     )
 
 
@@ -227,8 +227,8 @@ def _unfitted_verdict(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> V
     if unmentioned_count > 0:
         parts.append(f"{unmentioned_count} more records")
     sentence = (
-        f"The model is not fitted: it leaves more of {listing(parts)} than the readings vary about "
-        "their mean. That is no evidence of a missing force. Check how the trials begin, inputs, "
-        "signs and units, and try a shorter record."
+        f"The model does not fit: its residuals of {listing(parts)} are larger than the variation "
+        "of the readings about their mean. That is no evidence of a missing force. Check how the "
+        "trials begin, inputs, signs and units, and try a shorter record."
     )
     return replace(_verdict_without_name(verdict, sentence), unfitted=tuple(unfitted))

@@ -448,8 +448,9 @@ class _UsedSamples:
 def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
     """Return the functions of time and of load that static readings may depend on.
 
-    The constant with the time allows for a time scale that begins anywhere. A dependence on the
-    load is proportional (the prediction x and the load) or not (|load| load, load^2).
+    The basis of the time also has a constant, so that it does not matter when the time begins. The
+    functions of the load are proportional to it (the prediction x and the load itself), or are not
+    (|load| load and load^2).
     """
     bases: dict[tuple[str, str], FloatArray] = {}
     time = samples.stack_used_samples(lambda fitted: fitted.trial.time)

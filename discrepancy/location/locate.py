@@ -130,7 +130,8 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     has_samples = any(trial.used.any() for trial in fitted_residuals.trials)
     if has_samples and all(cell.axis == "frequency" for cell in cells):
         remarks.append(
-            "The model is so far off that beside the noise no cell of the map can be judged."
+            "The errors of the model are so much larger than the noise that no single cell of the "
+            "map can be judged."
         )
     return Location(any(rejections), tests, cells, tuple(findings), tuple(remarks))
 
@@ -296,7 +297,7 @@ def _amplitude_and_time_look_alike(
 
 
 def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
-    """Return what disagrees: a single channel, the mode with most of the excess, or all channels.
+    """Return the subject of a disagreement: a channel, the mode with most excess, or all channels.
 
     A channel or a mode is named only if it has more than half of the excess variance.
 

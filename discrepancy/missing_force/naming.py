@@ -123,7 +123,8 @@ class ForceSearch(MissingForces):
         effects : sequence of Effect
             The effects that may be missing in the model.
         on_progress : callable
-            The function to which progress is reported, as a line of text.
+            The function that receives a line for the progress display: the comparison that runs,
+            and how many remain.
         largest_set : int, optional
             The largest number of effects in a set; by default that of `FOLLOWED_COUNTS`.
         """
@@ -164,7 +165,8 @@ class ForceSearch(MissingForces):
         followed_count : int
             The number of effects that are fitted.
         on_progress : callable
-            The function to which progress is reported, as a line of text.
+            The function that receives a line for the progress display, such as the comparison that
+            runs.
         """
         extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
         self._fit_promising_effects(base, effects, followed_count, extended_hypotheses, on_progress)
@@ -191,7 +193,8 @@ class ForceSearch(MissingForces):
         extended_hypotheses : dict of CandidateKey to ForceHypothesis
             The hypotheses with one more effect, to which results are added.
         on_progress : callable
-            The function to which progress is reported, as a line of text.
+            The function that receives a line for the progress display, such as the comparison that
+            runs.
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         on_progress(f"comparing all effects{base_in_words} with the missing force")

@@ -224,8 +224,8 @@ def findings(
     if gate.has_failed:
         sentences.append(
             f"The campaign is not explained by these parameters: {small(gate.reason)} The "
-            "posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on "
-            "the same campaign and model looks for what is missing."
+            "posterior is too narrow and may be biased; `uav-twin discrepancy run` on the same "
+            "campaign and model looks for what is missing."
         )
     elif gate.passed is None:
         sentences.append(gate.reason)
@@ -292,9 +292,10 @@ def _range_findings(
         first = refusals[0]
         values = _parameter_values(priors, marginal.physical_values(first.parameters))
         yield (
-            f"At {counted(len(refusals), 'place')} near the optimum, and within its range, the "
-            f"model cannot be had, first at {values} ({first.reason.rstrip('.')}): the posterior "
-            "has nothing there; correct the range in the model's file."
+            f"At {counted(len(refusals), 'place')} near the optimum, within the range of the "
+            f"parameters, the model cannot be evaluated, first at {values} "
+            f"({first.reason.rstrip('.')}): the posterior leaves these places out; correct the "
+            "range in the model's file."
         )
 
 
@@ -314,12 +315,11 @@ def _optimum_findings(
             phrases.append(f"{_parameter_values(priors, values)} ({probability:.0%})")
         yield (
             f"The posterior has {len(optima)} maxima: {' and '.join(phrases)}; the campaign does "
-            "not tell which, and the mean lies between them."
+            "not decide between them, and the mean lies between them."
         )
     if not optima[0].converged:
         yield (
-            "The fit had not settled when it ended: the samples may be off; state the priors "
-            "narrower."
+            "The fit ended before it converged: the samples may be wrong; state narrower priors."
         )
 
 
@@ -331,16 +331,16 @@ def _undetermined_findings(
         if ratio > LARGEST_DEVIATION_RATIO:
             remaining = "all" if ratio > 0.995 else f"{100.0 * ratio:.0f} %"
             yield (
-                f"The campaign does not tell {prior.name}: {remaining} of its prior deviation is "
-                "left, and what is believed of it is the prior."
+                f"The campaign does not determine {prior.name}: its posterior standard deviation "
+                f"is {remaining} of the prior one, so that the result is mostly the prior."
             )
     correlations = correlation(posterior.draws)
     for i, j in combinations(range(len(priors)), 2):
         if abs(correlations[i, j]) > TIED_CORRELATION:
             yield (
-                f"{priors[i].name} and {priors[j].name} are told together and hardly apart "
-                f"(correlation {correlations[i, j]:+.3f}): fly with samples of both, or measure "
-                "where they act differently."
+                f"{priors[i].name} and {priors[j].name} are determined in combination, but hardly "
+                f"each of them (correlation {correlations[i, j]:+.3f}): fly with samples of both, "
+                "or measure where they act differently."
             )
 
 

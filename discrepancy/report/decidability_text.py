@@ -86,12 +86,13 @@ def group_lines(separability: Separability, hint: str = "the table says to which
     )
     if not separability.identifiers or not shows_any:
         return [
-            "These trials show none of the effects that can be tested: nothing moves in what the "
-            "model predicts of them. Say how each trial begins and what drives it."
+            "These trials show none of the effects that can be tested: the model predicts no "
+            "motion in them. State how each trial begins and what drives it."
         ]
     if not separability.groups:
         return [
-            "Every effect that can be tested here can be told from every other at its prior median."
+            "Every effect that can be tested here can be distinguished from every other one at its "
+            "prior median."
         ]
     lines = []
     for group in separability.groups:
@@ -138,7 +139,7 @@ def campaign_needs(
         sentences.append(
             f"Give a noise record for {', '.join(without_noise)} (samples at rest, or a standard "
             "deviation with its degrees of freedom): without it the absolute gate cannot be "
-            "applied, and the sizes above take a thousandth of the range for its noise."
+            "applied, and the sizes above assume a thousandth of the range as its noise."
         )
     if not campaign.held_out:
         sentences.append(
@@ -171,8 +172,8 @@ def _sentence_on_group(
     names = listing(name.replace("_", " ") for name in group)
     if not kinds:
         return (
-            f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
-            "load, a known added mass, another temperature, strain beside displacement."
+            f"To tell {names} apart, vary what was kept constant: another amplitude, sign or place "
+            "of the load, a known added mass, another temperature, strain beside displacement."
         )
     texts_of_kinds = " or ".join(WORDS_OF_KINDS[kind] for kind in kinds)
     return f"To tell {names} apart, add {texts_of_kinds}: some of them act there and others do not."
@@ -201,9 +202,11 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     names = [detectability.effect.identifier.replace("_", " ") for detectability in hidden]
     improvement = f"with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials"
     if len(names) == 1:
-        return [f"At its prior median {names[0]} would not be seen; it would be {improvement}."]
+        return [
+            f"At its prior median {names[0]} would not be detectable; it would be {improvement}."
+        ]
     first = nearest.effect.identifier.replace("_", " ")
     return [
-        f"At their prior medians {listing(names)} would not be seen; {first} would be the first, "
-        f"{improvement}."
+        f"At their prior medians {listing(names)} would not be detectable; {first} would be the "
+        f"first, {improvement}."
     ]

@@ -178,7 +178,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     """
     row_titles = {"force": "missing force"}
     if missing.law:
-        row_titles["left"] = "what is left"
+        row_titles["left"] = "remaining force"
     name_of_force, displacement_unit, speed_unit = port_motion_units(missing.at_port)
     if displacement_unit:
         motions = {
@@ -331,8 +331,8 @@ def _unit_of_noise(before: ResidualSet) -> str:
     if not unknown:
         return "1 is noise."
     return (
-        f"1 is noise; of {listing(unknown)}, whose noise is not recorded, what the model as it was "
-        "leaves in fitted trials."
+        f"1 is noise; for {listing(unknown)}, without a noise record, 1 is the residual of the "
+        "unchanged model in fitted trials."
     )
 
 
@@ -340,7 +340,7 @@ def _sentence_on_held_out_trials(names: Sequence[str], *, has_both: bool) -> str
     """Return which trials are held out, and that two panels have one scale if there are two."""
     if names:
         them = "them" if len(names) > 1 else "it"
-        text = f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."
+        text = f"Held out: {listing(names)}; only release and zero were fitted to {them}."
     else:
         text = "No trial is held out."
     return f"{text} Both panels have one scale." if has_both else text
@@ -365,7 +365,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         _add_residual_figures(figures, content, investigation.before)
     if investigation.proof is not None:
         before, after, trials = proof_scores(investigation.proof)
-        scores = {"model as it was": before, "with the effect": after}
+        scores = {"unchanged model": before, "with the effect": after}
         with_pit = {title: score for title, score in scores.items() if score.pit}
         trials_text = (
             "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
@@ -406,7 +406,7 @@ def _add_residual_figures(
     windows = investigation.verdict.windows
     remark = ""
     if any(window.with_effect for window in windows):
-        remark = " The thin bars below are what the hypothesis leaves."
+        remark = " The thin bars below are the residuals of the hypothesis."
     _add_figure(figures, "time_line", time_line_figure(windows), left=remark)
     worst = worst_record(before.trials)
     if worst is not None:

@@ -69,7 +69,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     Parameters
     ----------
     before, after : ResidualSet or None
-        Residuals of the model as it was, and with the effect.
+        Residuals of the unchanged model, and with the effect.
     worst : Worst
         The record.
     """
@@ -209,7 +209,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     Parameters
     ----------
     before, after : ResidualSet or None
-        Residuals of the model as it was, and with the effect.
+        Residuals of the unchanged model, and with the effect.
 
     Returns
     -------

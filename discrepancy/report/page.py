@@ -12,6 +12,7 @@ from discrepancy.location.locate import Location
 from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.report.figures import ReportInput
+from discrepancy.report.sensor_table import sensor_table
 from discrepancy.report.sizes import size_sentence
 from discrepancy.report.text import (
     NAMING,
@@ -38,7 +39,7 @@ from discrepancy.verdict import Estimate, Gate, NamedEffect, Verdict, VerdictKin
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.record_table import add_titled_table
-from reporting.words import capital, counted, listing
+from reporting.words import capital, counted, listing, with_short_hashes
 
 LONGEST_CARD = 60
 """Most characters of a card of the page; the sentence below it has all names."""
@@ -50,7 +51,7 @@ MOST_SHOWN_DISAGREEMENTS = 8
 OPENING = {
     VerdictKind.NOTHING_MISSING: "is missing",
     VerdictKind.NAMED: "is missing",
-    VerdictKind.NAMED_IN_PART: "is missing; more than noise is left",
+    VerdictKind.NAMED_IN_PART: "is missing; the remainder is larger than noise",
     VerdictKind.FAMILY: "is missing",
     VerdictKind.GROUP: "is missing: these data cannot tell which",
     VerdictKind.UNEXPLAINED: "fits what is missing",
@@ -62,7 +63,7 @@ OPENING = {
 TEXT_WITHOUT_EFFECT = {
     VerdictKind.NOTHING_MISSING: "nothing",
     VerdictKind.DATA_ERROR: "the data",
-    VerdictKind.BELOW_LIMIT: "nothing that could be seen",
+    VerdictKind.BELOW_LIMIT: "nothing that could be detected",
 }
 """The text of the first card for verdicts that name no effect."""
 
@@ -117,7 +118,8 @@ def render_report(
     verdict = investigation.verdict
     page = Page(
         origin.campaign,
-        f"What the model “{origin.model}” lacks beside these data: located, named, added, proved",
+        f"What the model “{origin.model}” lacks compared with these data: located, named, added, "
+        "proved",
         footer=(
             f"Repeat it: {origin.short_command}",
             f"Data {origin.data_hash[:16]}, model {origin.model_hash[:16]}, seed "
@@ -168,7 +170,8 @@ def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
         book.add_paragraph(
-            f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
+            f"The nearest in the catalogue is {listing(names)}; this is a resemblance and not a "
+            "name."
         )
     effects: dict[str, NamedEffect] = {}
     for effect in verdict.effects:
@@ -184,9 +187,16 @@ def verdict_card(verdict: Verdict) -> str:
     """Return the verdict in one line: what is missing, where, how large, and how sure that is.
 
     The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval.
+    a named effect with its 90 % interval. If nothing is missing, the parameter, gain or zero that
+    the fit moves farthest is mentioned.
     """
     clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
+    moved = (*verdict.moved, *verdict.moved_within_prior)
+    if verdict.kind in KINDS_WITHOUT_GAP and moved:
+        clauses.append(
+            f"but with {moved[0].name} moved by {abs(moved[0].deviations):.1f} stated deviations, "
+            "where an error of the model may hide"
+        )
     parameters: list[Estimate] = []
     if verdict.kind in NAMING:
         for effect in verdict.effects:
@@ -213,7 +223,7 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
         cards.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
     if proof is not None and proof.closed is not None:
         taken_or_added = "taken away" if proof.closed.value >= 0.0 else "added"
-        reservation = "" if verdict.kind in NAMING else ", which is no name"
+        reservation = "" if verdict.kind in NAMING else ", which is not named"
         meaning = (
             f"of the mean square error in {proof.closed.trials} trials is {taken_or_added} by "
             f"{added_label(investigation)}{reservation}"
@@ -238,7 +248,7 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
 
 
 def missing_effects_text(verdict: Verdict) -> str:
-    """Return what the model lacks in a few words, for a card at the top of the page."""
+    """Return a few words on what the model lacks, for a card at the top of the page."""
     members = group_members(verdict)
     if members:
         names = listing(members, "or")
@@ -278,7 +288,7 @@ def deciding_gates(verdict: Verdict) -> list[Gate]:
 
 
 def _meaning(verdict: Verdict) -> str:
-    """Return what the kind of the verdict means, as far as the absolute fit could be judged."""
+    """Return the meaning of the kind of a verdict, which depends on the gate of absolute fit."""
     could_not_judge = any(
         gate.name == "absolute fit" and gate.passed is None for gate in verdict.gates
     )
@@ -324,35 +334,37 @@ def _add_location(book: _PictureBook, investigation: Investigation) -> None:
 
 
 def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
-    """Return whether the residuals of the model as it was stand out, and in how many cells."""
+    """Return whether the residuals of the unchanged model stand out, and in how many cells."""
     if location is None:
         return "The residuals were not searched for patterns."
     if location.disagrees:
         significant = sum(cell.significant for cell in location.cells)
         discoveries = "is a discovery" if significant == 1 else "are discoveries"
         return (
-            f"The model as it was disagrees with the fitted trials; {significant} of "
+            f"The unchanged model disagrees with the fitted trials; {significant} of "
             f"{counted(len(location.cells), 'cell')} of the map (channel, trial, and bin of time, "
             f"amplitude, frequency or load) {discoveries} at a false discovery rate of 5 %."
         )
     if has_no_gap:
         return (
-            "No global test finds a disagreement between the model as it was and the fitted trials."
+            "No global test finds a disagreement between the unchanged model and the fitted trials."
         )
     return (
-        "The residuals of the model as it was do not stand out by themselves, or cannot be judged "
-        "by their size: what is missing shows where effects are fitted, or in the missing force."
+        "The residuals of the unchanged model are not significant by themselves, or cannot be "
+        "judged by their size: the gap appears only when effects are fitted, or in the missing "
+        "force."
     )
 
 
 def _add_reasons(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on the gates, the compared hypotheses, and the model's parameters."""
+    """Add the section on gates, compared hypotheses, parameters, and fitted gains and zeros."""
     verdict = investigation.verdict
     book.page.add_section("Why this verdict")
     add_titled_table(book.page, verdict_tables.gates_table(verdict))
     add_titled_table(book.page, verdict_tables.evidence_table(verdict))
     add_titled_table(book.page, verdict_tables.not_compared_table(verdict))
     add_titled_table(book.page, tables.parameters_table(investigation))
+    add_titled_table(book.page, sensor_table(verdict.sensors, investigation.campaign.channels))
 
 
 def _add_proof(book: _PictureBook, investigation: Investigation) -> None:
@@ -398,7 +410,7 @@ def _add_data(book: _PictureBook, investigation: Investigation) -> None:
         book.page.add_notice(fault.sentence)
     remarks = remarks_beside_faults(investigation)
     for remark in remarks:
-        book.add_paragraph(f"• {remark}")
+        book.add_paragraph(f"• {with_short_hashes(remark)}")
     if not investigation.faults and not remarks:
         book.add_paragraph("No fault was found.")
     add_titled_table(book.page, tables.trials_table(investigation.campaign))

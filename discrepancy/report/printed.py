@@ -14,6 +14,7 @@ from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import campaign_needs, confused_effects, group_lines
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import remarks_beside_faults, sizes_sentence
+from discrepancy.report.sensor_table import printed_sensor_table
 from discrepancy.report.text import number
 from discrepancy.report.verdict_sentences import (
     error_sentence,
@@ -34,7 +35,7 @@ MOST_PRINTED_EXPERIMENTS = 3
 
 
 def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
-    """Yield what is printed of an investigation: lines, and the table of the effects' parameters.
+    """Yield the printed lines of an investigation, and the tables of effects and sensors.
 
     Parameters
     ----------
@@ -47,6 +48,9 @@ def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
     table = verdict_tables.printed_effects_table(verdict)
     if table.rows:
         yield table
+    sensors = printed_sensor_table(verdict.sensors, investigation.campaign.channels)
+    if sensors.rows:
+        yield sensors
     yield from filter(None, _sentences_on_proof(investigation))
     for experiment in verdict.next_experiments[:MOST_PRINTED_EXPERIMENTS]:
         yield f"Next: {experiment.description} ({experiment.information:.2f} nat)"
@@ -128,7 +132,7 @@ def check_lines(
     faults: Sequence[DataFault],
     separability: Separability | None,
 ) -> Iterator[str | Table]:
-    """Yield what is printed of a campaign: its faults, and which effects it can decide on.
+    """Yield the printed lines on a campaign: its faults, and the effects that it can decide on.
 
     Parameters
     ----------

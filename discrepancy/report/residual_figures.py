@@ -37,10 +37,10 @@ class DrawnModel(NamedTuple):
 
 def models_to_draw(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     """Return the residuals to draw, with style and label: before and, if given, with the effect."""
-    was = DrawnModel(before, style.PREDICTION, "--", "o", "model", "model as it is")
+    was = DrawnModel(before, style.PREDICTION, "--", "o", "model", "unchanged model")
     if after is None:
         return [was]
-    was = was._replace(label="model as it was", title="a  model as it was")
+    was = was._replace(label="unchanged model", title="a  unchanged model")
     with_effect = residuals_with_noise_of(after, before)
     return [was, DrawnModel(with_effect, style.PAST, "-", "D", AFTER, f"b  {AFTER}")]
 

@@ -87,7 +87,7 @@ def size_sentence(
         return ""
     begin = "In SI units"
     if not is_named:
-        begin = "In SI units, were it the most probable member, which is not named"
+        begin = "In SI units, for the most probable member, which is not named"
     has_intervals = any(" to " in phrase for phrase in phrases)
     brackets = "; 90 % intervals in brackets" if has_intervals else ""
     return f"{begin}: {'; '.join(phrases)}{brackets}."

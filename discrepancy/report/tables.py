@@ -55,7 +55,7 @@ def global_tests_table(location: Location) -> TitledTable:
         table_of_records(columns, location.tests),
         title="Global tests",
         caption=(
-            "Residuals of the model as it was on fitted trials, each against what noise would "
+            "Residuals of the unchanged model on fitted trials, each against what noise would "
             "leave after the fit; Holm's rule at 1 % over the tests."
         ),
     )
@@ -64,7 +64,7 @@ def global_tests_table(location: Location) -> TitledTable:
 def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     """Return the rows of the model's parameters: name, unit, and values with 90 % half-widths.
 
-    Values are those of the calibration, of the fit of the model as it was, and of the fit with the
+    Values are those of the calibration, of the fit of the unchanged model, and of the fit with the
     effect. Without an effect the last is left out; without parameters there are no rows.
     """
     problem, search, fit = investigation.problem, investigation.search, investigation.fit
@@ -99,7 +99,7 @@ def parameters_table(investigation: Investigation) -> TitledTable:
         PageColumn("parameter"),
         PageColumn("unit"),
         number_column("calibration"),
-        number_column("model as it was"),
+        number_column("unchanged model"),
         number_column("with the effect"),
     ]
     rows = parameter_rows(investigation)
@@ -112,7 +112,7 @@ def parameters_table(investigation: Investigation) -> TitledTable:
         title="Calibrated parameters before and after",
         caption=(
             "Values with the half-width of their 90 % intervals: as the calibration states them, "
-            f"and fitted to these data {fits}. Where the model as it was moves a parameter by "
+            f"and fitted to these data {fits}. Where the unchanged model moves a parameter by "
             "several deviations, the parameter has taken up what the model lacks."
         ),
     )
@@ -207,8 +207,8 @@ def detectable_sizes_table(separability: Separability) -> TitledTable:
         table_of_records(columns, testable_effects(separability)),
         title="Detectable sizes",
         caption=(
-            "From the model, the inputs and the noise alone. Detectable from: the size at which d² "
-            "reaches 25, with all nuisances adapted."
+            "Computed from the model, the inputs and the noise, without the readings. Detectable "
+            "from: the size at which d² reaches 25, with all nuisances adapted."
         ),
     )
 
@@ -322,5 +322,5 @@ def origin_table(origin: Origin) -> TitledTable:
     return TitledTable(
         Table([PageColumn("item"), PageColumn("value")], rows),
         title="Provenance",
-        caption="verdict.json, patch.json and residuals.nc beside this page hold every figure.",
+        caption="verdict.json, patch.json and residuals.nc beside this page contain every number.",
     )

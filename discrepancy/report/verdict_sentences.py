@@ -135,7 +135,7 @@ def ordered_percent(force: ForceAtPort) -> str:
 
 
 def _sentence_on_law(force: ForceAtPort) -> str:
-    """Return how much of a missing force remains beside its law; empty if it was not tested."""
+    """Return how much of a missing force its law leaves; empty if this was not tested."""
     phrases = []
     for role, remainder in tested_trials(force):
         trials = counted(remainder.trials, f"{role} trial")
@@ -188,9 +188,9 @@ def error_sentence(investigation: Investigation) -> str:
     errors = ErrorComparison(proof.closed, proof.closed_reason, before.rms, after.rms)
     predicate = closed_share_text(investigation.campaign.channels, errors).removeprefix("it ")
     if proof.closed.has_grown:
-        subject = "With it" if is_named else "With the best hypothesis, which is no name,"
+        subject = "With it" if is_named else "With the best hypothesis, which is not named,"
     else:
-        subject = "It" if is_named else "The best hypothesis, which is no name,"
+        subject = "It" if is_named else "The best hypothesis, which is not named,"
     return f"{subject} {predicate}."
 
 
@@ -207,13 +207,13 @@ def remainders_sentence(verdict: Verdict) -> str:
     phrases = []
     for remainder in verdict.remainders:
         phrase = (
-            f"{remainder.channel} {number(remainder.size, 2)} noises over "
-            f"{number(remainder.time, 2)} s"
+            f"{remainder.channel} {number(remainder.size, 2)} standard deviations of the noise "
+            f"over {number(remainder.time, 2)} s"
         )
         if remainder.frequency > 0.0:
             phrase += f", swinging at {number(remainder.frequency)} Hz"
         phrases.append(phrase)
-    return f"What is left beside the noise: {'; '.join(phrases)}." if phrases else ""
+    return f"The remainder beyond the noise: {'; '.join(phrases)}." if phrases else ""
 
 
 def parameters_sentence(effects: Iterable[NamedEffect]) -> str:

@@ -102,14 +102,16 @@ def effect_rows(verdict: Verdict) -> list[EffectRow]:
 
 CAPTION_OF_SIZES = {
     VerdictKind.NAMED: "Most probable values and 90 % intervals.",
-    VerdictKind.NAMED_IN_PART: ("Most probable values and 90 % intervals, wider for what is left."),
+    VerdictKind.NAMED_IN_PART: (
+        "Most probable values and 90 % intervals, widened for the remainder."
+    ),
     VerdictKind.FAMILY: "Most probable values and 90 % intervals; the shape was fitted.",
 }
 """Whose values the table of parameters holds, by the kind of the verdict."""
 
 
 def effects_table(content: ReportInput) -> TitledTable:
-    """Return the table of what is added to the model, or could be."""
+    """Return the table of the effects that are added to the model, or could be added."""
     verdict = content.investigation.verdict
     is_named = verdict.kind in NAMING
     is_group = bool(group_members(verdict))
@@ -128,7 +130,7 @@ def effects_table(content: ReportInput) -> TitledTable:
     sentences.append(
         CAPTION_OF_SIZES.get(
             verdict.kind,
-            "Most probable values and 90 % intervals of each, were it there alone.",
+            "Most probable values and 90 % intervals of each member, if it acts alone.",
         )
     )
     if content.intervals:
@@ -137,7 +139,7 @@ def effects_table(content: ReportInput) -> TitledTable:
     if is_group:
         title = "The members of the group"
     else:
-        title = "What is added" if is_named else "What could be added"
+        title = "What is added" if is_named else "Effects that could be added"
     table = table_of_records(columns, effect_rows(verdict))
     return TitledTable(table, title, " ".join(sentences).rstrip())
 
@@ -192,7 +194,7 @@ def gates_table(verdict: Verdict) -> TitledTable:
         title="Gates",
         caption=(
             "A name must fit the noise record (absolute fit), freeing its shape must not gain more "
-            "than two nats, and what it leaves must follow neither loads, runs nor its own channel "
+            "than two nats, and its residuals must follow neither loads, runs nor its own channel "
             "(consistency)."
         ),
     )
@@ -313,7 +315,7 @@ def not_compared_table(verdict: Verdict) -> TitledTable:
         Table([PageColumn("why"), PageColumn("effects")], rows),
         title="Not compared",
         caption=(
-            "What is not in this table was fitted and compared. In brackets what a screen promised "
-            "at most."
+            "Effects that are not in this table were fitted and compared. Numbers in brackets are "
+            "the largest gain that a screening predicted."
         ),
     )

@@ -44,7 +44,7 @@ def ignore_progress(message: str) -> None:
 def report_each(
     on_progress: OnProgress, items: Sequence[T], describe: Callable[[T], str]
 ) -> Iterator[T]:
-    """Yield items, and before each one report what is done with it and how many follow.
+    """Yield items; before each one, report how it is processed and how many items follow.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def report_each(
     items : sequence
         The items of which each is reported.
     describe : callable
-        Returns what is done with an item, such as "fitting gain".
+        Returns a phrase on how an item is processed, such as "fitting gain".
     """
     for number, item in enumerate(items):
         remaining_count = len(items) - number - 1

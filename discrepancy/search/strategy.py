@@ -51,7 +51,8 @@ class Search(FittedCandidates):
         The largest decrease of the misfit by each effect, as expected by the screen at the fit
         without effect [nat].
     on_progress : callable
-        Called with a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     wide_problem : Problem or None
         The problem under the wider noise of `wide_fits`, which is as large as the residuals of the
         best hypothesis.
@@ -73,7 +74,7 @@ class Search(FittedCandidates):
         try:
             return ForceSearch(self.problem)
         except (ModelError, np.linalg.LinAlgError) as cause:
-            self.on_progress(f"the missing force cannot be seen: {cause}")
+            self.on_progress(f"the missing force cannot be estimated: {cause}")
             return None
 
     # ---------------------------------------------------------------- rough fits of one more effect
@@ -284,7 +285,7 @@ class Search(FittedCandidates):
         for fit in report_each(
             self.on_progress,
             promising_fits,
-            lambda fit: f"fitting {fit.candidate.description} to the end",
+            lambda fit: f"fitting {fit.candidate.description} until it converges",
         ):
             exact_fits.append(self.fit_exactly(fit))
         return sorted(exact_fits, key=lambda fit: -self.score(fit))
@@ -360,7 +361,7 @@ class Search(FittedCandidates):
         for hypothesis in report_each(
             self.on_progress,
             probable_hypotheses[: SEARCH.most_far_fits],
-            lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
+            lambda hypothesis: f"fitting {hypothesis.candidate.description} until it converges",
         ):
             start = force_search.point_with_effects(hypothesis)
             fit = try_fit(self.problem, hypothesis.candidate, start)

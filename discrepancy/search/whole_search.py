@@ -40,7 +40,8 @@ def search(
         The catalogue. Effects that cannot act in the campaign are left out. If an event of the
         campaign may have begun or ended an effect, the effect is also tried in that form.
     on_progress : callable
-        Called with a line that says what is fitted, and how much is still to come.
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
     on_search : callable
         Called with the search after the fit without effect.
 
@@ -49,7 +50,7 @@ def search(
     Search
         All candidates that were fitted, with their evidence.
     """
-    on_progress("fitting the model as it is")
+    on_progress("fitting the unchanged model")
     start = problem.prior_mean_point(Candidate())
     no_effect = fit(problem, Candidate(), start, iterations=SEARCH.no_effect_iterations)
     no_effect = refit_from_first_readings(

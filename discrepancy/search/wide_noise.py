@@ -211,8 +211,9 @@ def _sum_of_squares(series: Sequence[FloatArray]) -> float:
 def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
     """Return the noise variance of each channel over s0^2, (channels,); 1 with a noise record.
 
-    Without a record the variance is estimated from the second differences of the residuals. Those
-    of white noise have six times its variance, while a slow process contributes hardly anything.
+    Without a record the variance is estimated from the second differences of the residuals. The
+    second differences of white noise have six times the variance of the noise, while a slow process
+    contributes hardly anything.
     """
     levels = np.ones(len(problem.channel_names))
     for channel in np.flatnonzero(problem.record_freedom == 0.0):

@@ -105,13 +105,13 @@ def run_campaign(
 
 
 def _check_scenario(folder: Path, scenario: JsonObject) -> None:
-    """Refuse the run of another asset than the wing, or one with a steady force at the tip."""
+    """Refuse a run whose asset is not the wing, or that has a steady force at the tip."""
     states = {state["name"] for state in scenario["state"]}
     is_of_wing = scenario["observation"].get("role") == STRAIN
     if not is_of_wing or states != {*records.USUAL_REGIONS}:
         raise CampaignFileError(
-            f"{folder} is the run of another asset than the wing: strains under the damage states "
-            "z1 and z2 are needed."
+            f"{folder} is not a run of the wing: strains under the damage states z1 and z2 are "
+            "needed."
         )
     force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
     if force:
@@ -345,7 +345,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
 
 def _read_config(folder: Path) -> JsonObject:
     """Return the content of `config.json`, which has a scenario."""
-    with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is no run folder. "):
+    with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is not a run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
         raise CampaignFileError(
@@ -372,10 +372,12 @@ def _read_run(folder: Path) -> xr.DataTree:
     missing_groups = {"observed", "smoothed", "calibration"} - {*run.children}
     if missing_groups:
         groups = ", ".join(sorted(missing_groups))
-        raise CampaignFileError(f"{path} lacks the groups {groups}: it is no run of a twin.")
+        raise CampaignFileError(f"{path} lacks the groups {groups}: it is not a run of a twin.")
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:
-            raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
+            raise CampaignFileError(
+                f"{path} lacks the observed {name!r}: it is not a run of a wing."
+            )
     return run
 
 

@@ -30,7 +30,7 @@ class ReleasedState(NamedTuple):
 def state_at_first_stamp(
     system: LinearSystem, excitation: Excitation, laws: PortLaws
 ) -> InitialMotion:
-    """Return the state at the first stamp of a record that is no ring-down.
+    """Return the state at the first stamp of a record that is not a ring-down.
 
     Parameters
     ----------

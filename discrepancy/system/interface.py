@@ -11,11 +11,19 @@ import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    ModelPatch,
+    PortForce,
+    Primitive,
+    RegionStiffnessLoss,
+)
 from fe.runtime.state import Losses
 from reporting.memory import ResultCache
 from reporting.words import brief, capital, comma_list, counted
@@ -46,7 +54,9 @@ class Model(ABC):
     patch : ModelPatch
         The primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
-        The names of the damage regions.
+        Damage regions.
+    largest_losses : mapping of str to float
+        Largest stiffness loss of each damage region that the model can have.
     kinds : frozenset of TrialKind
         The kinds of trials that it can simulate.
     load_places : tuple of str, optional
@@ -71,6 +81,7 @@ class Model(ABC):
     stations: tuple[float, float] | None = None
     patch: ModelPatch = NO_PATCH
     regions: tuple[str, ...] = ()
+    largest_losses: Mapping[str, float] = MappingProxyType({})
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
@@ -96,8 +107,10 @@ class Model(ABC):
 
     @property
     def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs as they are listed in a sentence."""
-        return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
+        """The outputs with quantity and SI unit, as they are listed in a sentence."""
+        return tuple(
+            f"{name} ({quantity_with_unit(quantity)})" for name, quantity in self.quantities.items()
+        )
 
     # ------------------------------------------------------------ what each kind of model defines
 
@@ -189,7 +202,7 @@ class Model(ABC):
         if trial.kind is TrialKind.RINGDOWN and TrialKind.RINGDOWN not in self.kinds:
             raise ModelError(
                 f"The trial {trial.name!r} is a ring-down, which {self.quoted_name} cannot begin, "
-                'since it is free, driven or has states; say kind = "driven" and begins = '
+                'since it is free, driven or has states; set kind = "driven" and begins = '
                 '"unknown".'
             )
         is_driven = trial.kind is TrialKind.DRIVEN
@@ -234,15 +247,19 @@ class Model(ABC):
                 f"{primitive.kind!r}{reason}."
             )
 
-    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
-        """Return the losses of the model's regions in each row.
+    def region_losses(
+        self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
+    ) -> list[Losses]:
+        """Return the stiffness losses of the model's regions in each row.
 
         Parameters
         ----------
         trial : Trial
             The trial, which names the regions of its losses.
         health : (N, K) array
-            The stiffness losses of these K regions at N samples.
+            Losses of these regions that the campaign states.
+        patch : ModelPatch
+            A patch, whose `RegionStiffnessLoss` act on the stiffness that the stated losses leave.
 
         Raises
         ------
@@ -258,13 +275,23 @@ class Model(ABC):
                     f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
                     f"{self.quoted_name} has {comma_list(self.regions)}."
                 )
+        for primitive in patch:
+            if not isinstance(primitive, RegionStiffnessLoss):
+                continue
+            if primitive.region not in self.regions:
+                raise ModelError(
+                    f"The patch takes stiffness from the damage region {primitive.region!r}, but "
+                    f"{self.quoted_name} has {comma_list(self.regions)}."
+                )
+            column = self.regions.index(primitive.region)
+            losses[:, column] = 1.0 - (1.0 - losses[:, column]) * (1.0 - primitive.loss)
         return [tuple(row) for row in losses.tolist()]
 
     # ------------------------------------------------------------ parameters
 
     @property
     def unpatched_parameters(self) -> tuple[ParameterPrior, ...]:
-        """Calibrated parameters as they are without what is added."""
+        """Calibrated parameters of the model without the patch."""
         if self._unpatched_parameters is None:
             return self.parameters
         return self._unpatched_parameters
@@ -298,7 +325,7 @@ class Model(ABC):
     def built_in_sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
-        They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
+        They are not a part of the model's responses: `discrepancy.system.sensing.observe` applies
         them, since what sensors show of a response depends on all of them together.
         """
         return self.patch.of(*SENSORS)
@@ -344,7 +371,7 @@ class Model(ABC):
         if conditions.parameters.shape != (count,):
             raise ModelError(
                 f"{capital(self.quoted_name)} has {counted(count, 'parameter')}, but "
-                f"{conditions.parameters.size} came."
+                f"{conditions.parameters.size} were given."
             )
         whole_patch = (self.patch + patch).in_trial(trial.name)
         self.check_trial(trial)
@@ -398,7 +425,7 @@ class Model(ABC):
             The change of the model. Its errors of sensors name channels of a campaign or outputs of
             the model, and come before the errors of sensors in the patch of a response.
         calibrated : mapping of str to (float, float)
-            The means and standard deviations of those parameters that differ from the model's.
+            Means and standard deviations of the parameters that differ from those of the model.
         """
         parameters = []
         for parameter in self.parameters:

@@ -403,8 +403,9 @@ class LinearSystem:
         if unbalanced > 1e-6 * np.max(np.abs(modal_loads), initial=1e-300):
             largest_coefficient = np.max(np.abs(restoring), initial=0.0)
             raise ModelError(
-                "the rig has no rest under what acts at the first sample (nothing holds it): "
-                'say `begins` = "still" or "unknown" '
+                "the rig has no equilibrium under the loads of the first sample (nothing holds "
+                "it): "
+                'set `begins` = "still" or "unknown" '
                 f"(its largest restoring coefficient is {largest_coefficient:.3g})"
             )
         return np.asarray(amplitudes.T @ self.shapes.T)

@@ -86,7 +86,7 @@ def choose_load_place(
         return places[0]
     if isinstance(place, str) and place in places:
         return place
-    problem = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+    problem = "no load_place is given" if place == DEFAULT_PLACE else f"the load place is {place!r}"
     forces = f"forces at {', '.join(places)}: name one of these" if places else "no force"
     raise ModelError(f"In {trial_text} {problem}, and {model_name} takes {forces}.")
 

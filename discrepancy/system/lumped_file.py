@@ -75,7 +75,7 @@ BLOCKS = {
     "flow_of_displacements": Block(0, rows_of_states=True, columns_of_states=False),
 }
 """Matrices in the equation of all unknowns."""
-LOOSE = "; a structure that can float away has no static response: say `free = true` if it can"
+LOOSE = "; a structure that can float away has no static response: set `free = true` if it can"
 
 
 def _is_definite(matrix: FloatArray) -> bool:
@@ -147,8 +147,8 @@ class LumpedDescription(ModelDescription):
             if not file.exists():
                 shipped = sorted(model.stem for model in SHIPPED_MODELS.glob("*.toml"))
                 raise ModelError(
-                    f"No lumped model is {str(path)!r}; shipped are {', '.join(shipped)}, or give "
-                    f"a file.{did_you_mean(str(path), shipped)}"
+                    f"There is no lumped model {str(path)!r}; give a file or one of the shipped "
+                    f"models {', '.join(shipped)}.{did_you_mean(str(path), shipped)}"
                 )
         return super().read(file)
 
@@ -259,8 +259,8 @@ class LumpedDescription(ModelDescription):
             count = len(self.damping.ratios)
             yield (
                 count != n,
-                f"damping.ratios needs one value for each mode, {n} in all, but "
-                f"{counted(count, 'value')} came",
+                f"damping.ratios needs one value for each mode, {n} in all, but has "
+                f"{counted(count, 'value')}",
             )
 
     def _missing_matrix_faults(self) -> Iterator[Fault]:
@@ -274,7 +274,7 @@ class LumpedDescription(ModelDescription):
         lacks_stiffness = displacement_count and not self.free and not self.matrices_of("stiffness")
         yield (
             lacks_stiffness,
-            "stiffness is missing: give it, or [[stiffness_part]], or say `free = true`",
+            "stiffness is missing: give it, or [[stiffness_part]], or set `free = true`",
         )
         lacks_conductance = state_count and not self.matrices_of("conductance")
         yield lacks_conductance, "conductance is missing: give it, or [[conductance_part]]"
@@ -393,7 +393,7 @@ class LumpedDescription(ModelDescription):
         return (
             not is_of_states or is_load or bool(section.quantity.motion_chain),
             f"the input {section.name!r} prescribes a state: give it a vector of states alone, a "
-            "quantity that is no motion, and neither `through` nor `station_derivative`",
+            "quantity that is not a motion, and neither `through` nor `station_derivative`",
         )
 
     def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:

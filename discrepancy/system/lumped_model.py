@@ -103,7 +103,9 @@ class LumpedModel(DescribedModel, SystemModel):
         }
         return carried.get(primitive, primitive in SENSORS)
 
-    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+    def region_losses(
+        self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
+    ) -> list[Losses]:
         """Return one row without losses: health has no meaning here."""
         return [()]
 

@@ -81,7 +81,7 @@ class Damping(Section):
     """Factor on the stiffness matrix [s]."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the fault that there is not exactly one kind of damping."""
+        """Yield a fault unless exactly one kind of damping is given."""
         has_coefficients = self.alpha is not None or self.beta is not None
         kinds = [self.ratios is not None, self.matrix is not None, has_coefficients]
         yield kinds.count(True) != 1, "give exactly one of ratios, matrix, or alpha and beta"
@@ -123,11 +123,11 @@ class InputSection(LoadSection):
     station_derivative: Vector | None = None
     """Change of the vector for each metre that the load moves along the structure [1/m]."""
     prescribes_state: bool = False
-    """Whether the input prescribes its value to a state (vector . x), and is no load."""
+    """Whether the input prescribes its value to a state (vector . x), and is not a load."""
 
     @property
     def is_prescribed(self) -> bool:
-        """Whether the input prescribes a motion or a state, and is no load."""
+        """Whether the input prescribes a motion or a state, and is not a load."""
         return self.prescribes_state or bool(self.quantity.motion_chain)
 
 
@@ -204,7 +204,8 @@ class LawSection(Section):
         kinds = [law.kind for law in LAWS]
         yield (
             self.kind not in kinds,
-            f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(kinds)}",
+            f"the law {self.name!r} has the kind {self.kind!r}, but the known ones are "
+            f"{', '.join(kinds)}",
         )
         try:
             self.scaled_force(1.0).check()

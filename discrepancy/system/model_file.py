@@ -71,7 +71,7 @@ class ModelDescription(Section):
         Raises
         ------
         ModelError
-            One sentence that names `source`, the place, what came and what was expected.
+            One sentence that names `source`, the place, what was given and what was expected.
         """
         return validate(cls, content, source, ModelError, what=cls.what)
 
@@ -85,7 +85,7 @@ class ModelDescription(Section):
     def repeated_name_faults(kind: str, names: list[str]) -> Iterator[Fault]:
         """Yield a fault for each name that occurs twice."""
         for name in names:
-            yield names.count(name) > 1, f"there are two of {kind} {name!r}"
+            yield names.count(name) > 1, f"there is more than one {kind} named {name!r}"
 
 
 class DescribedModel(Model):

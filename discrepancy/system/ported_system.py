@@ -84,7 +84,7 @@ def ported_system(
 def _direct_forces(
     system: LinearSystem, equations: Sequence[OutputEquation], directions: FloatArray
 ) -> FloatArray:
-    """Return what a unit force at each port adds to each output at once, as (P, C).
+    """Return the immediate change (P, C) of each output by a unit force at each port.
 
     A force adds to the output that is the reaction of a drive, and to outputs of modes without
     inertia, which deform at once.

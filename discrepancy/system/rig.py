@@ -103,7 +103,7 @@ class ControlLoop:
             if history.hold is Hold.ZERO_ORDER:
                 raise ModelError(
                     f"The reference {section.reference!r} of the trial {trial.name!r} goes in "
-                    f"steps, which the controller {section.name!r} cannot differentiate: say "
+                    f"steps, which the controller {section.name!r} cannot differentiate: set "
                     "derivative_of = 'measurement' in the model, or hold = 'linear' in the "
                     "campaign."
                 )
@@ -181,7 +181,8 @@ def build_rig(
     remaining_stiffness = 1.0 - softening
     if remaining_stiffness < LEAST_STIFFNESS:
         raise ModelError(
-            f"The temperature leaves {remaining_stiffness:.2g} of the stiffness, which none has."
+            f"At this temperature the factor on the stiffness would be {remaining_stiffness:.2g}, "
+            "and it must be positive: check the temperature and the coefficient."
         )
     warm_factors = {**factors, "stiffness": factors.get("stiffness", 1.0) * remaining_stiffness}
     matrices = description.scaled_matrices(warm_factors)

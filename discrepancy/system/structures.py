@@ -14,6 +14,7 @@ from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
@@ -98,6 +99,7 @@ class StructureModel(SystemModel):
         self.model = model
         self.name = model.name
         self.regions = model.regions
+        self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
         # loads
         units = zip(model.controls, model.control_units, strict=True)
@@ -160,9 +162,9 @@ class StructureModel(SystemModel):
         for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port "
-                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
-                    "[[port]] out of the file."
+                    f"The port {port!r} of the structure {self.name} moves exactly as its port "
+                    f"{other_port!r} does, so that no reading can distinguish their forces: remove "
+                    "this [[port]] from the file."
                 )
 
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
@@ -196,10 +198,13 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, and errors of its forces.
+        It carries sensors, laws at its ports, losses of its damage regions, and errors of its
+        forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
+        if primitive is changes.RegionStiffnessLoss:
+            return bool(self.regions)
         if primitive is changes.LoadGain:
             return bool(self.forces)
         return primitive in SENSORS
@@ -346,6 +351,7 @@ class WingModel(SystemModel):
         validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
         self.parameters = wing_priors(validity, **prior)
         self.regions = arrays.regions
+        self.largest_losses = {region: validity[region][1] for region in arrays.regions}
         self.length = self.wing.span
         self.stations = (0.0, self.wing.span)
         self.port_rows = self.wing.port_rows
@@ -415,12 +421,15 @@ class WingModel(SystemModel):
 
     @property
     def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs as they are listed in a sentence."""
+        """The outputs with quantity and SI unit, as they are listed in a sentence."""
+        strain = quantity_with_unit(Quantity.STRAIN)
+        displacement = quantity_with_unit(Quantity.DISPLACEMENT)
         return (
-            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]",
-            "tip_displacement",
-            "load_point_displacement",
-            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction",
+            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}] ({strain})",
+            f"tip_displacement ({displacement})",
+            f"load_point_displacement ({displacement})",
+            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction "
+            f"({displacement})",
         )
 
     def supports(self, primitive: type[Primitive]) -> bool:

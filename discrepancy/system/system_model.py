@@ -179,7 +179,7 @@ class SystemModel(Model):
         temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
             parameters=tuple(conditions.parameters.tolist()),
-            losses=self.region_losses(trial, conditions.health)[0],
+            losses=self.region_losses(trial, conditions.health, patch)[0],
             structure=patch.of(*STRUCTURE),
             temperature_rise=temperature_rise,
         )
@@ -196,7 +196,7 @@ class SystemModel(Model):
             if len(case.patch.of(PortLoad)):
                 raise ModelError(
                     f"The trial {trial.name!r} is a ring-down, which no force with a course in "
-                    'time can act on; say kind = "driven" and begins = "unknown".'
+                    'time can act on; set kind = "driven" and begins = "unknown".'
                 )
             row = self.force_row(trial.load_place, case.state)
             return replace(
@@ -300,7 +300,7 @@ class SystemModel(Model):
             A slice of rows, and the state of the structure in all of them.
         """
         row_count = len(case.trial.force)
-        losses_of_rows = self.region_losses(case.trial, case.conditions.health)
+        losses_of_rows = self.region_losses(case.trial, case.conditions.health, case.patch)
         # a single entry holds for all rows
         if len(losses_of_rows) == 1:
             losses_of_rows = losses_of_rows * row_count

@@ -110,7 +110,7 @@ class FormulaHistory:
     formula : Expression
         The load as a function of `time` [s].
     spans : tuple of (float, float)
-        The begin and the end of each span [s]; without any the load acts always.
+        The beginning and the end of each span [s]; without any the load acts always.
     """
 
     formula: Expression

@@ -52,7 +52,7 @@ def identify(
 ) -> None:
     """Fit the free numbers of the wing design to outputs of the published model; takes minutes."""
     if out is not None and out.exists() and not out.is_dir():
-        raise FileNotWrittenError(f"{out} exists and is no folder: choose another --out.")
+        raise FileNotWrittenError(f"{out} exists and is not a folder: choose another --out.")
     result = run_identification(
         data,
         load_design(design),

@@ -180,7 +180,7 @@ def write_identification(result: Identification, out: Path) -> IdentificationFil
         If a file cannot be written.
     """
     if out.exists() and not out.is_dir():
-        raise FileNotWrittenError(f"{out} exists and is no folder: choose another --out.")
+        raise FileNotWrittenError(f"{out} exists and is not a folder: choose another --out.")
     files = result_files(out)
     texts = {
         files.design: design_toml(result.fit.design, identified_places(result)),

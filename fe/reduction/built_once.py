@@ -54,7 +54,7 @@ def built_once(
         try:
             return load()
         except ReducedModelFileError as error:
-            _logger.warning("What is kept is not usable and is built anew: %s", error)
+            _logger.warning("The stored result is not usable and is built again: %s", error)
     with _locked(path.with_suffix(".lock"), path):
         with suppress(OSError, ReducedModelFileError):
             return load()  # another process may have built it meanwhile
@@ -63,7 +63,7 @@ def built_once(
             keep(result)
         except FileNotWrittenError as error:
             _logger.warning(
-                "What was built could not be kept in %s and will be built again: %s",
+                "The result could not be stored in %s and will be built again: %s",
                 path.parent,
                 error,
             )

@@ -137,7 +137,7 @@ def _project_duals(
 def _project_batch(
     terms: ReductionTerms, outputs: FloatArray, displacements: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return what `_project_duals` does, for b outputs at once.
+    """Return the projections of `_project_duals` for b outputs at once.
 
     Parameters
     ----------

@@ -88,8 +88,8 @@ def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalRed
     mode_count = count + EXTRA_MODES
     if structure.unknowns <= 2 * mode_count:
         raise ReductionError(
-            f"{count} modes cannot be had from {structure.unknowns} unknowns; ask for fewer or "
-            "refine."
+            f"{count} modes cannot be computed from {structure.unknowns} unknowns; ask for fewer "
+            "modes or refine the mesh."
         )
     working = _start_basis(terms, mode_count)
     try:

@@ -103,7 +103,7 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
         If the full model cannot be solved.
     """
     progress = reporter(progress)
-    with progress.stage("Solving the wing for changes"):
+    with progress.stage("Computing solutions of the wing with changes"):
         full = assemble_patch_operators(operators)
         basis = _working_basis(full)
     with progress.stage("Reducing the patched wing"):

@@ -125,7 +125,7 @@ def _check_reducible(terms: ReductionTerms) -> None:
 
 
 def _design_fields(terms: ReductionTerms) -> DesignFields:
-    """Return the fields of the reduced model that no basis changes."""
+    """Return the fields of the reduced model that do not depend on the reduced basis."""
     structure = terms.structure
     design = structure.design
     chosen = (

@@ -223,7 +223,7 @@ class ReductionTerms:
         return np.asarray(parameter[parameter_numbers] * remaining_stiffness[region_numbers])
 
     def losses_at(self, *fractions: float) -> FloatArray:
-        """Return losses (B, K), all of them at each of B fractions of their ranges."""
+        """Return losses (B, K): in a row, all regions are at one fraction of their ranges."""
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:

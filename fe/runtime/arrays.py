@@ -112,12 +112,12 @@ def arrays_from_bytes(
     except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception
         reason = " ".join(str(cause).split()) or type(cause).__name__
         raise ReducedModelFileError(
-            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it "
-            "anew."
+            f"{where} is not a valid archive of plain arrays ({reason}); delete it and build it "
+            "again."
         ) from cause
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
+        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it again.")
     return arrays
 
 
@@ -227,7 +227,7 @@ class StoredArrays:
     def _error(self, fault: str) -> ReducedModelFileError:
         """Return the error of an inconsistent record; `fault` is the rest of its sentence."""
         name = f"{self.record_name[0].upper()}{self.record_name[1:]}"
-        return ReducedModelFileError(f"{name} {fault}; build it anew.")
+        return ReducedModelFileError(f"{name} {fault}; build it again.")
 
     def losses(self, stiffness_loss: LossValues) -> Losses:
         """Return one stiffness loss for each region; see `fe.runtime.state.losses_of`."""
@@ -268,19 +268,19 @@ class StoredArrays:
         arrays = arrays_from_bytes(content, where, ["format"])
         if arrays["format"].tolist() != cls.version:
             raise ReducedModelFileError(
-                f"{where} has the format {arrays['format']}, but this version reads "
-                f"{cls.version}; build it anew."
+                f"{where} has the format {arrays['format']}, but this version reads {cls.version}; "
+                "build it again."
             )
         try:
             values = {field.name: _value_from_array(field, arrays) for field in fields(cls)}
             return cls(**values)
         except KeyError as missing:
             raise ReducedModelFileError(
-                f"{where} lacks {missing.args[0]}; build it anew."
+                f"{where} lacks {missing.args[0]}; build it again."
             ) from missing
         except (TypeError, ValueError, IndexError) as cause:
             raise ReducedModelFileError(
-                f"{where} does not hold the arrays of {cls.record_name} ({cause}); build it anew."
+                f"{where} does not hold the arrays of {cls.record_name} ({cause}); build it again."
             ) from cause
 
     @classmethod

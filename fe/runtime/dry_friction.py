@@ -25,7 +25,7 @@ def hold_stuck_ports(
     state: ModalState,
     h: float,
 ) -> None:
-    """Keep the ports that friction holds in their positions, by impulses at the begin of step `k`.
+    """Hold the ports that stick by friction, by impulses at the beginning of step `k`.
 
     A port that needs a larger impulse than friction can give breaks loose.
     """

@@ -133,7 +133,8 @@ class Expression:
         """Raise `InvalidPatchError` for a name that the expression may not use."""
         if name not in self.names:
             raise self._error(
-                f" uses the unknown name {name!r}; known are {', '.join(sorted(self.names))}"
+                f" uses the unknown name {name!r}; the known names are "
+                f"{', '.join(sorted(self.names))}"
             )
 
     def _check_call(self, function: str, arguments: list[ast.expr]) -> None:

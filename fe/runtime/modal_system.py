@@ -274,7 +274,7 @@ class ExactSteps(NamedTuple):
     transition : (S, 2M, 2M) array
         Transition matrix from the old to the new state.
     begin, end : (S, 2M, M) array
-        Change of the new state by unit forces at the begin, and at the end, of a step.
+        Change of the new state by unit forces at the beginning, and at the end, of a step.
     """
 
     transition: FloatArray

@@ -17,7 +17,7 @@ cannot move."""
 
 
 class StepArrays(NamedTuple):
-    """K time steps of M modes with J laws; boundary k is the begin of step k.
+    """K time steps of M modes with J laws; boundary k is the beginning of step k.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class StepArrays(NamedTuple):
     increment : (K, 2M) array
         Change of the state (q, v) by the applied forces in each step.
     begin_force, end_force : (K, M) array
-        Applied modal forces at the begin and at the end of each step.
+        Applied modal forces at the beginning and at the end of each step.
     residual_position : (K + 1, J) array
         Displacements of the laws' ports under the loads in the modes that are left out, at each
         boundary.
@@ -112,18 +112,18 @@ class ModalState(NamedTuple):
 
 
 class StepWorkspace(NamedTuple):
-    """Values at the begin of a step that are needed at its end, and a buffer for the new state.
+    """Values at the beginning of a step that are needed at its end, and a buffer for the new state.
 
     Attributes
     ----------
     q, v : (M,) array
-        Modal coordinates and speeds at the begin.
+        Modal coordinates and speeds at the beginning.
     new_state : (2M,) array
         Buffer for (q, v).
     forces : (J,) array
-        Forces of the laws at the begin.
+        Forces of the laws at the beginning.
     speed : (J,) array
-        Speed of the port of each law of speed at the begin.
+        Speed of the port of each law of speed at the beginning.
     speed_lost : (J,) array
         Decrease of that speed by the first half of the law's impulse.
     broke_loose : (J,) array

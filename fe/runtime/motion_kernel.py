@@ -86,7 +86,7 @@ def integrate(
         by_mode[0], by_mode[1], by_mode[2:].ravel(), by_law[0], by_law[1], by_law[2], by_law[3]
     )
     start_laws(ports, state, memory_is_known)
-    # at the begin, a step without duration: lagged forces stay, or follow at once
+    # at the beginning, a step without duration: lagged forces stay, or follow at once
     h = 0.0
     lag = 1.0 if memory_is_known and ports.relaxation > 0.0 else 0.0
     fade = 1.0
@@ -108,7 +108,10 @@ def integrate(
 
 
 def start_laws(ports: PortArrays, state: ModalState, memory_is_known: bool) -> None:
-    """Set the forces of the laws at the begin; without a known memory, speeds have been steady."""
+    """Set the forces of the laws at the beginning of the motion.
+
+    If their memory is not known, the speeds are assumed to have been steady before.
+    """
     for j in range(len(ports.law_number)):
         x = port_value(ports.motion_rows, j, state.q)
         v = port_value(ports.motion_rows, j, state.v)
@@ -144,7 +147,7 @@ def first_half_impulse(
     half = 0.5 * h
     mode_count = len(state.q)
     law_count = len(ports.law_number)
-    # the begin, for reversals of friction
+    # the beginning, for reversals of friction
     for m in range(mode_count):
         workspace.q[m] = state.q[m]
         workspace.v[m] = state.v[m]

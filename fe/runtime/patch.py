@@ -75,6 +75,13 @@ class ModulusTemperature(Primitive):
     coefficient: Annotated[float, "1/K"]
 
 
+class RegionStiffnessLoss(Primitive):
+    """A damage region loses `loss` of the stiffness that it has in a trial."""
+
+    region: str
+    loss: Annotated[float, "1"]
+
+
 class StiffnessDrift(Primitive):
     """The whole stiffness drifts within a record: K (1 + `rate` t), t since its start."""
 
@@ -160,6 +167,7 @@ SENSORS = (
 """Primitives that change readings of sensors, but not the motion of the structure."""
 _PRIMITIVE_TYPES: tuple[type[Primitive], ...] = (
     *STRUCTURE,
+    RegionStiffnessLoss,
     StiffnessDrift,
     *LAWS,
     *LOADS,
@@ -278,7 +286,7 @@ def _primitive_from_row(row: object, where: str) -> Primitive:
     kind = row.get("kind") if isinstance(row, Mapping) else row
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(
-            f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}."
+            f"{where} has the kind {kind!r}, but the known ones are {', '.join(PRIMITIVES)}."
         )
     primitive_type = PRIMITIVES[kind]
     values = {name: value for name, value in row.items() if name not in ("kind", "windows")}

@@ -14,7 +14,15 @@ import numpy as np
 from .arrays import FloatArray
 from .dense_matrices import lowest_modes
 from .errors import InvalidPatchError
-from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from .patch import (
+    LOADS,
+    LoadGain,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    RegionStiffnessLoss,
+    RootCompliance,
+)
 from .port_laws import STATION_PORTS, port_laws
 from .skin_losses import remaining_skin
 from .state import Losses
@@ -155,21 +163,20 @@ class PatchedWing(WingRows):
         young_modulus_factor, stiffness_loss
             Modulus factor and losses, see `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            The patch whose root compliances, local losses and temperature coefficients act.
+            The patch whose root compliances, losses and temperature coefficients act.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
-            If a change leaves no stiffness.
+            If a change leaves no stiffness, or is of a damage region that the wing does not have.
         """
         factor = young_modulus_factor
         for primitive in patch:
             if isinstance(primitive, ModulusTemperature):
                 factor = factor * (1.0 - primitive.coefficient * temperature_difference)
-        healthy = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
-        theta = np.array([factor, *healthy, 1.0])
+        theta = np.array([factor, *self._remaining_in_regions(stiffness_loss, patch), 1.0])
         if not (isfinite(factor) and theta.min() > 0.0):
             raise InvalidPatchError(
                 "The factors on the stiffness of skin and damage regions must be positive, but are "
@@ -180,6 +187,34 @@ class PatchedWing(WingRows):
         self._add_root_compliance(stiffness, patch)
         self._add_local_losses(stiffness, patch, theta)
         return np.asarray(stiffness)
+
+    def _remaining_in_regions(self, stiffness_loss: Losses, patch: ModelPatch) -> list[float]:
+        """Return the fraction of its stiffness that each damage region keeps.
+
+        Parameters
+        ----------
+        stiffness_loss : tuple of float
+            Losses of the regions in the state of the wing.
+        patch : ModelPatch
+            The patch whose losses of regions act; all losses of a region multiply.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the wing does not have a region of the patch.
+        """
+        regions = self.arrays.regions
+        remaining = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
+        for primitive in patch:
+            if not isinstance(primitive, RegionStiffnessLoss):
+                continue
+            if primitive.region not in regions:
+                raise InvalidPatchError(
+                    f"The patch takes stiffness from the damage region {primitive.region!r}, but "
+                    f"the wing has {', '.join(regions)}."
+                )
+            remaining[regions.index(primitive.region)] *= 1.0 - primitive.loss
+        return remaining
 
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
         """Put the root compliances of a patch in series with the spring at the root, in place.
@@ -357,7 +392,7 @@ class PatchedStructure:
 
     @cached_property
     def modes(self) -> PatchedModes:
-        """The modes that move."""
+        """The modes of the motion."""
         return self.lowest_modes(MODE_COUNT, self._static_shape_rows)
 
     @property

@@ -65,7 +65,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
 # ---------------------------------------------------------------- laws of a patch
 
 Span = tuple[float, float]
-"""Begin and end of a time interval [s]."""
+"""Beginning and end of a time interval [s]."""
 
 
 @dataclass(frozen=True)
@@ -252,8 +252,7 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
         law.check()
         if law.windows and not in_windows:
             raise InvalidPatchError(
-                f"The primitive {law.kind!r} acts in a window, which lumped models alone can "
-                "follow."
+                f"The primitive {law.kind!r} acts in a window, which only lumped models can follow."
             )
         forces.append(law)
     drifts = [primitive for primitive in patch if isinstance(primitive, StiffnessDrift)]

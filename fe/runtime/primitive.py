@@ -19,7 +19,7 @@ from .expression import Expression
 class Window(NamedTuple):
     """A time interval in one trial, from `begin` to `end` in the trial's time [s].
 
-    Without a begin it starts at the first sample; without an end it lasts to the last sample.
+    Without a beginning it starts at the first sample; without an end it lasts to the last sample.
     """
 
     trial: str
@@ -28,7 +28,7 @@ class Window(NamedTuple):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Begin and end [s]; infinite if the window has none."""
+        """Beginning and end [s]; infinite if the window has none."""
         begin = -inf if self.begin is None else self.begin
         end = inf if self.end is None else self.end
         return begin, end

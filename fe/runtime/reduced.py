@@ -169,8 +169,8 @@ class ReducedModel(ReducedArrays):
         """Return the number of an input; raise `OutsideModelError` for an unknown name."""
         if name not in self.input_names:
             raise OutsideModelError(
-                f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
-                f"{', '.join(self.input_names)}."
+                f"The structure {self.name} has no parameter, region, mass or control named "
+                f"{name!r}; it has {', '.join(self.input_names)}."
             )
         return self.input_names.index(name)
 

@@ -165,7 +165,7 @@ class ReducedArrays(StoredArrays):
         `counts` are the numbers of names of each kind.
         """
         if factors.min(initial=0) < 0 or np.any(factors > counts):
-            raise self._error(f"names by its array {name} what is not there")
+            raise self._error(f"has an array {name} that names something that does not exist")
 
     @cached_property
     def input_names(self) -> tuple[str, ...]:

@@ -48,7 +48,7 @@ class SensorRecord:
     release : float
         Amplitude of a ring-down [m, or the unit of the signal].
     settled : bool
-        Whether the structure was at rest at the begin, not in an unknown motion.
+        Whether the structure was at rest at the beginning, not in an unknown motion.
     """
 
     channels: Sequence[tuple[str, str]]
@@ -88,7 +88,7 @@ class Sensor(Primitive):
     """Whether the primitive is for strain gauges alone."""
 
     def error(self, record: SensorRecord) -> SensorError:
-        """Return what the sensor adds at each sample of a record."""
+        """Return the error that the sensor adds to each sample of a record."""
         return NO_ERROR
 
     def readings(
@@ -247,7 +247,7 @@ class HighPass(Sensor):
 
 
 class SensorLag(Sensor):
-    """A channel shows now what it should have shown `lag` [s] earlier: a late filter or logger.
+    """A channel shows each value `lag` [s] too late, because of a filter or a logger.
 
     A negative lag means that the recorded force is late. A ring-down has no recorded force that a
     reading could lag behind, so a lag changes only forced and driven trials.
@@ -263,8 +263,8 @@ class SensorLag(Sensor):
         """Return the readings (N, C) delayed by `lag`, and their rates; see `Sensor.readings`.
 
         Outside of the record, the readings are extrapolated linearly. Before the first sample the
-        rate is zero if the structure was at rest at the begin (`record.settled`), else the rate at
-        the first sample; after the last sample it is the rate at the last one.
+        rate is zero if the structure was at rest at the beginning (`record.settled`), else the rate
+        at the first sample; after the last sample it is the rate at the last one.
         """
         # only forced and driven trials have a recorded input that a reading can lag behind; a
         # single sample has no interval to interpolate in
@@ -352,8 +352,8 @@ class LoggerClock(Sensor):
 class Line(Sensor):
     """A spectral line is added: cosine cos(2 pi f t) + sine sin(2 pi f t), f the `frequency` [Hz].
 
-    t is the time since the trial's start; amplitudes are in the channel's unit. The line is in the
-    noise record too.
+    t is the time since the trial's start; amplitudes are in the channel's unit. The line also
+    appears in the noise record.
     """
 
     can_act_in_windows: ClassVar[bool] = True

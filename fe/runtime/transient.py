@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 INSTANT = 1e-6
-"""Duration of a step from which only the state at its begin is used [s]."""
+"""Duration of a step from which only the state at its beginning is used [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,7 +273,7 @@ class ModalIntegrator:
         Parameters
         ----------
         state : TransientState
-            The state at the begin.
+            The state at the beginning.
         duration : float
             Duration of the step [s], positive.
         load : (L,) array_like
@@ -324,16 +324,16 @@ class ModalIntegrator:
     def _motion_with_laws(
         self, state: TransientState, loads: FloatArray, duration: float, time: float
     ) -> "ModalMotion":
-        """Return the motion of the modes with laws, at the begin and the end of a time step.
+        """Return the motion of the modes with laws, at the beginning and the end of a time step.
 
         Parameters
         ----------
         state : TransientState
-            The state at the begin.
+            The state at the beginning.
         loads : (L,) array
             Coefficients of the loads, which are held.
         duration, time : float
-            Duration of the step, and its begin since the start [s].
+            Duration of the step, and its beginning after the start [s].
         """
         from .motion import InitialMotion, integrate_motion
         from .time_steps import loaded_steps, step_boundaries

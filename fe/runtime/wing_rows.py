@@ -38,7 +38,7 @@ _STRAIN_COMPONENTS = (None, ".transverse", ".shear")
 
 
 def strain_gauge(output: str) -> int:
-    """Return the number of an output's gauge, counted from 0, or -1 if the output is no strain.
+    """Return the number of an output's gauge, counted from 0, or -1 if the output is not a strain.
 
     In the names strain[k], strain[k].transverse and strain[k].shear k counts from 1.
     """

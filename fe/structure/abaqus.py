@@ -176,13 +176,13 @@ def _coordinate_system(block: _Block) -> CoordinateSystem:
     """
     numbers: list[float] = []
     for where, values in block.data:
-        # empty values at the end of a line are no numbers
+        # empty values at the end of a line are not numbers
         for text in ",".join(values).rstrip(",").split(","):
             numbers.append(real(where, text))
     if len(numbers) not in (0, 3, 6, 9):
         fail(
             block.where,
-            f"*SYSTEM needs one, two or three points, but {len(numbers)} numbers came.",
+            f"*SYSTEM needs one, two or three points, but {len(numbers)} numbers were given.",
         )
     points = np.zeros((3, 3))
     points.flat[: len(numbers)] = numbers
@@ -304,6 +304,6 @@ def _add_members(deck: Deck, block: _Block) -> None:
         if len(texts) not in (2, 3) or first < 1 or step < 1:
             fail(
                 where,
-                f"first, last and step are expected, but {short_repr(','.join(texts))} came.",
+                f"first, last and step are expected, but {short_repr(','.join(texts))} was given.",
             )
         members.extend(deck.counted(where, range(first, last + 1, step)))

@@ -304,8 +304,8 @@ class Deck:
         line_of_last_type = [str(self.path), *self._first_of_solid_type.values()][-1]
         fail(
             line_of_last_type,
-            f"a whole mesh of one kind of elements is expected ({known_names}), but {found} came; "
-            "mesh it with tetrahedra alone.",
+            f"a whole mesh of one kind of elements is expected ({known_names}), but the mesh has "
+            f"{found}; mesh it with tetrahedra alone.",
         )
 
     def _node_indices(self, numbers: Iterable[int], owner: str) -> list[int]:
@@ -369,7 +369,7 @@ class Deck:
                 fail(
                     row.where,
                     f"a face S1 to S{face_count} of {kind.name} is expected, but "
-                    f"{short_repr(row.face)} came.",
+                    f"{short_repr(row.face)} was given.",
                 )
             for number in set(self.members_or_number("ELSET", row.where, row.member)):
                 if number not in solids:

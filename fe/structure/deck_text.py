@@ -114,11 +114,11 @@ def lines_of(
 
 
 def whole(where: str, text: str) -> int:
-    """Return a text as a whole number; `where` says file and line of it."""
+    """Return a text as a whole number; `where` names its file and line, for messages."""
     try:
         number = int(text)
     except ValueError:
-        fail(where, f"a whole number is expected, but {short_repr(text)} came.")
+        fail(where, f"a whole number is expected, but {short_repr(text)} was given.")
     if abs(number) > _LARGEST_NUMBER:
         fail(where, f"the number {short_repr(text)} is too large.")
     return number
@@ -135,5 +135,5 @@ def real(where: str, text: str) -> float:
     except ValueError:
         number = nan
     if not isfinite(number):
-        fail(where, f"a real number is expected, but {short_repr(text)} came.")
+        fail(where, f"a real number is expected, but {short_repr(text)} was given.")
     return number

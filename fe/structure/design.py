@@ -92,7 +92,7 @@ class Gauged(tables.DesignSection):
 
     gauge: tuple[Gauge, ...] = ()
     rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
-    """Rosettes of gauges, which come behind the single ones."""
+    """Rosettes of gauges, which are numbered after the single gauges."""
 
     @model_validator(mode="after")
     def _add_gauges_of_rosettes(self) -> "Gauged":
@@ -336,7 +336,7 @@ def parse_structure(
     Raises
     ------
     InvalidDesignError
-        If the content is not a structure; one sentence names the place, what came and what was
+        If the content is not a structure; one sentence names the place, what was given and what was
         expected.
     """
     if "stiffness_matrix" in content:
@@ -354,7 +354,7 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     DesignFileError
         If the file cannot be read or is not TOML.
     InvalidDesignError
-        If its content is no structure.
+        If its content is not a structure.
     """
     file = Path(path)
     return parse_structure(

@@ -96,7 +96,7 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     point : (3,) array
         The point [m].
     where : str
-        Begins the sentence on a point that lies outside.
+        The beginning of the message on a point that lies outside.
 
     Returns
     -------

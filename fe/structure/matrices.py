@@ -278,7 +278,7 @@ def _check_structure(
     _check_rows(
         places,
         stiffness_diagonal < 0.0,
-        "a negative stiffness on its own: the matrix is no structure's at rest",
+        "a negative stiffness on its own: the matrix cannot belong to a structure at rest",
     )
     _check_rows(
         places,

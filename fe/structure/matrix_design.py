@@ -38,8 +38,8 @@ class MatrixSupport(tables.DesignSection):
 class StiffnessPart(tables.AlternativeKeys):
     """Share of the stiffness that a parameter scales, a region may lose, or both.
 
-    Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus
-    `times` what it is.
+    Either its own `matrix`, or that of the whole structure, `changed` by multiplying the part's
+    modulus by `times`.
     """
 
     matrix: FileName | None = None

@@ -87,9 +87,9 @@ class MatrixFiles:
         components = [str(other) for number, other in sorted(self.rows) if number == node]
         known = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
-            f"{where}: node {node} has no component {component} in the matrices, which know "
-            f"{known}; what is held or tied when they are written is not among them: name another "
-            "node."
+            f"{where}: node {node} has no component {component} in the matrices, which have "
+            f"{known}; components that were held or tied when the matrices were written are "
+            "missing: name another node."
         )
 
     def unit_vector_at(

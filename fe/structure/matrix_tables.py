@@ -60,7 +60,7 @@ def read_unknowns(path: Path) -> list[Place]:
         elif line.strip():
             fail(
                 f"{path}, line {number}",
-                f"a node and its component from 1 to 6 are expected, but {line!r} came.",
+                f"a node and its component from 1 to 6 are expected, but {line!r} was given.",
             )
     return unknowns
 
@@ -100,7 +100,7 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] 
         fail(
             str(path),
             "lines of row, column and value, or of node, component, node, component and value, "
-            f"are expected, but {len(table)} lines of {width} numbers came.",
+            f"are expected, but there are {len(table)} lines of {width} numbers.",
         )
     positions = table[:, :-1].astype(np.int64)
     unknowns = None
@@ -127,7 +127,7 @@ def _square_matrix(path: Path, matrix: FloatArray | sparse.sparray) -> sparse.cs
         fail(
             str(path),
             f"a square matrix of real numbers is expected, but {matrix.dtype} of shape "
-            f"{matrix.shape} came.",
+            f"{matrix.shape} was given.",
         )
     return sparse.csr_array(matrix, dtype=np.float64)
 
@@ -193,7 +193,7 @@ def read_vector(
         fail(
             str(folder / file),
             f"a vector of {size} numbers, or lines of node, component and value, are expected, but "
-            f"an array of shape {values.shape} came.",
+            f"an array of shape {values.shape} was given.",
         )
     return values.ravel()
 

@@ -60,7 +60,7 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
             f"The mesh file {path} is {state}; `mesh` must name it as seen from the structure file."
         )
     if not path.stat().st_size:
-        raise MeshError(f"The mesh file {path} is empty; write it anew.")
+        raise MeshError(f"The mesh file {path} is empty; write it again.")
     read = _READERS.get(path.suffix.lower(), read_by_meshio)
     mesh = read(path).mesh(unit, unit_name)
     _check_edges(mesh)
@@ -82,8 +82,8 @@ def _check_edges(mesh: StructureMesh) -> None:
             node = mesh.node_numbers[mesh.cells[cell, corner_count + edge]]
             raise MeshError(
                 f"{mesh.source}: node {node} of element {mesh.cell(cell)} lies far from the middle "
-                "of its edge; the nodes of the element stand in another order, or the edge is "
-                "bent too much."
+                "of its edge; the nodes of the element are in another order, or the edge is bent "
+                "too much."
             )
 
 

@@ -277,7 +277,7 @@ def _check_element_lines(path: Path) -> None:
             f"{path}, line {start + 1}",
             f"$Elements declares {declared} lines of blocks and elements, but {len(rows)} follow, "
             "and the last would be lost. Delete the line that is there twice, or write the mesh "
-            "anew.",
+            "again.",
         )
 
 
@@ -301,11 +301,11 @@ def _mesh_of_meshio(path: Path) -> Mesh:
         if "gmsh:physical" in reason:
             fail(
                 str(path),
-                "some elements are in a physical group and others in none, as Gmsh saves them "
-                "with Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh anew.",
+                "some elements are in a physical group and others in none, as Gmsh saves them with "
+                "Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh again.",
             )
     reason = " ".join(reason[:_LONGEST_REASON].split()).rstrip(".")
     raise MeshError(
         f"The mesh file {path} cannot be read as {path.suffix}: {reason}; it is damaged, cut off, "
-        "or of another dialect. Write it anew, or as .msh, .inp, .med or .bdf."
+        "or of another dialect. Write it again, or as .msh, .inp, .med or .bdf."
     )

@@ -201,7 +201,7 @@ def _solid_element(card: _Card) -> tuple[str, list[int]]:
         counts = " or ".join(str(count) for count in kinds)
         fail(
             card.where,
-            f"{card.word} {card.whole(0)} must have {counts} nodes, but {len(nodes)} came.",
+            f"{card.word} {card.whole(0)} must have {counts} nodes, but {len(nodes)} were given.",
         )
     meshio_name = kinds[len(nodes)].file_type
     order = _ORDER_FOR_MESHIO.get(meshio_name, range(len(nodes)))
@@ -299,7 +299,7 @@ def _refuse_continuation(line: _Line) -> NoReturn:
     """Refuse a continuation that belongs to no line."""
     fail(
         line.where,
-        f"the continuation {short_repr(line.head)} stands behind no line that it continues.",
+        f"the continuation {short_repr(line.head)} follows no line that it could continue.",
     )
 
 
@@ -323,6 +323,9 @@ def _fields(where: str, text: str) -> list[str]:
     count = 4 if "*" in values[0] else 8
     marker = values.pop() if _MARKER.match(values[-1]) else ""
     if len(values) > count + 2:
-        fail(where, f"a line of at most {count + 2} fields is expected, but {len(values)} came.")
+        fail(
+            where,
+            f"a line of at most {count + 2} fields is expected, but {len(values)} were given.",
+        )
     values += [""] * (count + 2 - len(values))
     return [*values[:-1], marker or values[-1]]

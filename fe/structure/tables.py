@@ -302,7 +302,8 @@ class StructureDesign(DesignSection):
         named_table : str
             The table whose rows have these names.
         tied, untied : str
-            What messages say of a row that is tied to a name, and of a name to which none is.
+            The words of a message on a row that is tied to a name, and on a name without such a
+            row.
         """
         known_names = [row.name for row in getattr(self, named_table)]
         place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}

@@ -98,7 +98,7 @@ def _prints_strains(deck: CalculixDeck) -> bool:
 
 
 def _static_results(deck: CalculixDeck, folder: Path) -> list[_PrintedResults]:
-    """Return what CalculiX prints for each load; raises `CalculixError` if it fails."""
+    """Return the results that CalculiX prints for each load; raises `CalculixError` if it fails."""
     if not deck.loads:
         return []
     prints = ["*NODE PRINT, NSET=NALL", "U"]

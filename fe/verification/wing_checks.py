@@ -55,8 +55,8 @@ class RootMotions(NamedTuple):
 def _root_motions(operators: AffineOperators) -> RootMotions:
     """Return the rigid motions that the root allows: heave, flap and yaw.
 
-    The last three of the free unknowns are those of the root itself: each motion has a one
-    there, and its nodal displacements before.
+    In a vector of the free unknowns, the displacements of the nodes come first. The last three
+    entries are heave, flap and yaw of the root: each motion has a one in its own entry.
     """
     motions = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)
     nodal = motions[operators.body.supports.free_displacements]

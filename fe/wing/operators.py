@@ -8,6 +8,8 @@ flap [rad] and yaw [rad]. Gauge strains are weights of nodal displacements, Kapt
 (15). Statics and modes of the full wing follow eqs. (13), (15) and (16).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path

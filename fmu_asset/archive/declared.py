@@ -354,7 +354,7 @@ class FmuDescription(FmuIdentity):
         """
         if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
             raise BindingError(
-                f"The step size must be a positive number of seconds, and {step_size:g} came."
+                f"The step size must be a positive number of seconds, but {step_size:g} was given."
             )
         return step_size or self.fixed_step or self.step_size
 

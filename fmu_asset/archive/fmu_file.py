@@ -137,8 +137,8 @@ def inspect_fmu(
         ) from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
         raise FmuFileError(
-            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
-            "function; the FMU is damaged or unsafe."
+            f"The model identifier of {file}, {description.model_identifier!r}, is not a name of a "
+            "C function; the FMU is damaged or unsafe."
         )
     # the binary for this platform; FMI 3 has other names of platforms than FMI 1 and 2
     platform_folder = platform_tuple if description.major_version == 3 else fmi_platform
@@ -303,7 +303,7 @@ def check_archive(
             _check_duplicate_entries(file, archive)
     except (*_ARCHIVE_ERRORS, EOFError, NotImplementedError, RuntimeError) as error:
         raise FmuFileError(
-            f"{file} is not a sound {archive_kind} archive ({error}); fetch or {remedy} it again."
+            f"{file} is not a valid {archive_kind} archive ({error}); fetch or {remedy} it again."
         ) from error
     return {entry.filename for entry in entries if not entry.is_dir()}
 

@@ -115,7 +115,7 @@ def _check_units(description: FmuDescription) -> list[CheckResult]:
             f"Nothing can be converted to {_listed(unknown)}: the FMU does not define it in SI."
         )
     if not sentences:
-        text = "All real variables have units, and these mean what is usual."
+        text = "All real variables have units, and these have their usual meaning."
         return [CheckResult("ok", text)]
     return [CheckResult("warning", sentence) for sentence in sentences]
 

@@ -8,6 +8,7 @@ from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, load_binding
 from fmu_asset.client.experiment import whole_binding
+from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import BindingError, FmuError, visible
 from reporting.progress import Progress, reporter
 
@@ -99,6 +100,9 @@ def check_fmu(
         if binding is not None:
             text = f"{binding.name} fits."
         findings.append(Finding("binding", "ok", text))
+        unset = "" if binding is None else unset_inputs_sentence(description, binding)
+        if unset:
+            findings.append(Finding("inputs", "warning", unset))
         findings += runs.findings(cycles, reporter(progress))
     # Names in an FMU may contain control characters, which a terminal would obey.
     printable = tuple(

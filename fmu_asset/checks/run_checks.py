@@ -37,7 +37,9 @@ _LARGEST_TRIED_LIMIT = 1e9
 """Magnitude of a range's limit from which it is taken as unlimited, and not tried."""
 _KIBIBYTE = 1024
 _SMALL_GROWTH = 1.0
-"""Largest growth of memory for each instance that is no leak [KiB]; allocators keep some memory."""
+"""Largest growth of memory for each instance that is not a leak [KiB]; allocators keep some
+memory.
+"""
 _LARGE_GROWTH = 16.0
 """Growth of memory for each instance above which the leak is a problem [KiB]."""
 _MEMORY_NOISE = 1024 * _KIBIBYTE
@@ -286,10 +288,13 @@ class RunChecks:
                             limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
                             failures.append(f"{limit}: {one_line(error)}")
         if failures:
-            text = f"{len(failures)} of {limit_count} ends of ranges fail, such as {failures[0]}"
+            text = (
+                f"{len(failures)} of {limit_count} limits of input ranges make it fail, such as "
+                f"{failures[0]}"
+            )
             return CheckResult("warning", text)
         if limit_count:
-            return CheckResult("ok", f"{limit_count} ends of ranges give finite outputs.")
+            return CheckResult("ok", f"{limit_count} limits of input ranges give finite outputs.")
         return CheckResult("skipped", "No input has a range.")
 
     def _step_with(self, asset: FmiAsset, role: str, name: str, value: float) -> None:
@@ -306,10 +311,14 @@ class RunChecks:
             trial = asset.reset_trial
         if not np.array_equal(outputs, outputs_again):
             difference = _first_difference(outputs, outputs_again)
-            return CheckResult("problem", f"Started again it is not as new ({difference}).")
+            return CheckResult(
+                "problem",
+                "After it was ended and started again, its outputs are not those of a new "
+                f"instance ({difference}).",
+            )
         if trial.works is False:
             return CheckResult("problem" if trial.lies else "warning", trial.fault)
-        return CheckResult("ok", "After a reset it is as new.")
+        return CheckResult("ok", "After a reset its outputs are those of a new instance.")
 
     def _check_instances(self, cycles: int, progress: Progress) -> CheckResult:
         """Make, step and free many instances in one process, and check the growth of its memory.

@@ -26,7 +26,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
@@ -51,7 +51,7 @@ StandardVersion = Literal["1.0", "2.0", "3.0"]
 """Version of FMI that a binding asks for."""
 
 StateChoice = Literal["auto", "serialised", "replay"]
-"""How `save_state` keeps the state; auto trusts what the FMU declares."""
+"""How `save_state` saves the state; `auto` relies on the declarations of the FMU."""
 
 Interpolation = Literal["zero-order", "linear"]
 """Course of inputs between communication points."""
@@ -77,28 +77,29 @@ class BindingHeader(Section):
     step_size : float
         Communication step of the FMU [s].
     decimation : int
-        Communication steps between two observations; the inputs are held meanwhile.
+        Number of communication steps from one observation to the next; the inputs are held in
+        between.
     start_time : float
         Start of the FMU [s].
     stop_time : float, optional
         End of the experiment that the FMU is told at its start [s]; some do not start without one.
         The asset itself does not stop there.
     fmi_version : {"1.0", "2.0", "3.0"}, optional
-        Version of FMI that the FMU must have; any if absent.
+        Version of FMI that the FMU must have; without this key any version is allowed.
     interface : {"co-simulation", "model-exchange"}, optional
         Interface by which it is run; co-simulation if it offers that.
     tolerance : float, optional
         Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
         that the FMU declares for its default experiment, and at most 1e-6 for ours [1].
     interpolation : {"zero-order", "linear"}
-        Course of inputs between communication points: held, or, where the FMU can follow and both
-        ends are continuous, in a straight line to the value given for a step, which they reach at
-        its end.
+        Course of inputs between communication points. They are held, or they move in a straight
+        line to the value of a step and reach it at the end of the step, if the FMU supports it and
+        both ends are continuous.
     structural_parameters : dict of str to float
         Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow
         [unit of the FMU].
     state : {"auto", "serialised", "replay"}
-        How `save_state` keeps the state; auto trusts what the FMU declares.
+        How `save_state` saves the state; `auto` relies on the declarations of the FMU.
     description : str
         A line for people.
     """
@@ -158,11 +159,23 @@ class Binding(Section):
     port: dict[str, PortBinding] = Field(default_factory=dict)
     record: RecordBinding = Field(default_factory=RecordBinding)
     limits: WorkerLimits = Field(default_factory=WorkerLimits)
+    _file: str = PrivateAttr(default="")
 
     @property
     def name(self) -> str:
         """Name of the binding."""
         return self.binding.name
+
+    @property
+    def title(self) -> str:
+        """Name of the binding, and the file that it was read from, for messages."""
+        return f"{self.name} ({self._file})" if self._file else self.name
+
+    def with_file(self, file: str) -> "Binding":
+        """Return the binding with the file that it was read from, which messages name."""
+        binding = self.model_copy()
+        binding._file = file
+        return binding
 
     @property
     def step_size(self) -> float:
@@ -219,7 +232,7 @@ class Binding(Section):
         Raises
         ------
         InvalidChoiceError
-            If a word is none of those that the table may hold.
+            If a word is not one of those that the table may have.
         """
         for name, allowed in _HEADER_WORDS.items():
             if name in changes:
@@ -289,10 +302,10 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
     ------
     BindingError
         If the file is missing, not TOML, has an unknown or missing key or a wrong type, or maps one
-        FMU variable to two inputs.
+        FMU variable to two inputs. The message states all such faults of the file.
     """
     content = read_toml(os.fspath(path), BindingError, what="binding file")
-    return parse_binding(content, where=str(path))
+    return parse_binding(content, where=str(path)).with_file(str(path))
 
 
 def parse_binding(content: Mapping[str, object], *, where: str = "the binding") -> Binding:
@@ -310,20 +323,23 @@ def parse_binding(content: Mapping[str, object], *, where: str = "the binding") 
     BindingError
         As `load_binding`.
     """
-    binding = validate(Binding, dict(content), where, BindingError, what="a binding")
+    binding = validate(
+        Binding, dict(content), where, BindingError, what="a binding", all_faults=True
+    )
+    faults = []
     if not binding.observation:
-        raise BindingError(
-            f"In {where}, there is no [observation.<name>] table; say what is measured."
-        )
+        faults.append("there is no [observation.<name>] table; say what is measured")
     user_of_variable: dict[str, str] = {}
     for role in (*INPUT_ROLES, "parameter"):
         table: Mapping[str, ScalarBinding] = getattr(binding, role)
         for key, scalar in table.items():
             label = f"{role}.{key}"
             if scalar.variable in user_of_variable:
-                raise BindingError(
-                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
-                    f"{user_of_variable[scalar.variable]} and {label}; keep one."
+                faults.append(
+                    f"the FMU variable {scalar.variable!r} is set by both "
+                    f"{user_of_variable[scalar.variable]} and {label}; keep one"
                 )
             user_of_variable[scalar.variable] = label
+    if faults:
+        raise BindingError(f"In {where}, {'; '.join(faults)}.")
     return binding

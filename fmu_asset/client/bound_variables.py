@@ -81,7 +81,7 @@ _Names = Annotated[
 
 
 class ScalarBinding(Section):
-    """One variable: its name in the FMU, and the unit in which the caller gives or takes it.
+    """One variable: its name in the FMU, and the unit in which the caller sets or reads it.
 
     The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of
     a whole array, which takes as many values.
@@ -90,7 +90,7 @@ class ScalarBinding(Section):
     variable: _Text
     """Name of the variable in the FMU."""
     unit: _Text
-    """Unit in which the caller gives or takes the value."""
+    """Unit in which the caller sets or reads the value."""
 
 
 class InputBinding(ScalarBinding):
@@ -130,13 +130,13 @@ class ParameterBinding(InputBinding):
 class VectorBinding(Section):
     """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
 
-    `unit` is one for all variables, or one for each.
+    `unit` is a single unit for all variables, or a list with one unit for each of them.
     """
 
     variables: Annotated[_Names, Field(min_length=1)]
     """Names of variables in the FMU, in order; `{a..b}` stands for all numbers from a to b."""
     unit: _Text | _Texts
-    """Unit of all variables, or a list with that of each."""
+    """Unit of all variables, or a list with the unit of each variable."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -168,8 +168,8 @@ class VectorBinding(Section):
         unit_count = len(self.units)
         yield (
             unit_count != count,
-            f"`unit` must be one text, or one for each of the {count} variables, and {unit_count} "
-            "came",
+            f"`unit` must be one text, or one for each of the {count} variables, but {unit_count} "
+            "were given",
         )
 
 
@@ -195,7 +195,7 @@ class PortBinding(Section):
         for name, vector in self.quantities.items():
             unit = vector.unit
             if isinstance(unit, tuple):
-                yield True, f"{name} must have one unit, and {len(unit)} came"
+                yield True, f"{name} must have one unit, but {len(unit)} were given"
                 continue
             units = PORT_QUANTITIES[name]
             # a unit that is not understood (None) is accepted

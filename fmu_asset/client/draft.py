@@ -15,7 +15,9 @@ from .bound_variables import PORT_QUANTITIES
 from .exchange import Exchange
 from .units import same_dimension
 
-_HEALTH = re.compile(r"health|damage|wear|foul|crack|degrad|fault|stiffness_?loss", re.IGNORECASE)
+_HEALTH = re.compile(
+    r"health|damage|wear|foul|clog|crack|corro|erosi|degrad|fault|stiffness_?loss", re.IGNORECASE
+)
 _LOAD = re.compile(
     r"load(?!_?factor)|force|torque|moment|press|ambient|outside|disturb|wind|gust|weight",
     re.IGNORECASE,
@@ -147,8 +149,12 @@ class _TableKeys:
         self._uses: Counter[tuple[str, str]] = Counter()
 
     def key(self, role: str, name: str) -> str:
-        """Return a key made from a name; a number is appended if that key is used already."""
-        plain_key = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
+        """Return a key made from a name; a number is appended if that key is used already.
+
+        A name that begins with its role, such as `health.z1`, gives the rest of it: `z1`.
+        """
+        words = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower()
+        plain_key = words.removeprefix(f"{role}_") or "x"
         key = plain_key
         while self._uses[role, key]:
             self._uses[role, plain_key] += 1

@@ -69,6 +69,30 @@ class Exchange:
         self.description = description
         self.binding = binding.with_arrays(elements)
         resolver = BindingResolver(description, self.binding)
+        try:
+            self._resolve(resolver, configuration)
+        except BindingError:
+            messages = resolver.misfits()
+            if len(messages) < 2:
+                raise
+            title = f"{len(messages)} entries of the binding {binding.title} do not fit the FMU:"
+            raise BindingError("\n".join([title, *messages])) from None
+
+    def _resolve(self, resolver: BindingResolver, configuration: list[InitialValue]) -> None:
+        """Lay out what is exchanged with the FMU.
+
+        Parameters
+        ----------
+        resolver : BindingResolver
+            The binding and the FMU.
+        configuration : list of InitialValue
+            The structural parameters, which are set first.
+
+        Raises
+        ------
+        BindingError
+            If an entry of the binding does not fit the FMU.
+        """
         ports = resolver.port_quantities()
         reply = ReplyBlock(resolver, ports)
         self.outputs = reply.table
@@ -157,6 +181,6 @@ def _check_version(description: FmuDescription, binding: Binding) -> None:
     version = binding.binding.fmi_version
     if version is not None and version[0] != description.fmi_version[0]:
         raise BindingError(
-            f"The binding {binding.name} is for FMI {version}, but {description.label} is of FMI "
+            f"The binding {binding.title} is for FMI {version}, but {description.label} is of FMI "
             f"{description.fmi_version}; correct `fmi_version`, or leave it out."
         )

@@ -73,7 +73,7 @@ def default_experiment(
         If the FMU has no number to observe, or no parameter or input of a name, or the step is not
         positive.
     FmuInputError
-        If the end does not come after the start, the steps are too many, or a text is no value.
+        If the end does not come after the start, the steps are too many, or a text is not a value.
     """
     start = description.start_time or 0.0
     end = description.stop_time if stop_time is None else stop_time
@@ -121,7 +121,7 @@ def _values_of_variables(
     BindingError
         If a variable cannot be set.
     FmuInputError
-        If a text is no value of its variable.
+        If a text is not a value of its variable.
     """
     plain_values: dict[str, PlainValue] = {}
     for name, value in values.items():
@@ -154,7 +154,7 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
     Raises
     ------
     FmuInputError
-        If the text is no such value.
+        If the text is not such a value.
     """
     if variable.is_text_parameter or text in variable.items:
         return text

@@ -74,8 +74,8 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
         if input_name is None:
             known = [name.full for name in dict.fromkeys(known_names.values())]
             raise FmuInputError(
-                f"The column {column!r} of {path} is no input of the binding {binding.name}; it "
-                f"has {comma_list(known)}."
+                f"The column {column!r} of {path} is not an input of the binding {binding.name}; "
+                f"it has {comma_list(known)}."
             )
         elements = columns_of_input.setdefault(input_name, {})
         mixes_forms = bool(elements) and (number == _WHOLE or _WHOLE in elements)

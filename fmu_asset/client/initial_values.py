@@ -79,7 +79,7 @@ class InitialValueTable:
         parameters: Mapping[str, npt.ArrayLike],
         health: Mapping[str, npt.ArrayLike] | None = None,
     ) -> InitialValues:
-        """Return what is set before the initialisation: values of the binding, then the caller's.
+        """Return the values to set before the initialisation: the binding's, then the caller's.
 
         Parameters
         ----------

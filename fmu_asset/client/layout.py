@@ -227,7 +227,7 @@ def start_values(
     Raises
     ------
     FmuFileError
-        If they are no numbers, or not as many as the array has elements.
+        If they are not numbers, or not as many as the array has elements.
     """
     text = "0" if placeholders else variable.start or "0"
     value_texts = text.lower().split() or ["0"]
@@ -238,7 +238,7 @@ def start_values(
         ]
     except ValueError as error:
         raise FmuFileError(
-            f"{variable.name!r} of {description.label} has a start value that is no number "
+            f"{variable.name!r} of {description.label} has a start value that is not a number "
             f"({error})."
         ) from error
     if len(values) == 1:
@@ -268,13 +268,13 @@ def with_structural_parameters(
     BindingError
         If the FMU has no such structural parameter, or is run by model exchange.
     FmuInputError
-        If a value is no whole number or out of range, or makes an array too large.
+        If a value is not a whole number or out of range, or makes an array too large.
     """
     settings = []
     lengths: dict[str | None, int] = {}
     for name, value in binding.binding.structural_parameters.items():
         label = f"structural_parameters.{name}"
-        location = f"{label} of the binding {binding.name}"
+        location = f"{label} of the binding {binding.title}"
         variable = find_variable(description, name, location, "structuralParameter").variable
         low, high = variable.bounds
         slot = InputSlot(label, (0,), low, high, IDENTITY, variable)

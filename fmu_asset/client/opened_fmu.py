@@ -418,7 +418,7 @@ class OpenedFmu:
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self._phase == "closed":
-            raise FmuStateError("The asset is closed; reset it to start anew.")
+            raise FmuStateError("The asset is closed; reset it to start again.")
 
     # ------------------------------------------------------------------ outputs and errors
 

@@ -88,7 +88,8 @@ class ReplyBlock:
         for request, selection in zip(requested, selections, strict=True):
             unit = request.unit or selection.variable.unit or "1"
             definitions = resolver.description.units_of(selection.variable)
-            to_fmu = conversion(unit, selection.variable, definitions, where=request.label)
+            place = resolver.place_in_binding(request.label)
+            to_fmu = conversion(unit, selection.variable, definitions, where=place)
             outputs.append(_ResolvedOutput(self.layout.positions(selection)[0], unit, to_fmu))
         # of several extra outputs with the same name, the last one is kept
         observed = outputs[: len(observations)]

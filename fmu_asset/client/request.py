@@ -165,7 +165,7 @@ class RequestBlock:
         for position in positions:
             if position in user_of_position:
                 raise BindingError(
-                    f"In the binding {resolver.binding.name}, {bound.label} and "
+                    f"In the binding {resolver.binding.title}, {bound.label} and "
                     f"{user_of_position[position]} set the same value of {variable.name!r}; keep "
                     "one."
                 )
@@ -176,7 +176,7 @@ class RequestBlock:
         """Refuse linear interpolation if the FMU, or all of its inputs, cannot follow it."""
         description = self._resolver.description
         request = (
-            f"The binding {self._resolver.binding.name} asks for linear interpolation of inputs, "
+            f"The binding {self._resolver.binding.title} asks for linear interpolation of inputs, "
             "but"
         )
         if not description.can_interpolate_inputs:
@@ -223,7 +223,7 @@ class RequestBlock:
         Raises
         ------
         FmuFileError
-            If a start value is no number.
+            If a start value is not a number.
         """
         given_arrays = set()
         for role, values in inputs.items():
@@ -303,7 +303,7 @@ class RequestBlock:
         BindingError
             If a name is not in the binding.
         FmuInputError
-            If a value is no number, not finite or out of range, or the histories have different
+            If a value is not a number, not finite or out of range, or the histories have different
             lengths.
         """
         slots_and_values = []

@@ -1,13 +1,13 @@
 """The names of a binding, selection in the FMU: variables, units, ranges and mechanical ports."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 
 from .binding import Binding
-from .bound_variables import InputBinding, VectorBinding
+from .bound_variables import InputBinding, ScalarBinding, VectorBinding
 from .layout import VariableElements, find_variable
 from .slots import InputSlot
 from .units import conversion
@@ -52,8 +52,8 @@ class BindingResolver:
         self.binding = binding
 
     def place_in_binding(self, label: str) -> str:
-        """Return a text for messages: a place in the binding, and the name of the binding."""
-        return f"{label} of the binding {self.binding.name}"
+        """Return a text for messages: a place in the binding, its name and its file."""
+        return f"{label} of the binding {self.binding.title}"
 
     def find(self, name: str, label: str, causality: str) -> VariableElements:
         """Return the variable, or element of an array, that the binding names at a place.
@@ -115,7 +115,8 @@ class BindingResolver:
             If the unit cannot be converted, or the range lies outside that of the FMU.
         """
         definitions = self.description.units_of(variable)
-        unit_conversion = conversion(input_binding.unit, variable, definitions, where=label)
+        place = self.place_in_binding(label)
+        unit_conversion = conversion(input_binding.unit, variable, definitions, where=place)
         low, high = variable.bounds
         # A negative factor of the conversion exchanges the limits, so they are sorted.
         stated_low, stated_high = sorted(
@@ -148,6 +149,58 @@ class BindingResolver:
         """
         selection = self.find(input_binding.variable, label, "parameter")
         return self.slot(label, input_binding, selection.variable, selection.elements)
+
+    def misfits(self) -> list[str]:
+        """Return the messages about all entries of the binding that do not fit the FMU.
+
+        Ports are left out, because each of their quantities depends on the others. Of a list of
+        variables only the first misfit is stated.
+        """
+        messages: dict[str, str] = {}
+        for label, entry in self._labelled_entries():
+            if label in messages:
+                continue
+            try:
+                self._check_entry(label, entry)
+            except BindingError as error:
+                messages[label] = str(error)
+        return [*messages.values()]
+
+    def _labelled_entries(self) -> Iterator[tuple[str, ScalarBinding]]:
+        """Yield each variable that the binding names, with its place in the binding."""
+        binding = self.binding
+        for role in ("control", "health", "load", "parameter", "monitor"):
+            table: Mapping[str, ScalarBinding] = getattr(binding, role)
+            for name, entry in table.items():
+                yield f"{role}.{name}", entry
+        for name, vector in binding.observation.items():
+            for variable, unit in zip(vector.variables, vector.units, strict=True):
+                yield f"observation.{name}", ScalarBinding(variable=variable, unit=unit)
+
+    def _check_entry(self, label: str, entry: ScalarBinding) -> None:
+        """Refuse an entry of the binding that does not fit the FMU.
+
+        Raises
+        ------
+        BindingError
+            If the FMU has no such variable, or the variable has another causality, type, unit or
+            range.
+        """
+        variable = self.description.variable(entry.variable)
+        is_text = variable is not None and variable.is_text_parameter
+        role = label.partition(".")[0]
+        if not isinstance(entry, InputBinding):  # an observation or a monitor
+            found = self.find(entry.variable, label, "output").variable
+            definitions = self.description.units_of(found)
+            conversion(entry.unit, found, definitions, where=self.place_in_binding(label))
+        elif role == "parameter":
+            if not is_text:
+                self.start_slot(label, entry)
+        elif role == "health" and self.is_set_at_start(entry.variable):
+            self.start_slot(label, entry)
+        else:
+            selection = self.find(entry.variable, label, "input")
+            self.slot(label, entry, selection.variable, selection.elements)
 
     # ------------------------------------------------------------------ ports
 

@@ -62,7 +62,8 @@ class InputSlot(NamedTuple):
         Raises
         ------
         FmuInputError
-            If there are not n values, or one is no number, not finite, not whole or out of range.
+            If there are not n values, or one is not a number, not finite, not whole or out of
+            range.
         """
         values = self._with_item_numbers(values)
         array = self._float_array(values, history=history)
@@ -115,7 +116,7 @@ class InputSlot(NamedTuple):
         return float(self.variable.items[name])
 
     def _float_array(self, values: npt.ArrayLike, *, history: bool) -> Float:
-        """Return values as an array of floats; refuse what is no number."""
+        """Return values as an array of floats; refuse what is not a number."""
         try:
             return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -145,7 +146,7 @@ class InputSlot(NamedTuple):
             return
         if count == 1:
             raise FmuInputError(f"{self.label} must be a number, but is {values!r}.")
-        raise FmuInputError(f"{self.label} takes {count} values, but {array.size} came.")
+        raise FmuInputError(f"{self.label} takes {count} values, but {array.size} were given.")
 
     # ------------------------------------------------------------------ checking
 

@@ -1,5 +1,7 @@
 """Communication steps of an FMU with a binding, one by one or many at once."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from fmu_asset.errors import FmuEndedError, FmuError
@@ -62,7 +64,7 @@ class SteppedFmu(OpenedFmu):
         begin = self._start_time + self.step_index * self._interval
         if self._linear_count:
             # Linear inputs begin at their values at the end of the last step. The block holds their
-            # values at the end of the step first, and those at its begin last.
+            # values at the end of the step first, and those at its beginning last.
             request[-self._linear_count :] = request[2 : 2 + self._linear_count]
         try:
             self._exchange.request.place(request, inputs)
@@ -281,7 +283,7 @@ class SteppedFmu(OpenedFmu):
         return None
 
     def _run_and_check_start(
-        self, requests: Float, replies: Float, counter: "_StepCounter"
+        self, requests: Float, replies: Float, counter: _StepCounter
     ) -> FmuError | None:
         """Make a block of steps; repeat it in a new instance if a reset proves not to have worked.
 

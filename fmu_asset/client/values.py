@@ -44,7 +44,7 @@ def inputs_by_role(inputs: Inputs) -> InputsByRole:
     roles = Inputs.__annotations__
     for role in inputs:
         if role not in roles:
-            raise TypeError(f"Inputs are {', '.join(roles)}, and {role!r} came.")
+            raise TypeError(f"Inputs are {', '.join(roles)}, but {role!r} was given.")
     return cast("InputsByRole", inputs)
 
 

@@ -174,10 +174,10 @@ def _check_algorithm(algorithm: str, iterations: int, tolerance: float) -> None:
     """Refuse an algorithm that does not exist, and numbers that it cannot have."""
     if algorithm not in ALGORITHMS:
         raise CouplingError(
-            f"The algorithm must be one of {comma_list(ALGORITHMS)}, and {algorithm!r} came."
+            f"The algorithm must be one of {comma_list(ALGORITHMS)}, but {algorithm!r} was given."
         )
     if iterations < 1 or not (tolerance > 0.0 and math.isfinite(tolerance)):
         raise CouplingError(
-            f"Iterations must be at least 1 and the tolerance positive; {iterations!r} and "
-            f"{tolerance!r} came."
+            f"Iterations must be at least 1 and the tolerance positive, but {iterations!r} and "
+            f"{tolerance!r} were given."
         )

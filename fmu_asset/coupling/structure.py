@@ -128,7 +128,7 @@ class Connection:
     convert_units : bool
         Whether the value is converted where the units of the ends differ.
     delayed : bool
-        Whether the target gets the value at the begin of the step, whatever the order of the
+        Whether the target gets the value at the beginning of the step, whatever the order of the
         components.
     """
 
@@ -282,7 +282,7 @@ def expand_connection(
     if len(sources) != len(targets):
         raise CouplingError(
             f"The connection from {source!r} to {target!r} joins {len(sources)} ends to "
-            f"{len(targets)}; the two patterns must stand for equally many."
+            f"{len(targets)}; both patterns must stand for the same number of ends."
         )
     connections = []
     for source_name, target_name in zip(sources, targets, strict=True):

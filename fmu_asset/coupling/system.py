@@ -46,7 +46,7 @@ class SystemDescription(FmuDescription):
         return self.definitions[variable.name]
 
     def settings_of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
-        """Return values of the system's variables by component and variable, in the FMUs' units.
+        """Return the values to set in each component, by its name and that of the FMU's variable.
 
         Parameters
         ----------

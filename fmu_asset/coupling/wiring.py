@@ -50,7 +50,7 @@ class ConnectedVariable(NamedTuple):
 
 
 def read_component(component: Component) -> FmuDescription:
-    """Return what the FMU of a component declares; messages name it as the component does.
+    """Return the model description of a component's FMU; messages name it as the component does.
 
     Raises
     ------

@@ -49,8 +49,8 @@ from .statuses import (
 _MESSAGES_IN_ERROR = 10
 _LONGEST_LOG = 1000
 _NO_STOP_TIME = (
-    ". It was told no end of the experiment: if it asks for one, give `stop_time` in the table "
-    "[binding] of its binding"
+    ". No end of the experiment was passed to it: if it asks for one, give `stop_time` in the "
+    "table [binding] of its binding"
 )
 _LOST = "The instance was lost to a fatal error; reset the asset to go on."
 
@@ -246,7 +246,7 @@ class FmuInstance(Instance):
         if self._end_time is not None:
             raise FmuEndedError(
                 f"The FMU has ended its simulation at t = {self._end_time:g} s; reset the asset to "
-                "start anew.",
+                "start again.",
                 time=self._end_time,
             )
         self._send_inputs()
@@ -374,7 +374,7 @@ class FmuInstance(Instance):
         Parameters
         ----------
         verb : {"Set", "Get"}
-            What is done.
+            Whether variables are set or read.
         groups : tuple of VariableGroup
             The groups, which follow one another in the block.
         doubles : C array of double

@@ -118,8 +118,8 @@ class CoSimulation(FmuInstance):
             self.lost = True
             raise FmuCallError(
                 f"The FMU returned early, at t = {self._reached_time.value:g} s, in "
-                f"{self._step_label()}, though it was told that this is not supported; try a "
-                "smaller step_size in the binding.",
+                f"{self._step_label()}, although early returns are not allowed; try a smaller "
+                "step_size in the binding.",
                 self._last_messages(),
             )
 
@@ -150,6 +150,6 @@ class CoSimulation(FmuInstance):
         query_status = dll.fmi2GetRealStatus(
             component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached_time)
         )
-        # FMUs of pythonfmu claim at every discarded step that they ended at its begin
+        # FMUs of pythonfmu claim at every discarded step that they ended at its beginning
         if query_status == OK and reached_time.value > self._step_begin.value:
             raise self._ended_error(self._limited_to_step(reached_time.value))

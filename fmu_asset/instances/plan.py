@@ -146,7 +146,7 @@ class Plan:
     def input_count(self) -> int:
         """The number of values after time and step size in a request block.
 
-        These are all inputs, and then the values of the linear inputs at the begin of the step.
+        These are all inputs, and then the values of the linear inputs at the beginning of the step.
         """
         return sum(group.count for group in self.inputs) + self.linear_count
 
@@ -274,7 +274,7 @@ class LinearInputs:
     """Inputs that change linearly over a step (FMI's input derivatives).
 
     The request block holds their values at the end of the step, before the other inputs, and in its
-    last part their values at the begin of the step.
+    last part their values at the beginning of the step.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ class LinearInputs:
         self._present[:] = self._request[: len(self._present)]
 
     def begin_step(self) -> None:
-        """Compute the slopes of a new request, and set the present inputs to those at its begin."""
+        """Compute the slopes of a new request, and set the inputs to those of its beginning."""
         self._start_time = self._request[0]
         self._duration = self._request[1] * self._substeps
         self._slopes[:] = (self._at_end - self._at_begin) / self._duration

@@ -180,9 +180,9 @@ class PatchFile:
             check_channels(ModelPatch((primitive,)), outputs)
         except InvalidPatchError as error:
             raise PatchFileError(
-                f"{label} for the channel {channel!r}, which is no output of the FMU that it can "
-                f"act on ({_listed_outputs(outputs)}); name an output, or map the channel to one "
-                "in `channels`."
+                f"{label} for the channel {channel!r}, which is not an output of the FMU that it "
+                f"can act on ({_listed_outputs(outputs)}); name an output, or map the channel to "
+                "one in `channels`."
             ) from error
         return primitive
 

@@ -371,7 +371,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         The GUID that follows from the content.
     """
     with zipfile.ZipFile(path) as archive:
-        # If another tool has packed the archive again, it lists folders too; they are no files.
+        # If another tool has packed the archive again, it lists folders too; they are not files.
         names = [name for name in archive.namelist() if not name.endswith("/")]
         members = {name: archive.read(name) for name in names}
     description = members["modelDescription.xml"].decode("utf-8")

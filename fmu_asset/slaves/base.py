@@ -216,7 +216,7 @@ class Slave:
         """Return whether a step is possible now; if not, refuse it with a message."""
         if self._phase != READY:
             phase = _PHASE_NAMES[self._phase]
-            return self._refuse(Status.BAD_CALL, f"a step was asked for {phase}")
+            return self._refuse(Status.BAD_CALL, f"a step was requested {phase}")
         is_finite = math.isfinite(step_size) and math.isfinite(current_time)
         if not (step_size > 0.0 and is_finite):
             return self._refuse(

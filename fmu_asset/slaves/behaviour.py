@@ -441,7 +441,7 @@ class StructureBehaviour:
         Returns
         -------
         (2, C) array or None
-            Zero for channels that are no gauges; None if no sensor needs them.
+            Zero for channels that are not gauges; None if no sensor needs them.
         """
         if self._integrator is None or self._state is None or not active.changes_structure:
             return None

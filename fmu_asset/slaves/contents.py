@@ -28,7 +28,7 @@ class Behaviour(Protocol):
         """Return the outputs at the start: parameters by name, time [s], inputs in order."""
 
     def advance(self, time: float, duration: float, inputs: Sequence[float], /) -> Sequence[float]:
-        """Return the outputs after a step: time at its begin [s], its duration [s], inputs."""
+        """Return the outputs after a step: time at its beginning [s], its duration [s], inputs."""
 
     def state(self) -> Sequence[float]:
         """Return everything that is remembered, without the parameters."""

@@ -354,7 +354,7 @@ class SwitchableEffects:
         start: float,
         release: float,
     ) -> SensorReadings:
-        """Return what the sensors read at the end of a step, with the effects on sensors applied.
+        """Return the readings of the sensors at the end of a step, with the effects on sensors.
 
         Parameters
         ----------

@@ -40,7 +40,7 @@ def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[
 
 
 def load_contents(resources: Path) -> SlaveContents:
-    """Return what the files describe that `fmu_asset.packing.structure_fmu` packed.
+    """Return the structure in the files that `fmu_asset.packing.structure_fmu` packed.
 
     Parameters
     ----------

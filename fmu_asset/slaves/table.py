@@ -173,7 +173,7 @@ def _wing_table(
 def _table_of_structure(
     model: ReducedModel, start: Mapping[str, float]
 ) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
-    """Return the table of a structure that is no wing; see `structure_table`."""
+    """Return the table of a structure that is not a wing; see `structure_table`."""
     table = _ModelTable(model, start, {})
     table.add_values(_CONTROL, model.controls)
     table.add_values(_REGION, model.regions)

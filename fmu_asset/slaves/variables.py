@@ -200,7 +200,7 @@ class VariableTable:
         Raises
         ------
         ValueError
-            If a start value was given for a name that is no input or parameter.
+            If a start value was given for a name that is not an input or parameter.
         """
         if self._start:
             unused = sorted(self._start)

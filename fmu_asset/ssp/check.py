@@ -177,7 +177,7 @@ def _name_with_hint(name: str, settable_names: list[str], components: list[str])
     correct_name = prefix + similar[0]
     # A mapping of names may ask for the value of a parameter that the set of values does not have.
     if correct_name == name:
-        return f"{name} (its set lacks the value)"
+        return f"{name} (its parameter set has no such value)"
     return f"{name} (did you mean {correct_name!r}?)"
 
 

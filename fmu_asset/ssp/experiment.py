@@ -57,7 +57,7 @@ def _positive_step(text: str, attribute: str, path: str) -> float:
         step = 0.0
     if not (isfinite(step) and step > 0.0):
         raise SspError(
-            f"{SSD_NAME} in {path}: {attribute} must be a positive number of seconds, and {text!r} "
-            "came."
+            f"{SSD_NAME} in {path}: {attribute} must be a positive number of seconds, but {text!r} "
+            "was given."
         )
     return step

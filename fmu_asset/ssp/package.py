@@ -94,7 +94,9 @@ class SspPackage:
         with SspError.instead_of(FmuFileError):
             self.names = check_archive(self.path, size, archive_kind="SSP", remedy="export")
         if SSD_NAME not in self.names:
-            raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
+            raise SspError(
+                f"{self.path} is an archive without {SSD_NAME}, so it is not an SSP file."
+            )
 
     def read(self, name: str) -> bytes:
         """Return the content of a file in the archive."""
@@ -223,7 +225,7 @@ def _convert_to_ssp1(root: XmlElement, label: str) -> None:
 
 
 def _unsupported_part(element: XmlElement, tag: etree.QName) -> str:
-    """Return what an element has that is not supported, for a message; empty if nothing."""
+    """Return the unsupported part of an element, for a message; empty if all of it is supported."""
     if tag.localname == "Component" and element.get("source") is None:
         return f"the component {element.get('name')!r} without a source"
     if element.get("kind") in ("clock", "structuralParameter"):

@@ -81,7 +81,9 @@ class ParameterReader:
         """Return a number; the schemas allow NaN and INF, which are refused."""
         value = float(text)
         if not isfinite(value):
-            raise package_error(self.package, f"{label} must be a finite number, and {text} came.")
+            raise package_error(
+                self.package, f"{label} must be a finite number, but {text} was given."
+            )
         return value
 
     def _parameter_document(
@@ -182,7 +184,7 @@ class ParameterReader:
             if scale != IDENTITY:
                 if isinstance(setting.value, bool | str | bytes):
                     raise package_error(
-                        self.package, f"{label} scales {source!r}, which is no number."
+                        self.package, f"{label} scales {source!r}, which is not a number."
                     )
                 setting = replace(setting, scale=scale)
             if flag(entry, "suppressUnitConversion"):

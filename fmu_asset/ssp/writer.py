@@ -228,4 +228,4 @@ def _number_text(end: Endpoint, variable: VariableInfo, value: float) -> str:
     for name, item in variable.items.items():
         if item == value:
             return name
-    raise SspError(f"{end} = {value:g} is no item of its enumeration.")
+    raise SspError(f"{end} = {value:g} is not an item of its enumeration.")

@@ -81,7 +81,7 @@ class WorkerLimits(Section):
     sandbox : bool
         Whether the system keeps the FMU from the user's files, from programs and from the network.
     read, write, ports, programs
-        What the sandbox grants all the same; see `Grants`.
+        Rights that the sandbox grants in spite of this; see `Grants`.
     """
 
     step_time: Positive = 60.0

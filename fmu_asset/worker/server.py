@@ -245,7 +245,7 @@ class _Server:
             self._open(*call.arguments)
         instance = self.instance
         if instance is None:
-            raise FmuWorkerError("The worker was asked before it had an FMU.")
+            raise FmuWorkerError("The worker got a request before it had an FMU.")
         self._request[:] = call.request
         if call.name == "open":
             return b""

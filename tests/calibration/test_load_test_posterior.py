@@ -251,5 +251,7 @@ def test_measurements_far_from_the_prior_are_followed():
 def test_a_posterior_beyond_the_end_of_its_curve_is_refused():
     narrow = stiffness_line(575.2, 101.8, "narrow model", 0.9, 0.99)
 
-    with pytest.raises(OutsideValidityError, match=r"outside \[0.9, 0.99\], where narrow model"):
+    with pytest.raises(
+        OutsideValidityError, match=r"outside \[0.9, 0.99\], the range in which narrow model"
+    ):
         exact_posterior(LOAD_TEST, curve=narrow)

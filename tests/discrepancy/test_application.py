@@ -98,7 +98,7 @@ def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     said = run(*words, "--no-report")
     assert "Verdict: nothing missing" in said
     assert "apply" not in said
-    assert "nothing is missing, and the model stands as it is" in run(
+    assert "nothing is missing, and the model needs no change" in run(
         "apply", words[-1], "--out", "more.json", failed=True
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig_patched.toml", "verdicts"]
@@ -181,7 +181,10 @@ def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
     for words, member in (((), leading), (("--member", other), other)):
         out = tmp_path / f"{member}.json"
         told = run("apply", tmp_path / "verdict", "--out", out, *words)
-        assert f"one of a group that the data cannot tell apart: no name (of {leading}, {other})." in told
+        assert (
+            f"one of a group that the data cannot tell apart, and not a name (group: {leading}, {other})."
+            in told
+        )
         stored = read_patch(out)
         assert stored.verdict is VerdictKind.GROUP
         assert stored.sentence.startswith(told.splitlines()[0].split(": ", 1)[1])

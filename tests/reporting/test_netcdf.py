@@ -123,7 +123,7 @@ def test_a_missing_file_is_one_sentence(tmp_path):
 def test_a_file_that_is_no_netcdf_is_one_sentence(tmp_path, content):
     (tmp_path / "a.nc").write_bytes(content)
 
-    with refused(DamagedFileError, r"a\.nc is damaged or no NetCDF file \(.+\)$"):
+    with refused(DamagedFileError, r"a\.nc is damaged or is not a NetCDF file \(.+\)$"):
         read_groups(tmp_path / "a.nc")
 
 
@@ -228,7 +228,7 @@ def test_the_fork_holds_no_file_of_this_process(path, monkeypatch):
     """Or the lock of a run folder would outlive a process that is killed while a file is read."""
     monkeypatch.setattr(
         netcdf, "_read_groups", list_descriptors
-    )  # a text is no tree: it is refused
+    )  # a text is not a tree: it is refused
     with path.open("rb") as held:
         with pytest.raises(DamagedFileError) as raised:
             read_groups(path)

@@ -62,7 +62,7 @@ def test_what_is_not_there_is_one_sentence(tmp_path, kind):
     for path in (tmp_path / "none.toml", tmp_path):
         with refused(WrongFileError, r"^The file .* cannot be read: (No such|Is a)"):
             READERS[kind][0](path, WrongFileError)
-    with refused(WrongFileError, "is no name of a file"):
+    with refused(WrongFileError, "is not a name of a file"):
         READERS[kind][0]("a\0b", WrongFileError)
 
 
@@ -99,7 +99,7 @@ def test_blanks_separate_and_names_are_given():
     assert table.numbers("signal", "the test").tolist() == [1.0, -2.0]
     assert table.lines == (1, 3)
     with refused(
-        WrongFileError, r"^x\.dat, line 2: 1 cell came, and 2 columns \(time, signal\) are"
+        WrongFileError, r"^x\.dat, line 2: the row has 1 cell, but 2 columns \(time, signal\) are"
     ):
         parse_table("0.0\t1\n0.1\n", "x.dat", ERRORS, **given)
 

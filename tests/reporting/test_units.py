@@ -57,7 +57,7 @@ def test_any_text_is_a_unit_or_is_refused(text, gravity):
     ],
 )
 def test_a_name_with_a_number_is_no_unit(text):
-    with pytest.raises(ValueError, match="is no unit"):
+    with pytest.raises(ValueError, match="is not a unit"):
         exact_meaning(text)
 
     assert meaning_of(text) is None

@@ -63,7 +63,7 @@ def test_a_run_that_flies_is_not_replaced_nor_anything_that_is_no_run(tmp_path):
     make(mine, "first", replace=True)  # an empty folder
     (mine / "config.json").unlink()
     thesis = written(mine, "important", name="thesis.txt")
-    for place, sentence in ((mine, "not touched"), (thesis, "no folder")):
+    for place, sentence in ((mine, "left unchanged"), (thesis, "no folder")):
         with pytest.raises(RunFolderError, match=sentence):
             make(place, "second", replace=True)
     assert thesis.read_text(encoding="utf-8") == "important"
@@ -110,9 +110,9 @@ DEEP = '{"a":' * 5000 + "1" + "}" * 5000
 @pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
 def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
-    with pytest.raises(NotResumableError, match="is no run folder"):
+    with pytest.raises(NotResumableError, match="is not a run folder"):
         read_config(tmp_path)
-    with pytest.raises(RunFolderError, match="not touched"):
+    with pytest.raises(RunFolderError, match="left unchanged"):
         make(tmp_path, "second", replace=True)
     for name in ("timing.json", "summary.json"):  # of a run that is finished both are whole
         for file in ("timing.json", "summary.json"):
@@ -218,7 +218,10 @@ def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
 
 
 def test_what_cannot_be_resumed(tmp_path, library_file):
-    for place, sentence in ((tmp_path / "nothing", "there is no run folder"), (tmp_path, "is no run folder")):
+    for place, sentence in (
+        (tmp_path / "nothing", "there is no run folder"),
+        (tmp_path, "is not a run folder"),
+    ):
         with pytest.raises(NotResumableError, match=sentence):
             resume_run(place)
     folder = tmp_path / "run"
@@ -267,4 +270,6 @@ def test_an_error_before_the_first_step_says_how_to_begin_anew(tmp_path, library
     monkeypatch.setattr(workflow, "prepare_knowledge", broken)
     with pytest.raises(MissionInputError) as caught:
         fly(tmp_path / "run", library_file)
-    assert caught.value.__notes__ == ["Nothing was flown yet: once this is mended, fly again with --replace."]
+    assert caught.value.__notes__ == [
+        "Nothing was flown yet: correct the cause, and fly again with --replace."
+    ]

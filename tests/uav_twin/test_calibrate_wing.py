@@ -160,7 +160,7 @@ def test_what_a_calibration_leaves_and_says(soft):
     }  # fmt: skip
     page = (soft.out / "report.html").read_text(encoding="utf-8")
     assert "Calibration of soft" in page
-    assert "This calibration beside Table 1 of the paper" in page
+    assert "This calibration and Table 1 of the paper" in page
     assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
     assert not re.search(r"""(?<=[\s"'>(=])/(?:[\w.-]+/)+""", page)  # no folder of this machine
     result = soft.result

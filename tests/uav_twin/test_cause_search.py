@@ -67,7 +67,7 @@ def test_the_search_that_a_watch_gets_is_the_command_that_an_alarm_names():
     assert isinstance(given(), DiscrepancySearch)
     assert given(cause_search="another") == "another"
     assert "cause_search" in inspect.signature(uav_twin.watch).parameters
-    assert "cause_search" not in inspect.signature(watch_command.watch).parameters  # it is no option
+    assert "cause_search" not in inspect.signature(watch_command.watch).parameters  # it is not an option
 
 
 def test_to_teach_without_a_search_is_refused_before_a_folder_is_made(tmp_path):

@@ -104,6 +104,21 @@ def test_everything_that_is_not_said_is_named_at_once():
         "--release NAME=... for 'swing.csv' (how far the point was held",
     ):
         assert part in sentence
+    assert sentence.strip().endswith("To have the outputs of your model listed, give --model.")
+
+
+def test_the_outputs_of_the_model_are_listed_with_their_units_where_a_column_may_be_one_of_them():
+    Path("swing.csv").write_bytes(TWO["swing.csv"])
+    outputs = "displacement (displacement in m) and leaf_strain (strain without a unit)"
+    options = ("swing.csv", "--kind", "ringdown", "--release", "8mm", "--decimal", ",", "--model", MODEL)
+    assert f"The model has the outputs {outputs}." in refused(*IMPORT, *options)
+    wrong = ("--column", "Weg=deflection", "--unit", "Weg=mm")
+    assert f"the model has no output 'deflection'; it has {outputs}; say another." in refused(
+        *IMPORT, *options, *wrong
+    )
+    _, screen = in_a_terminal(["deflection", "displacement", "mm", "", "", "y"], *options, "--out", "lab")
+    assert screen.index(f"The model has the outputs {outputs}.") < screen.index("Weg: column")
+    assert [channel.output for channel in read_campaign("lab").channels.values()] == ["displacement"]
 
 
 def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumptions_only():
@@ -119,7 +134,10 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumpti
     )  # fmt: skip
     done = command(*IMPORT, "push.csv", "n1.csv", "n2.csv", *given)
     assert done.returncode == 1
-    assert done.stderr.strip() == "Noise is read from one file, and n1.csv and n2.csv came: give one of them."
+    assert (
+        done.stderr.strip()
+        == "Noise is read from one file, but n1.csv and n2.csv were given: give one of them."
+    )
     said(*IMPORT, "push.csv", "n1.csv", *given)
     toml = Path("lab/campaign.toml").read_text("utf-8")
     assert "begins" not in toml
@@ -135,9 +153,9 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumpti
     assert trial.inputs[0].values[3] == 3e-3
     assert trial.temperature[8] == 1.0
     assert read.channels["leaf_strain"].quantity is Quantity.SIGNAL
-    assert "(assumed: say `begins`" in " ".join(read.remarks)
+    assert "(assumed; set `begins`" in " ".join(read.remarks)
     Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
-    assert "(assumed: say `begins`" not in " ".join(read_campaign("lab").remarks)
+    assert "(assumed; set `begins`" not in " ".join(read_campaign("lab").remarks)
     Path("step.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
     said(*IMPORT, "step.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
     assert read_campaign("step").trials[0].load_factor.tolist() == [1.0, 2.5]
@@ -168,6 +186,10 @@ def test_the_documented_files_print_the_documented_tables():
     done = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
     assert done.returncode == 1
     assert [row for row in done.stdout.splitlines() if row.startswith("Fault: ")] == checked.splitlines()
+    stored_hashes = re.findall(r"SHA-256 ([0-9a-f]{64})\b", Path("lab/campaign.toml").read_text("utf-8"))
+    printed_hashes = re.findall(r"SHA-256 ([0-9a-f]+)", done.stdout)
+    assert len(stored_hashes) == 2  # a line of the output has 12 digits of each, once
+    assert printed_hashes == [stored[:12] for stored in stored_hashes]
 
 
 # ---------------------------------------------------------------- a terminal
@@ -192,7 +214,10 @@ def test_a_terminal_is_asked(tmp_path):
     answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "a bit", "0.5mm", "", "y"]
     code, screen = in_a_terminal(answers, "swing.csv", "--out", "lab")
     assert code == 0, screen
-    assert "--kind must be static, ringdown, forced, driven, flight or noise, and 'swinging' came." in screen
+    assert (
+        "--kind must be static, ringdown, forced, driven, flight or noise, but 'swinging' was given."
+        in screen
+    )
     assert "Write lab?" in screen
     read = read_campaign(tmp_path / "lab")
     assert read.trials[0].values[1, 0] == 2e-3
@@ -307,7 +332,7 @@ def test_zeros_and_gains_that_nobody_states_are_not_exact():
     swings("a.csv")
     printed = said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
     sentence = (
-        "Zeros and gains that nobody stated are assumed to be known: "
+        "Zeros and gains without a stated standard deviation are assumed to be known: "
         "the zero of 'x' to 0.2 um and the gain of 'x' to 2 %."
     )
     read = read_campaign("a")
@@ -355,7 +380,7 @@ def test_a_table_without_a_time_has_the_interval_that_is_stated():
     assert read_campaign("a").trials[0].time.tolist() == [0.02 * k for k in range(16)]
     swings("b.csv")
     sentence = refused(*IMPORT, "b.csv", "--kind", "driven", *PLAIN, "--interval", "b.csv=0.02")
-    assert "b.csv has a column of times, and --interval came for it" in sentence
+    assert "b.csv has a column of times, but --interval was given for it" in sentence
 
 
 def test_a_table_of_one_column_has_the_interval_that_is_stated():
@@ -389,7 +414,7 @@ def test_inputs_and_forces_keep_the_units_of_the_file():
     toml = Path("forced/campaign.toml").read_text("utf-8").replace('"lbf"', '"mm"')
     Path("forced/campaign.toml").write_text(toml, "utf-8")
     sentence = refused("discrepancy", "check", "forced", *RIG)
-    assert "force must have a unit such as N, mN or kN, and 'mm' came" in sentence
+    assert "force must have a unit such as N, mN or kN, but 'mm' was given" in sentence
 
 
 @pytest.mark.parametrize(
@@ -408,7 +433,7 @@ def test_a_scale_of_a_mere_number_keeps_the_unit_and_one_of_another_unit_is_refu
     said(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=-1")
     assert read_campaign("a").trials[0].values[0, 0] == pytest.approx(20e-6, rel=1e-14)
     sentence = refused(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--scale", "x=200 N/V", "--out", "b")
-    assert "--scale of 'x' is for cells in V, and they are in um" in sentence
+    assert "--scale of 'x' is for cells in V, but they are in um" in sentence
 
 
 def test_channels_keep_the_units_and_digits_of_the_files():
@@ -513,7 +538,7 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path)
     assert "Fault:" in shown.stdout
     assert "no channel has the column 'weather'" in shown.stdout
     error = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(tmp_path / "v"))
-    assert "shows about 1000 times what the model says (mm given as m?)" in error
+    assert "shows about 1000 times what the model predicts (mm given as m?)" in error
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
     page = (tmp_path / "v" / "report.html").read_text(encoding="utf-8")
     assert "Proof" not in page

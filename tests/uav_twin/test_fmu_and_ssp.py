@@ -1,9 +1,11 @@
 """`uav-twin fmu`, `library sample`, `ssp` and `run x.ssp` as a user calls them."""
 
 import csv
+import io
 import json
 import math
 import re
+import zipfile
 from contextlib import closing
 from pathlib import Path
 
@@ -17,13 +19,31 @@ from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.history_files import read_histories
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
-from scenarios import binding_files
+from scenarios import binding_files, scenario_files
 from tests.command_line import command, refused, said
 from tests.fmu_asset.making import DESCRIPTION, archive_of, edited, members
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
 ROOM = INPUTS.folder / "room.toml"
+
+
+def test_an_input_that_nobody_sets_is_warned_about_once(foreign_fmu, tmp_path):
+    inputs = tmp_path / "inputs.csv"
+    inputs.write_text("time,power\n120,1\n180,2\n", encoding="utf-8")
+    words = ("--binding", ROOM, "--inputs", inputs, "--in-process")
+    told = said("fmu", "simulate", foreign_fmu("room2"), *words)
+    assert told.count("2 inputs stay at their start values, because nobody sets them: ") == 1
+
+    binding = binding_files()["gear_pump"].read_text("utf-8")
+    without_pressure = re.sub(r"(?s)\[control\.pressure\].*?\n\n", "", binding)
+    (tmp_path / "pump.toml").write_text(without_pressure, encoding="utf-8")
+    scenario = re.sub(r", pressure = \d+\.0", "", scenario_files()["pump_wear"].read_text("utf-8"))
+    scenario = scenario.replace('binding = "gear_pump"', 'binding = "pump.toml"')
+    (tmp_path / "mine.toml").write_text(scenario, encoding="utf-8")
+    checked = command("scenario", "check", tmp_path / "mine.toml")
+    assert checked.returncode == 0, checked.stderr
+    assert checked.stderr.count("nobody sets it: pressure (150 bar)") == 1
 
 
 def test_histories_in_outputs_out(foreign_fmu, tmp_path):
@@ -145,7 +165,7 @@ def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
     given.write_text("time,u\n0,0\n")
     for more, sentence in (
         (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
-        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, and 'cubic' came"),
+        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, but 'cubic' was given"),
     ):
         assert sentence in refused("fmu", "simulate", *wanted, *more, "--replace", code=None)
 
@@ -350,3 +370,33 @@ def test_the_words_of_ssp_2_are_read(system, tmp_path):
 def test_the_wing_of_a_design(tmp_path):
     said("ssp", "export", "uav_wing", "--out", tmp_path / "wing.ssp")
     assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", tmp_path / "wing.ssp")
+
+
+def members_of_component(system: Path, component: str) -> set[str]:
+    """Return the first folders and files inside the FMU of a component of an SSP file."""
+    with zipfile.ZipFile(system) as archive:
+        content = archive.read(f"resources/{component}.fmu")
+    with zipfile.ZipFile(io.BytesIO(content)) as fmu:
+        return {name.partition("/")[0] for name in fmu.namelist()} | {*fmu.namelist()}
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_fmus_of_a_design_are_exported_as_the_user_says(tmp_path):
+    """A compiled FMU has no Python inside, and other components stay as they are."""
+    said("ssp", "export", "uav_wing", "--kind", "compiled", "--out", tmp_path / "wing.ssp")
+    said("ssp", "export", "three_fmus", "--kind", "compiled", "--out", tmp_path / "three.ssp")
+    said("ssp", "export", "three_fmus", "--out", tmp_path / "as_said.ssp")
+    python = {
+        (system, component): any(
+            name.endswith(".py") for name in members_of_component(tmp_path / f"{system}.ssp", component)
+        )
+        for system, component in (
+            ("wing", "uav_wing"),
+            ("three", "wing"),
+            ("three", "gauges"),
+            ("as_said", "wing"),
+        )
+    }
+    assert [*python.values()] == [False, False, True, True]
+    assert "no problem found" in said("ssp", "check", tmp_path / "three.ssp")

@@ -159,5 +159,5 @@ def test_a_misspelt_key_or_word_of_an_effect_is_refused_with_the_nearest_one(tmp
     with refused(CatalogueError, r"'signatur' is not a key of an effect; the nearest is `signature`\.$"):
         effects_of_file(path)
     path.write_text(text.replace('"log_normal"', '"lognormal"', 1), encoding="utf-8")
-    with refused(CatalogueError, r"'lognormal' came; the nearest is 'log_normal'\.$"):
+    with refused(CatalogueError, r"'lognormal' was given; the nearest is 'log_normal'\.$"):
         effects_of_file(path)

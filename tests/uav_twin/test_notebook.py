@@ -50,9 +50,9 @@ def test_functions_take_the_tree_and_panels_of_the_user(outcome):
 
     figure, panels = pyplot.subplots(2)
     assert uav_twin.plot_belief(outcome.tree, panels) == list(panels)
-    with pytest.raises(ValueError, match="The picture has 2 panels, and 1 came"):
+    with pytest.raises(ValueError, match="The picture has 2 panels, but 1 were given"):
         uav_twin.plot_belief(outcome.tree, panels[0])
-    with pytest.raises(TypeError, match=r"a str came: open a folder with `uav_twin.open_run`"):
+    with pytest.raises(TypeError, match=r"a str was given: open a folder with `uav_twin.open_run`"):
         uav_twin.plot_belief("runs/mine")  # type: ignore[arg-type]
     panel = uav_twin.plot_residuals(outcome)
     (mesh,) = panel.collections

@@ -66,7 +66,7 @@ def test_verify_compares_with_calculix(file, tmp_path, monkeypatch):
     found = command("structure", "verify", file, "--modes", "2")
     assert "BROKEN" in found.stdout
     assert found.returncode == 1
-    assert found.stderr.strip().endswith("1 of 4 checks broke their limit: 2 modes, frequencies.")
+    assert found.stderr.strip().endswith("1 of 4 checks exceeded their limits: 2 modes, frequencies.")
 
 
 def test_a_structure_is_reduced_and_compared(write_beam, tmp_path, monkeypatch):
@@ -185,7 +185,7 @@ def test_the_twin_flies_with_it(calibrated, tmp_path, monkeypatch):
     assert found.explained is True
     assert any("does not tell pump" in sentence for sentence in found.findings)
     folder = fly(mission(), tmp_path / "run", given, report=False).folder
-    wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
+    wanted_words = f"The calibrated model was {found.model}; flown is the FMU of the structure bracket, and"
     assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
     believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
     assert any(note.startswith(wanted_words) and note.endswith(believed) for note in told)

@@ -52,8 +52,8 @@ HASHED_COPIES = {
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
 NO_ASSET = (
-    "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` "
-    "takes in, and its `belief` must be a model of its own."
+    "this scenario has no `[asset]`: it is for a real asset, whose observations `uav-twin watch` "
+    "reads, and its `belief` must be a model of its own."
 )
 
 
@@ -157,7 +157,7 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
 
 
 def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> Float:
-    """Return what an asset would observe in every state under every control, without noise.
+    """Return the observations of an asset in every state under every control, without noise.
 
     Parameters
     ----------
@@ -226,16 +226,16 @@ def calibration_sentence(
     """
     if "campaign" not in record:
         return None
-    roles = f"flown and believed is the {asset}"
+    roles = f"asset and belief are the {asset}"
     if asset != believed:
-        roles = f"flown is the {asset}, and the twin believes the {believed}"
+        roles = f"the asset is the {asset}, and the twin believes the {believed}"
     # Without a believed design of its own, the twin believes what flies.
     believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
     if believed_hash is not None and believed_hash == record.get("design_hash"):
         comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
     else:
-        comparison = "The calibration file does not tell whether these are one and the same."
-    return f"Calibrated was the model {record['model']}; {roles}. {comparison}"
+        comparison = "The calibration file does not say whether these are one and the same."
+    return f"The calibrated model was {record['model']}; {roles}. {comparison}"
 
 
 class AssetSource:
@@ -268,7 +268,7 @@ class AssetSource:
 
     @cached_property
     def file_paths(self) -> dict[str, Path]:
-        """The files of the table, and the calibration file, by the paths of their copies."""
+        """The files of the table and of the calibration; keys are the paths of their copies."""
         section_files = {} if self.section is None else self.section.all_files()
         return {**section_files, **self._scenario.calibration.all_files()}
 
@@ -284,7 +284,7 @@ class AssetSource:
 
     @property
     def description(self) -> str:
-        """What flies or is believed, in words."""
+        """A phrase for the asset that flies or the model that is believed."""
         return str(self.label)
 
     @property

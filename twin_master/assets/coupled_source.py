@@ -44,6 +44,9 @@ class ComponentSection(FileSection):
     """An FMU, or the name of a companion that is shipped: `damage_growth` or `strain_gauges`."""
     design: str | None = None
     """A wing design from which the component is packed, or the name of a shipped one."""
+    packed: Literal["python", "compiled"] = "python"
+    """What evaluates an FMU that is packed from a design: Python, or C that is compiled on this
+    machine."""
     substeps: Count = 1
     """Steps that it makes in one step of the system."""
     parameters: dict[str, Flag | Number | str] = Field(default_factory=dict)
@@ -306,10 +309,13 @@ class CoupledSource(SeveralSource):
             calibration = load_calibration(Path(self._scenario.calibration.file or ""))
             design = calibration.wing_design
             # `tailoring` gives the options of `pack_wing` that set the calibrated values.
-            pack_wing(design, fmu, replace=True, progress=progress, **tailoring(calibration))
+            options = tailoring(calibration)
+            pack_wing(
+                design, fmu, replace=True, progress=progress, kind=component.packed, **options
+            )
         else:
             design = load_design(component.design_path)
-            pack_wing(design, fmu, replace=True, progress=progress)
+            pack_wing(design, fmu, replace=True, progress=progress, kind=component.packed)
         return fmu
 
     def wiring(self) -> "Wiring":

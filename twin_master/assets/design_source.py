@@ -132,7 +132,9 @@ class _Wing(NamedStructure):
 
         if CALIBRATION_COPY not in self.file_paths:
             raise MissionInputError(
-                "the design of a calibration is asked for, and there is no such file."
+                "the scenario asks for the design of a calibration, but there is no calibration "
+                "file: "
+                'give --calibration, or `source = "file"` in the table `calibration`.'
             )
         return load_calibration(self.path(CALIBRATION_COPY))
 
@@ -388,7 +390,7 @@ class DesignSource(_Wing, ReducedModelSource):
         role = self._scenario.observation.role
         if self.patch is not None and role != "strain":
             raise MissionInputError(
-                f"with `belief.patch` the twin predicts strains, and `{role}` is observed: leave "
+                f"with `belief.patch` the twin predicts strains, but `{role}` is observed: leave "
                 "out `belief.patch`."
             )
 

@@ -11,10 +11,12 @@ from pydantic import Field
 from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.client.binding import Binding, load_binding
 from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
 from reporting.files import hash_file
+from reporting.log import module_logger
 from reporting.progress import Progress
 from reporting.toml_file import Fault, Number, Positive
 from reporting.units import meaning_of
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
     from calibration.result.record import Calibration as CalibrationRecord
     from fmu_asset.coupling.asset import CoupledAsset
 
+
+_logger = module_logger(__name__)
 
 Session = Union[FmiAsset, "CoupledAsset"]
 """One FMU, or several coupled ones; both have the same methods."""
@@ -341,7 +345,25 @@ class FmuSource(AssetSource):
 
         A subclass may write into the scratch folder, which the caller removes.
         """
-        return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
+        asset = FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters())
+        self._warn_of_unset_inputs(asset)
+        return asset.binding
+
+    def _warn_of_unset_inputs(self, asset: FmiAsset) -> None:
+        """Warn of inputs of an FMU that stay at their start values in the whole mission.
+
+        The FMU of a design is left out: each of its inputs that nobody sets is a force of zero.
+        """
+        if packed_design_hash(asset.description.path):
+            return
+        given_names = {
+            "control": self._scenario.control[0].values,
+            "health": self._scenario.state_names,
+            "load": self.section.load,
+        }
+        unset = unset_inputs_sentence(asset.description, asset.binding, given_names)
+        if unset:
+            _logger.warning("%s", unset)
 
     def _check_state_units(self, binding: Binding) -> None:
         """Refuse a state factor whose unit differs from that of its monitor or health input."""
@@ -550,4 +572,6 @@ class ScriptSource(FmuSource):
         """Pack the FMU in the scratch folder; return the binding with its lengths of arrays."""
         packed_fmu = scratch / "asset.fmu"
         packed_fmu.write_bytes(self.files()[FMU_COPY])
-        return FmiAsset(packed_fmu, binding, parameters=self.parameters()).binding
+        asset = FmiAsset(packed_fmu, binding, parameters=self.parameters())
+        self._warn_of_unset_inputs(asset)
+        return asset.binding

@@ -320,7 +320,8 @@ def load_observation_library(path: Path) -> ObservationLibrary:
         ) from error
     if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
         raise MissionInputError(
-            f"{path} is no observation library of this version (format {FORMAT}): sample it again."
+            f"{path} is not an observation library of this version (format {FORMAT}): sample it "
+            "again."
         )
     try:
         return ObservationLibrary(dataset)

@@ -284,8 +284,8 @@ def check_calibration(
         if name in names and not low <= record.mean(name) <= high:
             raise MissionInputError(
                 f"the calibration of {record.asset} has {name} = {record.mean(name):.6g}, but "
-                f"{where} holds from {low:g} to {high:g} of it: give one of that, or widen the "
-                "range if its file has one."
+                f"{where} holds from {low:g} to {high:g} of it: give a calibration within this "
+                "range, or widen the range if its file has one."
             )
 
 

@@ -181,7 +181,7 @@ class NamedStructure(AssetSource):
         most = StructureSettings.mode_count
         if observation.count > most:
             raise MissionInputError(
-                f"a structure tells its first {most} frequencies, and {observation.count} are "
+                f"a structure gives its first {most} frequencies, but {observation.count} are "
                 "observed."
             )
         return observation.count
@@ -200,7 +200,7 @@ class NamedStructure(AssetSource):
         highest = max(modes.mode_indices) + 1
         if highest > most:
             raise MissionInputError(
-                f"a structure tells its first {most} modes, and mode {highest} is observed."
+                f"a structure gives its first {most} modes, but mode {highest} is observed."
             )
         accelerometers = [acceleration.name for acceleration in self.design.acceleration]
         names_by_sort = [("accelerometer", modes.accelerometers, accelerometers)]

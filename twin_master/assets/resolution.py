@@ -46,6 +46,8 @@ class Overrides:
         The calibration file, instead of what the scenario states of its calibration.
     ssp : Path or None
         The SSP file to fly instead of the scenario's asset.
+    no_notices : bool
+        Whether the twin gives no notices and alarms, also if the scenario asks for them.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -60,6 +62,7 @@ class Overrides:
     library: Path | None = None
     learnt: Path | None = None
     learnt_group: str | None = None
+    no_notices: bool = False
 
 
 def as_overrides(overrides: Overrides | Mapping[str, Any] | None) -> Overrides:
@@ -122,7 +125,8 @@ def resolve_scenario(
         for design_table in _design_tables(table)
     ):
         raise MissionInputError(
-            "the design of a calibration is asked for, and there is no calibration file: give "
+            "the scenario asks for the design of a calibration, but there is no calibration file: "
+            "give "
             '--calibration, or `source = "file"` in the table `calibration`.'
         )
     source = str(loaded.path)
@@ -131,6 +135,8 @@ def resolve_scenario(
         source += f" with {overrides.learnt}"
     if overrides.seed is not None:
         table["mission"]["seed"] = overrides.seed
+    if overrides.no_notices:
+        table["notice"] = False
     return parse_scenario(table, source)
 
 

@@ -115,7 +115,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
         """Return the positions of a role in the binding; none if features of modes are observed.
 
-        Features of modes are no outputs of the FMU. They are identified from its accelerations.
+        Features of modes are not outputs of the FMU. They are identified from its accelerations.
         """
         if self._scenario.observation.modes is None:
             return super()._observation_slice(binding, role)

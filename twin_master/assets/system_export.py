@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
@@ -31,10 +32,19 @@ from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.resolution import resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
+from twin_master.scenario.schema import Scenario
+
+PackedKind = Literal["python", "compiled"]
+"""What evaluates an FMU that is packed from a design: Python, or compiled C."""
 
 
 def export_scenario(
-    loaded: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool
+    loaded: LoadedScenario,
+    out: Path,
+    *,
+    seed: int | None = None,
+    kind: PackedKind | None = None,
+    replace_file: bool,
 ) -> Path:
     """Write the asset of a scenario as an SSP file.
 
@@ -50,6 +60,8 @@ def export_scenario(
     seed : int, optional
         The seed of the run, from which the seeds of the FMUs are drawn; by default that of the
         scenario.
+    kind : {"python", "compiled"}, optional
+        What evaluates the FMUs that are packed from designs; by default as the scenario says.
     replace_file : bool
         Whether an existing file may be replaced.
 
@@ -61,11 +73,13 @@ def export_scenario(
     Raises
     ------
     MissionInputError
-        If the scenario flies no FMU.
+        If the scenario flies no FMU, or if `kind` is given and no FMU is packed from a design.
     FmuError
         If the FMUs do not fit.
     """
     scenario = resolve_scenario(loaded, {"seed": seed})
+    if kind is not None:
+        scenario = _with_packed_kind(scenario, kind)
     source = scenario.asset.source(scenario)
     if not isinstance(source, FmuSource):
         raise MissionInputError(
@@ -95,7 +109,33 @@ def export_scenario(
         )
 
 
-def export_design(design: Path | None, out: Path, *, replace_file: bool) -> Path:
+def _with_packed_kind(scenario: Scenario, kind: PackedKind) -> Scenario:
+    """Return a scenario whose FMUs are packed from their designs in a way that the user chose.
+
+    Raises
+    ------
+    MissionInputError
+        If no FMU of the scenario is packed from a design.
+    """
+    asset = scenario.asset
+    if "packed" in type(asset).model_fields:
+        return scenario.with_changes("asset", packed=kind)
+    components = []
+    for component in getattr(asset, "component", ()):
+        is_packed = component.design is not None
+        components.append(component.model_copy(update={"packed": kind}) if is_packed else component)
+    if not any(component.design is not None for component in components):
+        raise MissionInputError(
+            f"--kind {kind} says how FMUs are packed from a design, and the scenario "
+            f"{scenario.mission.name} has none of a design (the kind of its asset is "
+            f"`{asset.kind}`): leave --kind out."
+        )
+    return scenario.with_changes("asset", component=tuple(components))
+
+
+def export_design(
+    design: Path | None, out: Path, *, kind: PackedKind = "python", replace_file: bool
+) -> Path:
     """Write the wing of a design as an SSP file with one component.
 
     Parameters
@@ -104,6 +144,8 @@ def export_design(design: Path | None, out: Path, *, replace_file: bool) -> Path
         The file of the design; by default the shipped one.
     out : Path
         The file to write.
+    kind : {"python", "compiled"}
+        What evaluates the FMU.
     replace_file : bool
         Whether an existing file may be replaced.
 
@@ -115,7 +157,7 @@ def export_design(design: Path | None, out: Path, *, replace_file: bool) -> Path
     wing = load_design(design)
     binding = load_binding(binding_files()["uav_wing"])
     with scratch_folder() as scratch:
-        fmu = pack_wing(wing, scratch / "wing.fmu").path
+        fmu = pack_wing(wing, scratch / "wing.fmu", kind=kind).path
         wiring = system_of_one_fmu(wing.name, fmu, binding)
         names = _parameter_names(wiring, binding)
         wiring = _with_values(wiring, binding, {}, {})

@@ -111,8 +111,8 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
     """
     if scenario.observation.role == "modes":
         raise FleetError(
-            'a fleet keeps values alone, and `role = "modes"` observes each step with its own '
-            "covariance: fly the scenario with `uav-twin run`."
+            'a fleet stores values without covariances, but with `role = "modes"` each step has a '
+            "covariance of its own: fly the scenario with `uav-twin run`."
         )
     if group.observations:
         _check_recordings(group)
@@ -120,8 +120,8 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
     has_one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
     if has_one_life and len(group.scenarios) < len(group.members):
         raise FleetError(
-            "the damage and noise of this asset are its own, so that every seed would fly the "
-            "same life: name its seeds in `asset.seeds`, or fly the scenario with --seed."
+            "the damage and noise of this asset are its own, so that every seed would fly the same "
+            "mission: name its seeds in `asset.seeds`, or fly the scenario with --seed."
         )
     if flies_model(scenario):
         unknown_parameters = sorted({*group.parameter_spreads} - {_WING_PARAMETER})
@@ -146,11 +146,14 @@ def _check_recordings(group: Group) -> None:
     names = {member.name for member in group.members}
     if not names:
         raise FleetError(
-            f"no recording fits {group.observations}; "
-            "what is still to come is watched by `fleet watch`."
+            f"no recording matches {group.observations}; use `fleet watch` for recordings that are "
+            "still to come."
         )
     if len(names) < len(group.members):
-        raise FleetError("two recordings have the same name, and it names the asset.")
+        raise FleetError(
+            "two recordings have the same name, but assets are named after their recordings: "
+            "rename one."
+        )
 
 
 def _check_true_parameters(group: Group, scenario: Scenario) -> None:

@@ -3,6 +3,8 @@
 A flight that was interrupted is continued with the first shard that is not in the store.
 """
 
+from __future__ import annotations
+
 import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +33,7 @@ from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.evidence import reason_transitions_are_fixed
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.reading import figure_rows, group_figures, open_fleet
-from twin_master.fleet.shard import ShardResult, result_of_unflown
+from twin_master.fleet.shard import ShardResult, reason_flown_one_by_one, result_of_unflown
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.parts import (
@@ -94,7 +96,7 @@ class FleetOutcome:
         title = f"Fleet of {self.twins} twins in {self.folder}"
         return html_table(title, ("result", *figures), figure_rows(figures))
 
-    def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
+    def plot(self, axes: Axes | Sequence[Axes] | None = None) -> list[Axes]:
         """Draw the believed states of all twins over the steps, with the median of the truth.
 
         Parameters
@@ -175,6 +177,7 @@ def fly_fleet(
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
         _note_fixed_transitions(fleet, progress)
+        _note_slow_flights(fleet, progress)
         with JournalFile(folder, hash_record(config)) as journal:
             counts = _FleetFlight(fleet, folder, journal).fly(engine, progress)
         failures, ended = endings_of(folder)
@@ -200,6 +203,26 @@ def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
             progress.note(
                 f"{group.name}: `fleet learn` leaves the transitions as assumed: {reason}."
             )
+
+
+def _note_slow_flights(fleet: Fleet, progress: Progress) -> None:
+    """Tell the user which groups fly one twin after the other, why, and what would be faster."""
+    for group in fleet.groups:
+        if group.observations or len(group.members) < 2:
+            continue
+        reason = reason_flown_one_by_one(group.scenarios[0], fleet.parts)
+        if not reason:
+            continue
+        advice = ""
+        if group.scenarios[0].notice is not None:
+            advice = (
+                " If nobody reads the notices, leave them out: `--no-notices` of `uav-twin run`, "
+                "or `notice = false` in the scenario."
+            )
+        progress.note(
+            f"{group.name}: the {len(group.members)} twins fly one after the other because "
+            f"{reason}, which takes many times as long as side by side.{advice}"
+        )
 
 
 class Endings(NamedTuple):
@@ -252,7 +275,7 @@ def prepare_kit(
     is_real : bool
         Whether the assets are real, so that no asset is simulated.
     parts : TwinParts
-        The parts of the twins that a user gives in the place of those of the scenario.
+        The parts of the twins that a user gives instead of those of the scenario.
 
     Returns
     -------
@@ -420,7 +443,7 @@ class _FleetFlight:
             }
         )
 
-    def _open_group(self, group_name: str) -> "Mapping[str, zarr.Array[object]]":
+    def _open_group(self, group_name: str) -> Mapping[str, zarr.Array[object]]:
         """Return the arrays of a group in the store, by their paths."""
         import zarr
 

@@ -306,8 +306,8 @@ def _learn_group(
     twin_count = sum(len(part.control) for part in steps)
     if not twin_count:
         raise FleetError(
-            "no state of the twins explains what was observed in group "
-            f"{record['name']}: nothing can be learnt of it; look at its model and its noise."
+            f"no state of the twins explains what was observed in group {record['name']}: nothing "
+            "can be learnt from it; check its model and its noise."
         )
     grid = _probability_grid(family, steps) if family.names else None
     rows = np.concatenate([twins.rows for twins in flown])

@@ -372,7 +372,7 @@ def seed_range(text: str) -> range:
     first, colon, end = text.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
         raise FleetError(
-            f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, and `{text}` came."
+            f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, but `{text}` was given."
         )
     seeds = range(int(first), int(end))
     if len(seeds) > LARGEST:
@@ -429,7 +429,7 @@ def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
         return []
     files = sorted(folder.glob(pattern))
     if not files:
-        raise FleetError(f'no file fits `{section.pattern_key}s = "{pattern}"` in {folder}.')
+        raise FleetError(f'no file matches `{section.pattern_key}s = "{pattern}"` in {folder}.')
     return files
 
 

@@ -127,7 +127,7 @@ def _add_flown_fleet(
         page.add_notice(
             f"{len(failures)} of {len(status)} assets failed in flight; their twins end there."
         )
-    _add_failures(page, failures, "All of them stand in fleet.json once the fleet has flown.")
+    _add_failures(page, failures, "fleet.json lists all of them once the fleet has flown.")
     ended_early = int(np.sum(status == ENDED))
     if ended_early:
         page.add_notice(
@@ -144,7 +144,7 @@ def _add_flown_fleet(
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
         _add_attention_table(page, standing, most_assets)
-    page.add_section("How the twins fared")
+    page.add_section("Results of the twins")
     figures = {name: group_figures(group) for name, group in groups.items()}
     WORDS.add_table(
         page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
@@ -163,7 +163,9 @@ def _leaving_or_explanation(
     try:
         probabilities = leaving_probabilities(folder, record, group)
     except TwinMasterError as error:
-        page.add_paragraph(in_one_line(f"Who leaves its control soon is not known: {error}"))
+        page.add_paragraph(
+            in_one_line(f"It is not known which assets will soon change their control: {error}")
+        )
         return None
     return probabilities[flown_rows(stored_values(group, "status"))]
 
@@ -220,7 +222,7 @@ def _damage_sentence(standings: Sequence[Standing]) -> str:
     ):
         states.append(f"{factor.title} {factor.scale * mean:.3g} {factor.unit}".rstrip())
     name = worst_group.names[number]
-    return f"The worst off is {name} of {worst_group.group}: {', '.join(states)}."
+    return f"The asset with the most damage is {name} of {worst_group.group}: {', '.join(states)}."
 
 
 def _add_watched_fleet(
@@ -235,7 +237,7 @@ def _add_watched_fleet(
     if failures:
         asset_count = counted(len(assets | failures), "asset")
         page.add_notice(f"{len(failures)} of {asset_count} are not watched.")
-    _add_failures(page, failures, "They stand in watched.json.")
+    _add_failures(page, failures, "watched.json lists them.")
     without_step = sorted(assets.keys() - decided.keys() - failures.keys())
     if without_step:
         names = ", ".join(without_step[:most_assets])

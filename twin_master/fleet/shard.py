@@ -27,6 +27,7 @@ from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import FAILED, stored_variables
 from twin_master.mission.loop import operate
+from twin_master.mission.parts import TwinParts
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.mission.replay import BelievedModel, refilter
 from twin_master.mission.side_by_side import (
@@ -221,18 +222,29 @@ def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
     """
     knowledge = kit.knowledge
     scenario = kit.scenario
-    has_plain_filter = (
-        scenario.learning is None and scenario.notice is None and not knowledge.parts.replace_filter
-    )
     truths = [knowledge.truth(member.seed) for member in members]
     with _AssetPool(kit, members) as pool:
-        if has_plain_filter:
+        if not reason_flown_one_by_one(scenario, knowledge.parts):
             # An error is suppressed here: it comes again below and is recorded for each twin.
             with suppress(*FLIGHT_ERRORS):
                 assets = pool.open_stateless_assets()
                 if assets:
                     return fly_side_by_side(knowledge, truths, assets)
         return fly_one_by_one(knowledge, truths, pool.asset_at_start)
+
+
+def reason_flown_one_by_one(scenario: Scenario, parts: TwinParts) -> str:
+    """Return why the twins of a scenario have no common filter; empty if they have one.
+
+    Twins with a common filter fly side by side in array operations, if their assets have no memory.
+    """
+    if scenario.learning is not None:
+        return "they learn"
+    if scenario.notice is not None:
+        return "they give notices"
+    if parts.replace_filter:
+        return "they have a sensor model or an estimator of your own"
+    return ""
 
 
 class _AssetKey(NamedTuple):

@@ -422,7 +422,7 @@ def _create_coordinates(
             overwrite=True,
         )
         array[:] = values
-    # By the CF conventions this attribute names the coordinates that are no dimensions.
+    # By the CF conventions this attribute names the coordinates that are not dimensions.
     beside_dimensions = [name for name, entry in coordinates.items() if name != entry.axis]
     if beside_dimensions:
         inner_group.attrs["coordinates"] = " ".join(beside_dimensions)

@@ -110,8 +110,8 @@ class FileSource:
     def __init__(self, watcher: Watcher, group: Group, *, follow: bool) -> None:
         if not follow and not recording_files(group.observations):
             raise FleetError(
-                f"no recording fits {group.observations}; "
-                "what is still to come is waited for with --follow."
+                f"no recording matches {group.observations}; give --follow to wait for recordings "
+                "that are still to come."
             )
         self._watcher = watcher
         self._group = group

@@ -264,7 +264,10 @@ class FleetWatch:
             If the name cannot be that of a folder, or if there are too many assets.
         """
         if not _ASSET_NAME.fullmatch(name):
-            raise FleetError(f"letters, digits, dots and hyphens name an asset, and {name!r} came.")
+            raise FleetError(
+                "the name of an asset must consist of letters, digits, dots and hyphens, but "
+                f"{name!r} was given."
+            )
         if len(self.assets) == LARGEST_FLEET:
             raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
         key = f"{group.name}/{name}"

@@ -405,9 +405,9 @@ def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: 
 
 
 def _joint_with_marginal(joint: Float, belief: Float) -> Float:
-    """Return p(k | D) of a joint belief (K, S) times another belief about the state (S,): (K, S).
+    """Return the joint belief (K, S) that has p(k | D) of one belief, and p(D) of another one (S,).
 
-    In a state that the joint belief rules out, p(k | D) is not defined; p(k) is taken there.
+    If the first belief rules out a state, p(k | D) is not defined there, and p(k) takes its place.
     """
     marginal = joint.sum(axis=0)
     hypothesis_given_state = np.tile(joint.sum(axis=1, keepdims=True), len(belief))

@@ -104,7 +104,7 @@ class FaultFilter:
         )
 
     def _log_gauge_prior(self) -> Float:
-        """Return the log prior probability (G,) of each gauge to be the one that is off.
+        """Return the log prior probability (G,) that the fault is in each gauge.
 
         The probability is proportional to the expected number of steps until a fault of the gauge
         is found. Otherwise a gauge with a weak signal would have no chance beside gauges whose
@@ -176,7 +176,7 @@ class FaultFilter:
     def _advance_belief(self, belief: NDArray[Any], control_index: int) -> None:
         """Advance beliefs (..., S) by one transition under a control, in place.
 
-        A row of zeros stays zero. Such rows are skipped: most of those of gauge faults are zero.
+        A row of zeros stays zero. Such rows are skipped; most rows of faults of gauges are zero.
         """
         rows = belief.reshape(-1, belief.shape[-1])
         is_nonzero = rows.any(axis=1)

@@ -216,7 +216,7 @@ def update_gauge_faults(
     belief : (G K, N) array
         The belief of each fault, gauge by gauge; updated in place.
     squares : (G, K) array
-        The sum of squared innovations of the gauge that is off; updated in place.
+        The sum of squared innovations of the faulty gauge; updated in place.
     sum_cc, sum_cx : (G, K) array
         The sums of the regression of its gain; updated in place.
 

@@ -13,6 +13,8 @@ of at most 1 / c, in however many steps they are compared (Ville 1939; Ramdas, G
 Shafer 2023).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -151,6 +153,8 @@ class WatchfulEstimator:
         notices = self._notices.report_absurd_readings(
             state.left_out, is_absurd, readings, control_index, step
         )
+        if before is None:
+            notices += self._notices.report_own_likelihood(self._sensor_model)
         # A gauge that was left out and sends no reading now counts as left out still.
         state.left_out = is_absurd | (state.left_out & np.isnan(readings))
         suspicion = self._suspicion(state)

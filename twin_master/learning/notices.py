@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
+from twin_master.network.sensor_model import GaussianSensorModel
 
 CLEARLY_BETTER = float(np.log(10.0))
 """Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
-_OR_THE_ASSET = "or the asset near it is not as the model says, as where it has softened"
+_OR_THE_ASSET = "or the asset near it differs from the model, for example because it has softened"
 """Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
 _LEAST_NAMED_PROBABILITY = 0.1
 """A gauge whose probability to be the one that is off is smaller is not named in an alarm."""
@@ -106,6 +107,22 @@ class NoticeWriter:
             notices.append(Notice("gauge_back", sentence, (g + 1,), float(readings[g])))
         return notices
 
+    def report_own_likelihood(self, sensor_model: GaussianSensorModel) -> list[Notice]:
+        """Return the notice that a user's sensor model has a likelihood that alarms do not use.
+
+        Alarms compare faults of gauges under Gaussian noise. The list is empty if the likelihood of
+        the sensor model is the Gaussian one, too.
+        """
+        if not sensor_model.has_own_likelihood:
+            return []
+        sentence = (
+            f"Notices and alarms take the noise of the {self.wording.sensor}s as Gaussian, with "
+            "the predictions and standard deviations of the sensor model "
+            f"{type(sensor_model).__qualname__}; the likelihood of that sensor model decides on "
+            "the belief alone. Say `notice = false` in the scenario if Gaussian noise does not fit."
+        )
+        return [Notice("gaussian", sentence)]
+
     def report_followed_hypothesis(
         self, state: WatchState, hypotheses: Sequence[Hypothesis], step: int
     ) -> list[Notice]:
@@ -130,8 +147,8 @@ class NoticeWriter:
             sentence = f"the model explains the {sensors} again {probability}."
         elif followed < 0:
             sentence = (
-                f"no state explains the {sensors}, none is believed, and the control is the safest "
-                f"{probability}."
+                f"no state explains the {sensors}: no state is believed, and the twin proposes the "
+                f"safest control {probability}."
             )
         else:
             or_the_asset = f"{_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}"
@@ -146,10 +163,10 @@ class NoticeWriter:
     def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
         """Return the alarms that are raised in this step, and mark them as raised in `state`.
 
-        Each kind of fault raises its alarm once: a single gauge, or free gains of several. A gauge
-        that is off also raises the evidence for free gains, and a region that softens raises that
-        for its gauges. So the kind with less evidence raises no alarm in the meantime; free gains
-        must be clearly better than a single gauge, the simpler explanation.
+        Each kind of fault raises its alarm once: a single gauge, or free gains of several. A faulty
+        gauge also raises the evidence for free gains, and a region that softens raises that for its
+        gauges. So the kind with less evidence raises no alarm in the meantime; free gains must be
+        clearly better than a single gauge, the simpler explanation.
         """
         log_gauge = suspicion.log_evidence_any_gauge
         log_free_gains = suspicion.log_evidence_none
@@ -166,7 +183,7 @@ class NoticeWriter:
         return notices
 
     def _gauge_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
-        """Return the alarm that a single gauge is off, with the gauges that may be the one."""
+        """Return the alarm that a single gauge is faulty, with the gauges that it may be."""
         log_weight = state.log_gauge_evidence + self.log_gauge_prior[:, None]
         weight = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))  # (G, K)
         probability = weight.sum(axis=1)
@@ -174,7 +191,7 @@ class NoticeWriter:
         onset = float(np.sum(weight * state.gauge_onset))
         if len(named) > 1:
             sensors = self.wording.name_sensors(named)
-            finding = f"one of {sensors} does not show what the model says"
+            finding = f"one of {sensors} does not show what the model predicts"
         else:
             expected_sign = weight @ np.sign(self.gains)
             amount = "much" if expected_sign[named[0]] > 0.0 else "little"

@@ -208,7 +208,7 @@ class GaugeRegression:
         return result
 
     def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
-        """Return what an observation adds to the six sums of the regression of each gauge.
+        """Return the terms that an observation adds to the six sums of each gauge's regression.
 
         The regression learns offset and gain of a gauge from the sums over observations of the
         products aa, ac, cc, ax, cx and xx: a and c are the changes of the gauge's reading by one

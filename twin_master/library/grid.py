@@ -141,7 +141,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
             known_names = [f"{role}.{key}" for role in _ROLES for key in getattr(binding, role)]
             raise MissionInputError(
                 f"--grid must be NAME=VALUES with a name of the binding {binding.name} "
-                f"({comma_list(known_names)}), and {text} came."
+                f"({comma_list(known_names)}), but {text} was given."
             )
         if len(matches) > 1:
             full_names = " or ".join(f"{role}.{key}" for role, key in matches)
@@ -174,7 +174,7 @@ def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
     except ValueError:
         raise MissionInputError(
             "--grid must give numbers, as 0,0.2,0.4 or as FIRST:LAST:COUNT with a count of 1 to "
-            f"{LARGEST_COUNT}, and {text} came."
+            f"{LARGEST_COUNT}, but {text} was given."
         ) from None
     return tuple(numbers)
 
@@ -213,16 +213,16 @@ def grid_of_fmu(
     if role is None:
         if len(binding.observation) != 1:
             raise MissionInputError(
-                f"the binding {binding.name} observes {comma_list(binding.observation)}: say "
-                "which one by --role."
+                f"the binding {binding.name} observes {comma_list(binding.observation)}: choose "
+                "one with --role."
             )
         role = next(iter(binding.observation))
     parameters = values_by_role["parameter"]
     swept_parameters = [name for name, values in parameters.items() if len(values) > 1]
     if len(swept_parameters) > 1:
         raise MissionInputError(
-            f"a library has one uncertain parameter, and {', '.join(swept_parameters)} came with "
-            "several values."
+            f"a library has one uncertain parameter, but {', '.join(swept_parameters)} were given "
+            "with several values."
         )
     parameter = swept_parameters[0] if swept_parameters else ""
     draws = parameters.pop(parameter, (0.0,))
@@ -265,7 +265,9 @@ def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
     """Return the one value of each load input; refuse a load with several values."""
     for name, values in loads.items():
         if len(values) > 1:
-            raise MissionInputError(f"the load {name} can have one value, and {len(values)} came.")
+            raise MissionInputError(
+                f"the load {name} can have one value, but {len(values)} were given."
+            )
     return {name: values[0] for name, values in loads.items()}
 
 

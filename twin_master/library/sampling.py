@@ -119,7 +119,7 @@ def sample_library(
     worker_count = _processor_count() if workers is None else workers
     if worker_count < 1:
         raise MissionInputError(
-            f"the number of workers must be at least 1, and {worker_count} came."
+            f"the number of workers must be at least 1, but {worker_count} was given."
         )
     binding = load_binding(grid.binding)
     _check_grid(grid, binding)
@@ -227,7 +227,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
         )
     for name, levels in grid.states.items():
         if any(second <= first for first, second in itertools.pairwise(levels)):
-            raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
+            raise MissionInputError(f"the levels of {name} must increase, but {levels} was given.")
 
 
 def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
@@ -280,14 +280,14 @@ def _prepare_folder(
         if not resume:
             raise MissionInputError(
                 f"{folder} holds the finished blocks of an interrupted sampling: give --resume to "
-                "go on with them, or --replace to begin anew."
+                "go on with them, or --replace to begin again."
             )
         former_plan = plan_file.read_bytes() if plan_file.is_file() else b""
         if former_plan and former_plan != plan.encode("utf-8"):
             difference = _differing_keys(former_plan, record)
             raise MissionInputError(
                 f"{folder} holds blocks of another FMU, binding, grid or version ({difference}): "
-                "give --replace to begin anew."
+                "give --replace to begin again."
             )
         if former_plan:
             return folder

@@ -54,7 +54,7 @@ _HASH_LENGTH = 64
 """Characters of a SHA-256 hash in hexadecimal digits."""
 _BLOCK_SIZE = 1_000_000
 """Bytes that are read at once from the end of a journal."""
-_WRONG_HASH = "it does not have the hash that stands before it"
+_WRONG_HASH = "its hash does not fit its content"
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
 
 
@@ -420,6 +420,6 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
             line_begin += len(line)
     return NotResumableError(
         f"line {line_number} of the journal {path} was changed or is damaged ({reason}); "
-        f"{undamaged_lines_before} before it are whole, and {undamaged_lines_after} behind it: "
-        "begin again with --replace."
+        f"{undamaged_lines_before} before it and {undamaged_lines_after} after it are valid: begin "
+        "again with --replace."
     )

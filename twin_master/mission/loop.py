@@ -38,7 +38,7 @@ class Source(Protocol):
         """Return the next observation for the twin; None if there are no more."""
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return what the twin assimilates in place of a reading that it refused with an error."""
+        """Return the observation that replaces one that the twin refused with an error."""
 
 
 StepSink = Callable[[MissionStep], None]

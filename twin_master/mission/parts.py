@@ -65,7 +65,7 @@ GivenEstimator = Estimator | Callable[[TwinBeforeFlight], Estimator] | str
 
 @dataclass(frozen=True)
 class TwinParts:
-    """The parts of a twin that a user gives in the place of those of the scenario.
+    """The parts of a twin that a user gives instead of those of the scenario.
 
     Attributes
     ----------
@@ -161,8 +161,8 @@ class TwinParts:
         if not isinstance(part, GaussianSensorModel):
             raise MissionInputError(
                 "the sensor model of a mission must be a GaussianSensorModel or a class derived "
-                "from it, because planner and report use its predictions, and "
-                f"{description(part)} came: derive the class, or step a `uav_twin.Twin` with it."
+                f"from it, because planner and report use its predictions, but {description(part)} "
+                "was given: derive the class, or step a `uav_twin.Twin` with it."
             )
         needed = twin.sensor_model.mean.shape
         if part.mean.shape != needed:
@@ -197,7 +197,8 @@ class TwinParts:
         if part is None or isinstance(part, str) or not _is_estimator(part):
             raise MissionInputError(
                 "an estimator needs `model`, `step(before, observation, control_index, step)` and "
-                f"`smoothed(carried)`, and {description(part)} came: see `uav_twin.ExactFilter`."
+                f"`smoothed(carried)`, but {description(part)} was given: see "
+                "`uav_twin.ExactFilter`."
             )
         states = part.model.states.size  # type: ignore[union-attr]
         if states != twin.model.states.size:
@@ -293,7 +294,7 @@ def _object_of_file(path: Path, attribute: str) -> object:
     """Return an attribute of the module that a Python file defines."""
     specification = importlib.util.spec_from_file_location(path.stem, path)
     if specification is None or specification.loader is None:
-        raise ImportError(f"{path} is no Python file")
+        raise ImportError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return getattr(module, attribute)

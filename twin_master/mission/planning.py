@@ -177,8 +177,8 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
             # allow these, which would be unsafe.
             reason = "it is neither NPY nor NPZ"
         raise PlanningError(
-            f"{path} is no policy, as of `uav-twin plan --out` ({reason}): give such a file, or "
-            "fly a run again whose copy is damaged"
+            f"{path} is not a policy such as `uav-twin plan --out` writes ({reason}): give such a "
+            "file, or fly a run again whose copy is damaged"
         ) from None
     states = policy.vectors.shape[1]
     if controls != model.controls or states != model.states.size:

@@ -388,7 +388,7 @@ def prepare_knowledge(
     policy: Float | BeliefPolicy | None = None,
     parts: TwinParts = NO_PARTS,
 ) -> Knowledge:
-    """Return what a twin knows: calibrated draws, and predictions for every state and control.
+    """Return the knowledge of a twin: calibrated draws, and predictions by state and control.
 
     Kapteyn et al. 2021, eq. (30). The plan, eq. (36), is made when it is first used.
 
@@ -434,7 +434,7 @@ def prepare_twin(
     *,
     progress: Progress | None = None,
 ) -> Knowledge:
-    """Return what the twin of a scenario knows before its flight, without a run folder.
+    """Return the knowledge of a scenario's twin before its flight, without a run folder.
 
     Parameters
     ----------
@@ -463,7 +463,7 @@ def prepare_twin(
 def prepare_without_folder(
     scenario: Scenario, source: AssetSource, progress: Progress | None = None
 ) -> Knowledge:
-    """Return what a twin knows, without a run folder; the source works in a temporary folder."""
+    """Return the knowledge of a twin without a run folder; the source uses a temporary folder."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
@@ -537,7 +537,7 @@ def link_knowledge(folder: Path, other_folder: Path) -> None:
 def load_knowledge(
     folder: Path, scenario: Scenario, number: int | None = None, parts: TwinParts = NO_PARTS
 ) -> Knowledge:
-    """Return what the twin of a run knew before its flight.
+    """Return the knowledge that the twin of a run had before its flight.
 
     Parameters
     ----------

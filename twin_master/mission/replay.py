@@ -171,7 +171,7 @@ class _BackwardScan:
         raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
 
     def _take_in_settled_state(self, record: JsonObject) -> None:
-        """Keep the settled state in a record, if it is the first one that is early enough."""
+        """Keep the settled state of a record if none is kept yet and it is early enough."""
         if self.settled is not None or "settled" not in record:
             return
         step = int(record["settled"]["step"])
@@ -208,7 +208,7 @@ class _BackwardScan:
                 observations = f"`--observations {self._path.parent}`"
                 advice = f"begin another watch, in another folder, with {observations}"
             raise NotResumableError(
-                f"the journal decided otherwise after step {number} than this version does: "
+                f"the journal has another decision after step {number} than this version makes: "
                 f"{advice}."
             )
 

@@ -218,7 +218,7 @@ def choose_sensors(
     """
     if not 1 <= count <= len(candidates):
         raise MissionInputError(
-            f"--sensors is from 1 to {len(candidates)}, the candidates, and {count} came."
+            f"--sensors is from 1 to {len(candidates)}, the candidates, but {count} was given."
         )
     chosen = _add_greedily(readings, candidates, count)
     chosen = _exchange(readings, candidates, chosen)

@@ -553,7 +553,8 @@ class Plant:
         """Return the true state (F,) that an asset with damage of its own reports."""
         if reading.state is None:
             raise MissionInputError(
-                f"step {self.step}: the asset does not tell its damage, which `truth` asks of it"
+                f"step {self.step}: the asset does not report its damage, which the table `truth` "
+                "requires"
             )
         return np.array([reading.state[name] for name in self._scenario.state_names])
 

@@ -5,6 +5,8 @@ estimate, and receives them for the next step. So a twin that keeps these arrays
 steps, filter again with late observations, and be stored and continued to the last bit.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -337,7 +339,7 @@ class NoticeWording:
     command: str = "uav-twin discrepancy run --from-run DIR"
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "NoticeWording":
+    def of(cls, scenario: Scenario) -> NoticeWording:
         """Return the wording that fits the steps and sensors of a scenario."""
         observation = scenario.observation
         factor, units = observation.printed

@@ -4,6 +4,8 @@ They are the factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Eve
 of the twin passes `stochastic_matrix`, which checks it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -65,7 +67,7 @@ class Factor:
         nearest_level = int(distance.argmin())
         if not distance[nearest_level] <= self.slack:
             raise InvalidModelError(
-                f"{value} is no level of factor {self.name!r}; its levels are "
+                f"{value} is not a level of factor {self.name!r}; its levels are "
                 f"{comma_list(self.levels)}"
             )
         return nearest_level
@@ -121,7 +123,7 @@ class StateSpace:
         Raises
         ------
         InvalidModelError
-            If a value is no level of its factor.
+            If a value is not a level of its factor.
         """
         if len(levels) != len(self.factors):
             raise InvalidModelError(
@@ -257,7 +259,7 @@ class GraphicalModel:
         levels: Mapping[str, Sequence[float]],
         tables: Mapping[str, Mapping[str, ArrayLike]],
         prior: Mapping[str, ArrayLike] | None = None,
-    ) -> "GraphicalModel":
+    ) -> GraphicalModel:
         """Return the model of factors that change independently, given the control.
 
         Kapteyn et al. 2021, eqs. (28)-(29).
@@ -274,7 +276,7 @@ class GraphicalModel:
         Raises
         ------
         InvalidModelError
-            If levels do not increase, a row is no distribution, or the table of a factor is
+            If levels do not increase, a row is not a distribution, or the table of a factor is
             missing.
         """
         states = StateSpace(tuple(Factor(name, tuple(values)) for name, values in levels.items()))

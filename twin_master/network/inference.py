@@ -8,6 +8,8 @@ The order of one step t: control u_t is in force, the state is D_t, the observat
 under u_t. Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +46,7 @@ class Filtered:
     log_filtered: Float
     log_evidence: Float
 
-    def __getitem__(self, index: int | slice | tuple[int | slice, ...]) -> "Filtered":
+    def __getitem__(self, index: int | slice | tuple[int | slice, ...]) -> Filtered:
         """Return the beliefs at an index of the leading axes."""
         return Filtered(
             forecast=np.asarray(self.forecast[index]),
@@ -74,7 +76,7 @@ class Predicted:
         """p(U_{t+h} | o_0..o_t): (H, U)."""
         return np.asarray(self.joint.sum(axis=1))
 
-    def mix_control(self, weight: float, control: Float) -> "Predicted":
+    def mix_control(self, weight: float, control: Float) -> Predicted:
         """Return the prediction with another distribution of the controls mixed in.
 
         Parameters

@@ -1,5 +1,7 @@
 """Decisions, and planning by value iteration: Kapteyn et al. 2021, eq. (36)."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -48,7 +50,7 @@ class BeliefPolicy:
     control: Index
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> BeliefPolicy:
         """Return the policy whose two arrays were read from a file.
 
         Parameters
@@ -259,7 +261,7 @@ class _DecisionProcess:
     @classmethod
     def from_arrays(
         cls, transition: TransitionModel, reward: ArrayLike, discount: ArrayLike
-    ) -> "_DecisionProcess":
+    ) -> _DecisionProcess:
         """Return the problem with checked rewards (S, U) and discounts, one or (U,).
 
         Raises

@@ -8,6 +8,8 @@ Rewards for health, control and error follow with their uncertainty, eqs. (9)-(1
 says which value is a limit, what a control is worth and how an error is scaled.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -116,7 +118,8 @@ class QuantityModel:
     Raises
     ------
     InvalidModelError
-        If the array has another rank, is empty or not finite, or the weights are no distribution.
+        If the array has another rank, is empty or not finite, or the weights are not a
+        distribution.
     """
 
     def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:

@@ -3,6 +3,8 @@
 Kapteyn et al. 2021, eqs. (30) and (32).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
@@ -191,6 +193,16 @@ class GaussianSensorModel(QuantityModel):
             raise InvalidModelError(
                 f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
             )
+
+    @property
+    def has_own_likelihood(self) -> bool:
+        """Whether a subclass computes the density of an observation in a way of its own."""
+        own = type(self)
+        return (
+            own.log_likelihood is not GaussianSensorModel.log_likelihood
+            or own.log_likelihood_sequence is not GaussianSensorModel.log_likelihood_sequence
+            or own.log_density_of_draws is not GaussianSensorModel.log_density_of_draws
+        )
 
     @property
     def extra_arguments(self) -> Mapping[str, Any]:
@@ -565,5 +577,5 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
         raise InvalidModelError(
             f"`{key}` is {sensor_noise:g} for sensor {sensor + 1}, and all that sensors of its "
             f"unit ({unit}) can show by the twin's model lies between {low:.3g} and {high:.3g}: "
-            f"such a sensor tells nothing; {advice}."
+            f"such a sensor gives no information; {advice}."
         )

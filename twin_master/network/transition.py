@@ -48,7 +48,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
     Raises
     ------
     InvalidModelError
-        If a row is no distribution; the message has the index of the first.
+        If a row is not a distribution; the message has the index of the first.
     """
     matrix = np.array(rows, dtype=np.float64, order="C")
     if matrix.ndim == 0 or matrix.size == 0:
@@ -236,7 +236,7 @@ class TransitionModel:
         Raises
         ------
         InvalidModelError
-            If a table is no square matrix of transitions, or if the controls have other states.
+            If a table is not a square matrix of transitions, or if the controls have other states.
         """
         checked = []
         for control, factor_tables in enumerate(tables):

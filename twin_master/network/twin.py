@@ -3,6 +3,8 @@
 It never receives the true state.
 """
 
+from __future__ import annotations
+
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -196,7 +198,7 @@ class Twin:
     Raises
     ------
     InvalidModelError
-        If the policy has another shape or is no policy, there is no such control, or the lag is
+        If the policy has another shape or is not a policy, there is no such control, or the lag is
         negative.
     InvalidChoiceError
         If `decide_on` is another word.
@@ -207,7 +209,7 @@ class Twin:
         name: str,
         model: GraphicalModel,
         sensor_model: SensorModel,
-        policy: "ArrayLike | Planner",
+        policy: ArrayLike | Planner,
         *,
         prediction_steps: int = 10,
         decide_on: DecisionBasis = "filtered",
@@ -358,7 +360,7 @@ class Twin:
         return self._decide(replace(estimate, notices=tuple(notices)))
 
     def observed(self, step: int) -> Float:
-        """Return what was observed in a kept step: (G,), NaN where nothing was received."""
+        """Return the observation (G,) of a kept step; NaN for a sensor without a reading."""
         return self._kept_steps[step - self._first_in_memory].observation
 
     def control_of(self, step: int) -> int:
@@ -416,10 +418,10 @@ class Twin:
         Raises
         ------
         InvalidModelError
-            If the bytes are no such state.
+            If the bytes are not such a state.
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
-        with InvalidModelError.instead_of(*causes, before="this is no saved state of a twin: "):
+        with InvalidModelError.instead_of(*causes, before="this is not a saved state of a twin: "):
             stored = arrays_from_bytes(state, "the state of the twin")
             arrays = {_FORMER_COUNT.sub("steps", name): value for name, value in stored.items()}
             steps, proposed = arrays["steps"].tolist()
@@ -457,9 +459,9 @@ class Twin:
             is_finite = False
         if not is_finite:
             raise InvalidObservationError(
-                f"twin {self.name!r}, step {step}: the observation cannot be weighed, for beside "
-                "what was observed before its numbers leave no belief; check the sensors and the "
-                "control in force"
+                f"twin {self.name!r}, step {step}: the observation is so improbable after the "
+                "earlier ones that no belief can be computed; check the sensors and the control "
+                "in force"
             )
         return estimate
 

@@ -285,7 +285,7 @@ def _draw_margin(figure: Figure, axes: Axes, run: Run) -> None:
         increasing = np.sort(action_values, axis=1)
         minuend = increasing[:, -1]
         subtrahend = increasing[:, -2]
-        label = "value beyond the next best"
+        label = "value minus that of the next best control"
     margin = minuend - subtrahend
     largest_margin = float(np.abs(margin).max()) or 1.0
     if len(run.controls) == 2:  # the margin has either sign

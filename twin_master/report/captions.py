@@ -181,7 +181,7 @@ def _assumptions(run: Run) -> str:
     if error:
         assumptions += f" and an error of its model of {error} of the predicted value"
     if run.scenario.learning is not None:
-        assumptions += ", and stands here by what it has learnt of it"
+        assumptions += ", corrected by what it has learnt about it"
     return assumptions
 
 

@@ -44,7 +44,7 @@ class _Switch:
     factor : str
         The title of the factor, with its article.
     level : str
-        The level with its unit.
+        The level with its unit, and whether the true value that is nearest to it is smaller.
     is_always_reached : bool
         Whether the level is the lowest, so that the policy leaves the first control in every state.
     """
@@ -55,7 +55,7 @@ class _Switch:
 
 
 def _decision_sentence(run: Run) -> str:
-    """Return the sentence on the flown controls, and on the delay of a fallback behind the damage.
+    """Return the sentence on the flown controls, and on the delay from the damage to the fallback.
 
     A fallback is the change from the first control after the true state has reached the level at
     which the policy leaves it.
@@ -94,11 +94,18 @@ def _switch(run: Run, fallback: Fallback) -> _Switch | None:
     """Return the level at which the policy leaves the first control; None if there is none."""
     if fallback.switch_state is None or fallback.switch_level is None:
         return None
-    factor = run.factors[run.scenario.state_names.index(fallback.switch_state)]
+    factor_index = run.scenario.state_names.index(fallback.switch_state)
+    factor = run.factors[factor_index]
     level = factor.scale * fallback.switch_level
+    level_text = f"{level:.4g} {factor.unit}".rstrip()
+    if fallback.called_for_step is not None and run.true_state is not None:
+        true_value = run.true_state[fallback.called_for_step, factor_index]
+        slack = run.model.states.factors[factor_index].slack
+        if true_value < fallback.switch_level - slack:
+            level_text += " (to the nearest level)"
     return _Switch(
         factor=_with_article(factor.title),
-        level=f"{level:.4g} {factor.unit}".rstrip(),
+        level=level_text,
         is_always_reached=level <= factor.levels[0],
     )
 
@@ -114,7 +121,7 @@ def _changes_of_control(run: Run) -> str:
 
 
 def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
-    """Return the clause on the step of the fallback and its delay behind the damage."""
+    """Return the clause on the step of the fallback and on the delay from the damage to it."""
     row = fallback.fallback_step
     assert row is not None
     if np.count_nonzero(np.diff(run.control_index)) == 1:
@@ -194,7 +201,7 @@ def _belief_sentence(run: Run) -> str:
 
 
 def _decided_by(run: Run) -> str:
-    """Return what decided on the last control according to the run's summary.
+    """Return the hypothesis that decided on the last control, from the run's summary.
 
     This is "model" unless an alarm overrides the model.
     """

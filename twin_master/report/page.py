@@ -137,7 +137,8 @@ def _present_row(run: Run, now: int | None) -> int:
     last_step = first_step + run.step_count - 1
     if not first_step <= now <= last_step:
         raise RunFolderError(
-            f"The present step of the report must lie in {first_step}..{last_step}, and {now} came."
+            f"The present step of the report must lie in {first_step}..{last_step}, but {now} was "
+            "given."
         )
     return now - first_step
 
@@ -210,7 +211,7 @@ def render_page(
     tables.add_run_table(page, run, seed)
     page.begin_fold("Versions of the software and hashes of the inputs")
     page.add_paragraph(
-        "Wall-clock times stand in timing.json, so that equal runs give equal reports."
+        "Wall-clock times are only in timing.json, so that equal runs give equal reports."
     )
     tables.add_provenance_table(page, run)
     page.end_fold()
@@ -252,9 +253,9 @@ def _add_outcome(page: Page, run: Run) -> None:
     if run.summary.get("asset_and_model_differ"):
         _add_notice(
             page,
-            "The asset and the twin's model differ: flown was the "
-            f"{run.summary['asset']}, and the twin believes the {run.summary['twin_model']}. "
-            "Its intervals hold as far as that model holds.",
+            f"The asset and the twin's model differ: the asset was the {run.summary['asset']}, and "
+            f"the twin believes the {run.summary['twin_model']}. Its intervals hold as far as that "
+            "model holds.",
         )
     notices = [notice["sentence"] for notice in run.summary.get("notices", [])]
     for notice in notices:

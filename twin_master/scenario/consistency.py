@@ -70,7 +70,7 @@ class ScenarioTables(Section):
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
     """The controls that the twin chooses from."""
     action: tuple[Action, ...] = ()
-    """Inspections, repairs and the end of the mission, beside the controls."""
+    """Inspections, repairs and the end of the mission, in addition to the controls."""
     observation: ObservationSection
     """What is observed, and how well."""
     transition: Transition
@@ -272,13 +272,13 @@ class ScenarioTables(Section):
             yield (
                 max(sensors) > sensor_count or is_repeated,
                 f"`rewards.health_sensors` must name different sensors from 1 to {sensor_count}, "
-                f"and {comma_list(sensors)} came",
+                f"but {comma_list(sensors)} was given",
             )
         yield value_count_fault("rewards.health_limit", rewards.health_limit, limited_count)
         yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
 
     def _sensor_faults(self) -> Iterator[Fault]:
-        """Yield (is present, message) of each possible fault: what is stated by sensor."""
+        """Yield (is present, message) of each possible fault of values stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
             yield value_count_fault(
@@ -306,8 +306,8 @@ class ScenarioTables(Section):
             largest = max(fault.sensor_indices(sensor_count)) + 1
             yield (
                 largest > sensor_count,
-                f"`truth.sensor_faults.sensors` counts from 1 to {sensor_count}, and {largest} "
-                "came",
+                f"`truth.sensor_faults.sensors` counts from 1 to {sensor_count}, but {largest} was "
+                "given",
             )
 
     def _strain_noise_fault(self, key: str, noise: float | tuple[float, ...]) -> Fault:

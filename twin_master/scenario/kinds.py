@@ -170,7 +170,7 @@ class KindSection(FileSection):
         expectation = f"`kind` must be one of {', '.join(sorted(kinds))}"
         if "kind" not in table:
             raise missing_keys(["kind"], f"{expectation}, and it is missing")
-        raise ValueError(f"{expectation}, and {short_repr(kind)} came")
+        raise ValueError(f"{expectation}, but {short_repr(kind)} was given")
 
 
 _Section = TypeVar("_Section", bound=KindSection)

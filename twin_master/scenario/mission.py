@@ -54,12 +54,12 @@ class StateFactor(Section):
         listed = ", ".join(str(level) for level in self.levels)
         yield (
             does_not_increase,
-            f"`levels` of state `{self.name}` must increase, and {listed} came",
+            f"`levels` of state `{self.name}` must increase, but {listed} was given",
         )
         yield (
             len(self.prior) != len(self.levels),
             f"`prior` of state `{self.name}` must hold one probability for each of its "
-            f"{len(self.levels)} levels, and {len(self.prior)} came",
+            f"{len(self.levels)} levels, but {len(self.prior)} were given",
         )
         total = sum(self.prior)
         yield (

@@ -221,8 +221,8 @@ class ObservationSection(Section):
         has_modes = table.get("modes") is not None
         if (table.get("role") == MODES_ROLE) != has_modes:
             raise ValueError(
-                f"the role `{MODES_ROLE}` needs the table `observation.modes`, and that needs "
-                "the role"
+                f"the role `{MODES_ROLE}` and the table `observation.modes` belong together: give "
+                "both, or neither of them"
             )
         if not has_modes:
             return table

@@ -34,7 +34,8 @@ def _limit_validator(limit: int, reason: str) -> AfterValidator:
     def check(value: int) -> int:
         if value > limit:
             raise ValueError(
-                f"a number of at most {limit} is expected, {reason}, and {short_repr(value)} came"
+                f"a number of at most {limit} is expected, {reason}, but {short_repr(value)} was "
+                "given"
             )
         return value
 
@@ -207,7 +208,9 @@ def _check_percentage(key: object, value: object) -> None:
         if isinstance(entry, bool) or not isinstance(entry, int | float):
             continue  # the type of the field refuses it
         if not -100 <= entry <= 100:
-            raise ValueError(f"`{key}` is in percent, at most 100, and {short_repr(entry)} came")
+            raise ValueError(
+                f"`{key}` is in percent, at most 100, but {short_repr(entry)} was given"
+            )
 
 
 def _convert_to_si(value: object, divisor: float) -> object:
@@ -237,7 +240,8 @@ def value_count_fault(key: str, value: object, count: int) -> Fault:
     """
     number = len(value) if isinstance(value, tuple) else count
     message = (
-        f"`{key}` must be one value, or one for each of the {count} sensors, and {number} came"
+        f"`{key}` must be one value, or one for each of the {count} sensors, but {number} were "
+        "given"
     )
     return number != count, message
 
@@ -271,7 +275,7 @@ def unknown_name_fault(name: str, known: Sequence[str], key: str, what: str) -> 
     what : str
         What is named, in the singular, for the message: "control".
     """
-    message = f"`{key}` must name a {what} ({', '.join(known)}), and `{name}` came"
+    message = f"`{key}` must name a {what} ({', '.join(known)}), but `{name}` was given"
     return name not in known, message
 
 

@@ -136,7 +136,8 @@ class Transition(Section):
                 departure = max(abs(sum(row) - 1.0) for row in rows)
                 yield (
                     departure > ROW_SUM_TOLERANCE,
-                    f"each row of `{key}.{state}` must sum to 1, one misses it by {departure:.3g}",
+                    f"each row of `{key}.{state}` must sum to 1, but one differs by "
+                    f"{departure:.3g}",
                 )
 
 
@@ -291,7 +292,7 @@ class InspectedState(NamedTuple):
 
 
 class Action(Section):
-    """A choice in a step beside the controls, such as an inspection or a repair."""
+    """A choice in a step in addition to the controls, such as an inspection or a repair."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
     name: Name
@@ -455,7 +456,10 @@ class Learning(Section):
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)
-        yield does_not_increase, f"`learning.transition_factors` must increase, and {listed} came"
+        yield (
+            does_not_increase,
+            f"`learning.transition_factors` must increase, but {listed} was given",
+        )
         yield (
             len(factors) == 1,
             "`learning.transition_factors` needs two or more factors to choose from",
@@ -542,7 +546,9 @@ class WatchSection(FileSection):
     observations: str | None = None
     """A recorded file that is watched by default, or the name of a shipped one."""
     lag: Count = 50
-    """Steps back over which the twin smooths; a message may be as late."""
+    """Number of past steps over which the twin smooths; a message may be late by this number of
+    steps.
+    """
     longest_gap: Count = 1000
     """Steps that a message may be ahead of the next one; the twin predicts those between."""
     seconds_per_step: Positive | None = None

@@ -92,7 +92,7 @@ class Fallback:
     switch_control : int or None
         The index of the control that the policy takes there; None if it takes several.
     called_for_step : int or None
-        The first step in which the true state reaches that level.
+        The first step in which that level, or a higher one, is the nearest to the true state.
     fallback_step : int or None
         The first step from then on that is flown with another control.
     early_step : int or None
@@ -123,7 +123,10 @@ def find_fallback(
 ) -> Fallback:
     """Return when the policy calls for another control than the first one, and when it was flown.
 
-    T is the number of steps, S that of states, F that of state factors.
+    A level of the policy stands for all true values that are nearest to it. So the true state calls
+    for another control from the middle between the two levels on between which the policy changes.
+
+    T is the number of steps, S the number of states, and F the number of state factors.
 
     Parameters
     ----------
@@ -143,7 +146,7 @@ def find_fallback(
         return Fallback()
     factor = states.factors[switch.factor_index]
     # `slack` lets a true value count as its level if it differs by rounding only
-    is_called_for = true_state[:, switch.factor_index] >= switch.level - factor.slack
+    is_called_for = true_state[:, switch.factor_index] >= switch.least_value - factor.slack
     called_for_step = _first_true(is_called_for)
     has_left = control_index != first_control
     is_at_level = states.coordinates[:, switch.factor_index] >= switch.level - factor.slack
@@ -174,10 +177,14 @@ class PolicySwitch(NamedTuple):
         The index of the one state factor that the policy depends on.
     level : float
         The level of this factor, SI, from which on the policy takes another control.
+    least_value : float
+        The least value of this factor, SI, to which that level is the nearest; the level itself if
+        it is the lowest.
     """
 
     factor_index: int
     level: float
+    least_value: float
 
 
 def find_policy_switch(
@@ -206,7 +213,9 @@ def find_policy_switch(
         depends_on_factor_alone = np.array_equal(leaves_somewhere, leaves_everywhere)
         level = _first_true(leaves_everywhere)
         if depends_on_factor_alone and level is not None and leaves_everywhere[level:].all():
-            return PolicySwitch(axis, float(factor.levels[level]))
+            level_below = factor.levels[max(level - 1, 0)]
+            least_value = 0.5 * (level_below + factor.levels[level])
+            return PolicySwitch(axis, float(factor.levels[level]), float(least_value))
     return None
 
 
@@ -518,7 +527,7 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     fallback_step = fallback.fallback_step
     delay = fallback.delay
     if fallback.early_step is not None and delay == 0:
-        # The other control was in force before the damage: this is no fallback from it.
+        # The other control was in force before the damage: this is not a fallback from it.
         fallback_step = None
         delay = None
     step = scenario.mission.step_name

@@ -108,7 +108,7 @@ class Flight:
     Raises
     ------
     NotResumableError, RunFolderError
-        If it is no run folder, if it is damaged, or if the flight is not prepared yet (see
+        If it is not a run folder, if it is damaged, or if the flight is not prepared yet (see
         `is_prepared`).
 
     Attributes
@@ -142,7 +142,7 @@ class Flight:
         self._models: list[_JournalledKnowledge] = []
         self._add_model(0)
         self._lines_of_steps: list[_StepLines] = []
-        # Notices of lines that are no step, by the step before them
+        # Notices of lines that are not steps, by the step before them
         self._later_notices: defaultdict[int, list[StepRecord]] = defaultdict(list)
         self.drawings: list[ForceDrawing] = []
         self.number += 1
@@ -240,14 +240,14 @@ class Flight:
         if not 0 <= observed_step <= record["step"] == last_step:
             step = f"{self.scenario.mission.step_name} {record['step']}"
             raise RunFolderError(
-                f"the journal in {self.folder} tells {step} where {self.steps} was expected: it is "
+                f"the journal in {self.folder} has {step} where {self.steps} was expected: it is "
                 "of another version."
             )
         self._lines_of_steps[-1].belief = begin
         self._lines_of_steps[observed_step].observation = begin
 
     def _take_event(self, record: StepRecord, begin: int) -> None:
-        """Update the flight with a line that is no step: notices, a verdict, or a patched model.
+        """Update the flight with a line that is not a step: notices, a verdict, or a patched model.
 
         Its notices are shown with the last step before it. If its verdict has a drawing of the
         missing force, the drawing is added.
@@ -305,7 +305,7 @@ class Flight:
         return np.array([array_from_json(record.get("state", unknown)) for record in records])
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return what the twin believed in each of n steps at the time of the step.
+        """Return the belief of the twin in each of n steps at the time of the step.
 
         Each step is evaluated with the knowledge that the twin had in it.
         """
@@ -326,7 +326,7 @@ class Flight:
         )
 
     def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return what the twin believed in n steps, in all of which it had the given knowledge."""
+        """Return the belief of the twin in n steps, in all of which it had the given knowledge."""
         filtered = np.array([record["filtered"] for record in records])
         controls = [record["control_index"] for record in records]
         joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
@@ -369,7 +369,7 @@ class Flight:
         return concatenate_expectations(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
-        """Return what the twin predicted, after one step, for each of the n steps to come.
+        """Return the predictions that the twin made after one step, for each of the n next steps.
 
         n is the number of steps that the scenario predicts (`mission.prediction_steps`).
         """
@@ -429,5 +429,5 @@ def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
 
 
 def is_prepared(folder: Path) -> bool:
-    """Return whether a run folder has all that precedes the first step, and can be viewed."""
+    """Return whether a run folder is complete up to the first step, so that it can be viewed."""
     return (folder / KNOWLEDGE_NAME).is_file()

@@ -27,7 +27,7 @@ POLL_SECONDS = 0.015
 LONGEST_REQUEST = 4096
 """Greatest length of a request [bytes]."""
 _INVALID_MESSAGE = 1003
-"""The code with which a WebSocket is closed after a message that is no request."""
+"""The code with which a WebSocket is closed after a message that is not a request."""
 
 HOST_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
 """The host names that are answered.
@@ -70,7 +70,7 @@ class _StepsSocket(WebSocketHandler):
         self._page = page
 
     def on_message(self, message: str | bytes) -> None:
-        """Answer a request; close the connection if the message is no request."""
+        """Answer a request; close the connection if the message is not a request."""
         try:
             self._page.ask(self.send, Request.model_validate_json(message))
         except ValueError as error:

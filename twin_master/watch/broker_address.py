@@ -65,8 +65,8 @@ def parse_broker(address: str, authority: Path | None = None, *, many: bool = Fa
     Raises
     ------
     MissionInputError
-        If paho-mqtt is not installed; if the address is no such address, has a password in it, or
-        has a topic of many assets for one or of one for many; if the file holds no certificate.
+        If paho-mqtt is not installed; if the address is not such a address, has a password in it,
+        or has a topic of many assets for one or of one for many; if the file holds no certificate.
     """
     if find_spec("paho") is None:
         raise MissionInputError(
@@ -114,7 +114,7 @@ def _address_error(address: str) -> MissionInputError:
 
 
 def _check_certificate(authority: Path, *, tls: bool) -> None:
-    """Refuse a certificate that is no file, belongs to no `mqtts://`, or cannot be read."""
+    """Refuse a certificate that is not a file, belongs to no `mqtts://`, or cannot be read."""
     if not tls or not authority.is_file():
         raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
     with MissionInputError.instead_of(

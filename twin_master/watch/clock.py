@@ -59,7 +59,7 @@ class Clock:
         Raises
         ------
         Refused
-            If the step lies before the first one or is no number, or if the scenario gives no
+            If the step lies before the first one or is not a number, or if the scenario gives no
             length of a step.
         """
         seconds_per_step = self._section.seconds_per_step

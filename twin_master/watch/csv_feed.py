@@ -27,7 +27,7 @@ _CONVERSIONS: dict[str, Callable[[str], object]] = {
     "time": float,
     "control": str,
 }
-"""The columns that are no sensor, with the conversion of their cells."""
+"""The columns that are not sensors, with the conversion of their cells."""
 _MISSING_VALUES = ("nan", "null", "none")
 """Cells of these columns that mean that there is no value."""
 
@@ -110,7 +110,7 @@ class CsvFeed(RecordedFeed):
         Raises
         ------
         MissionInputError
-            If there are no names, if one is no column, or if two mean the same column.
+            If there are no names, if one is not a column, or if two mean the same column.
         """
         if not any(names):
             raise MissionInputError(
@@ -136,7 +136,8 @@ class CsvFeed(RecordedFeed):
         has_double_column = any(occurrences[name] > 1 for name in _CONVERSIONS)
         if len(set(sensors)) < len(sensors) or has_double_column:
             raise MissionInputError(
-                f"{self.path}: two columns say the same; {', '.join(names)[:300]} came."
+                f"{self.path}: two columns stand for the same value, and only one of them is "
+                f"allowed: {', '.join(names)[:300]}."
             )
         self._columns = columns
 
@@ -146,7 +147,7 @@ class CsvFeed(RecordedFeed):
         Raises
         ------
         Refused
-            If a column is no sensor, and such columns are not ignored.
+            If a column is not a sensor, and such columns are not ignored.
         """
         sensors = []
         unknown_names = []
@@ -179,18 +180,18 @@ class CsvFeed(RecordedFeed):
         try:
             cells = _split_cells(line)
         except ValueError as error:
-            return Refused(f"it is no line of CSV: {str(error)[:80]}")
+            return Refused(f"it is not a line of CSV: {str(error)[:80]}")
         is_first_line = begin == 0
         if is_first_line and not self._has_readings(cells):
             with suppress(MissionInputError):
                 self._set_columns(cells)
                 return None
         if len(cells) != len(self._columns):
-            return Refused(f"{len(self._columns)} cells are expected, and {len(cells)} came")
+            return Refused(f"{len(self._columns)} cells are expected, but {len(cells)} were given")
         try:
             return self._record_of(cells)
         except (ValueError, OverflowError) as error:
-            return Refused(f"a cell is no number: {str(error)[:80]}")
+            return Refused(f"a cell is not a number: {str(error)[:80]}")
 
     def _record_of(self, cells: Sequence[str]) -> dict[str, object]:
         """Return the value of each column in a row; columns without a value are left out."""
@@ -218,7 +219,7 @@ def _split_cells(line: bytes) -> list[str]:
     Raises
     ------
     ValueError
-        If the line is no row of CSV, or no UTF-8.
+        If the line is not a row of CSV, or no UTF-8.
     """
     text = line.decode("utf-8-sig").rstrip("\r\n")
     try:

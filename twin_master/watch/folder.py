@@ -269,7 +269,7 @@ class Watch:
             intake.restore(last_line.get("intake"))
             if last_line:
                 step_name = self.scenario.mission.step_name
-                self.progress.note(f"The watch goes on at {step_name} {self.twin.steps}.")
+                self.progress.note(f"The watch continues at {step_name} {self.twin.steps}.")
             self.intake = intake
             self.filtered = None
             self.is_quiet = "quiet" in last_line
@@ -314,14 +314,15 @@ class Watch:
     def _write_step(self, step: MissionStep) -> JsonObject:
         """Write a step into the journal, with the notices that were pending; return its line.
 
-        If the operator was told that no step comes any more, a notice says that they come again.
+        If a notice has said that no step is received any more, another one says that steps are
+        received again.
         """
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)
         if self.is_quiet:
             when = f"{self.scenario.mission.step_name.capitalize()} {line['step']}"
             silence = self.seconds_since_step
-            sentence = f"{when}: observations come again, after {silence:.0f} s."
+            sentence = f"{when}: observations arrive again, after {silence:.0f} s."
             notices.append(Notice("heard", sentence).as_record())
         if notices:
             line["notices"] = line.get("notices", []) + notices
@@ -332,7 +333,7 @@ class Watch:
         return line
 
     def write_event(self, **fields: object) -> None:
-        """Write an event that is no step, such as a verdict, as a line into the journal.
+        """Write an event that is not a step, such as a verdict, as a line into the journal.
 
         Parameters
         ----------

@@ -405,8 +405,8 @@ class Intake:
             )
         if has_no_readings:
             return (
-                f"None of {received} has a reading of any {self._words.sensor}: what is told rests "
-                "on the transitions alone."
+                f"None of {received} has a reading of any {self._words.sensor}: the belief follows "
+                "the transitions alone."
             )
         return ""
 

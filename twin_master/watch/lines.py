@@ -291,8 +291,8 @@ class GrowingFile(Lines):
         copy = find_file(path, self.position, follow=True)
         if copy is None:
             yield Refused(
-                f"{path.name} was cut at byte {self.end}, and no copy is beside it: what stood "
-                "behind that and was not read yet is lost"
+                f"{path.name} was cut at byte {self.end}, and no copy is beside it: what followed "
+                "and was not read yet is lost"
             )
         file = (copy or path).open("rb", buffering=0)
         yield from self._switch_to(file, is_copy=copy is not None)

@@ -35,7 +35,7 @@ _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
 """A unit whose first name has a power. The prefix has this power, too: a mm2 is 1e-6 m2."""
 _FACTORS_WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 OTHER_KEYS = "step", "time", "control"
-"""The keys of a message that are no sensor."""
+"""The keys of a message that are not sensors."""
 PRESENT_NAMES = {"turn": "step"}
 """The present name of each key of a message, and of each column of a file, by its former name."""
 _UNITS_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -51,7 +51,7 @@ _NAME_WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]$")
 
 
 class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
-    """A message that is no observation; the sentence says why."""
+    """A message that is not an observation; the sentence says why."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Message(Reading):
     assumed : bool
         Whether its control was assumed when it was recorded, because no message had named it.
     ignored : dict of str to str
-        The names in it that are no sensor. The value of a name is the known name that it was
+        The names in it that are not sensors. The value of a name is the known name that it was
         probably meant to be, in words; it is empty if there is none.
     """
 
@@ -109,7 +109,7 @@ class _SensorReadings:
     sensors : set of int
         The indices of the sensors that the message names.
     unreadable : dict of int to str
-        What came in the place of a number, by the index of the sensor.
+        The value that was given in the place of a number, by the index of the sensor.
     ignored : dict of str to str
         As in `Message`.
     nested_name : str
@@ -130,7 +130,7 @@ class MessageReader:
     `strain_7_microstrain`, `strain_7 [microstrain]`. Without a unit the value is in that of the
     scenario. The key of the reading of an inspection is `ACTION_STATE` (`inspect_z1_percent`). All
     sensors together have the key of their role, with a list as value and `unit` beside it. A sensor
-    whose value is no number, or is too large, is lost; the others of the message count.
+    whose value is not a number, or is too large, is lost; the others of the message count.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class MessageReader:
     Attributes
     ----------
     allows_unknown : bool
-        Whether keys that are no sensor are ignored, and not refused.
+        Whether keys that are not sensors are ignored, and not refused.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -174,7 +174,7 @@ class MessageReader:
         self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
 
     def _find_column(self, name: str) -> SensorColumn | None:
-        """Return the sensor that a name means, with the factor to SI; None if it is no sensor.
+        """Return the sensor that a name means, with the factor to SI; None if it is not a sensor.
 
         The name is that of a sensor, alone or followed by a unit, in brackets or after `_`.
 
@@ -197,7 +197,7 @@ class MessageReader:
         factors = self._unit_factors(sensor)
         if unit and unit not in factors:
             raise Refused(
-                f"`{unit[:30]}` is no unit of sensor {sensor + 1}: it is read in "
+                f"`{unit[:30]}` is not a unit of sensor {sensor + 1}: it is read in "
                 f"{listing(factors, 'or')}"
             )
         return SensorColumn(sensor, factors[unit or self._units[sensor]])
@@ -222,7 +222,7 @@ class MessageReader:
         return matches[0] if matches else ""
 
     def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
-        """Return a sentence that says which names are no sensor, and what sensors are called.
+        """Return a sentence that says which names are not sensors, and what sensors are called.
 
         Parameters
         ----------
@@ -234,14 +234,14 @@ class MessageReader:
         """
         shown_names = [name[:_SHOWN_CHARACTERS] for name in names[:_SHOWN_NAMES]]
         quoted_names = listing(f"`{name}`" for name in shown_names)
-        verb = "is no sensor"
+        verb = "is not a sensor"
         if len(names) > 1:
             hidden_count = len(names) - len(shown_names)
-            verb = "are no sensors" + (f" (and {hidden_count} more)" if hidden_count else "")
+            verb = "are not sensors" + (f" (and {hidden_count} more)" if hidden_count else "")
         examples = _similar_names(shown_names[0], *self._sensor_of_name)
         sentence = (
-            f"{quoted_names} {verb}: a sensor is called such as {examples}, its unit behind it, "
-            f"and there are {len(self._units)}"
+            f"{quoted_names} {verb}: sensors have names such as {examples}, with a unit at the end "
+            f"where it is not SI, and there are {len(self._units)}"
         )
         if has_sensors and not any(map(self.likely_name, shown_names)):
             sentence += (
@@ -264,13 +264,15 @@ class MessageReader:
     def _parse(self, content: bytes) -> Mapping[str, object]:
         """Return the JSON object in the text of a message."""
         if len(content) > LARGEST_MESSAGE:
-            raise Refused(f"a message has at most {LARGEST_MESSAGE} bytes, and {len(content)} came")
+            raise Refused(
+                f"a message has at most {LARGEST_MESSAGE} bytes, but {len(content)} were given"
+            )
         try:
             record = parse_json(content, "the message", Refused, any_number=True)
         except RecursionError:
             raise Refused("it is nested too deeply") from None
         if not isinstance(record, dict):
-            raise Refused("it is no JSON object")
+            raise Refused("it is not a JSON object")
         return record
 
     def _read_record(self, record: Mapping[str, object]) -> Message:
@@ -299,8 +301,9 @@ class MessageReader:
     def _read_sensors(self, record: Mapping[str, object]) -> _SensorReadings:
         """Return the readings of all sensors in a parsed message.
 
-        A value that is no number or too large leaves the sensor without a reading (`unreadable`).
-        Names of no sensor are collected in `ignored`, and refused later if they are not allowed.
+        A value that is not a number or too large leaves the sensor without a reading
+        (`unreadable`). Names of no sensor are collected in `ignored`, and refused later if they are
+        not allowed.
         """
         readings = _SensorReadings(np.full(self._width, np.nan))
         for name, value in self._named_values(record):
@@ -332,8 +335,8 @@ class MessageReader:
         if readings.nested_name and not readings.sensors:
             example = next(iter(self._sensor_of_name))
             raise Refused(
-                f"`{readings.nested_name[:_SHOWN_CHARACTERS]}` holds an object, and no sensor "
-                "stands beside it: sensors stand at the top level of a message, as in "
+                f"`{readings.nested_name[:_SHOWN_CHARACTERS]}` holds an object, and the message "
+                "has no other sensor: sensors must be at the top level of a message, as in "
                 f'{{"step": 0, "{example}": 0.0}}'
             )
         if not self.allows_unknown:
@@ -345,7 +348,7 @@ class MessageReader:
         if value is None:
             return None
         if type(value) is not int or not 0 <= value <= LARGEST_SEED:
-            raise Refused(f"`step` is a whole number from 0, and {value!r:.40} came")
+            raise Refused(f"`step` is a whole number from 0, but {value!r:.40} was given")
         return value
 
     def _read_time(self, value: object) -> float | None:
@@ -379,7 +382,7 @@ class MessageReader:
             if name == role and isinstance(value, list):
                 count = self._observation.count
                 if len(value) != count:
-                    raise Refused(f"{count} values are expected, and {len(value)} came")
+                    raise Refused(f"{count} values are expected, but {len(value)} were given")
                 for number, element in enumerate(value, start=1):
                     yield f"{role}_{number}_{unit}".removesuffix("_"), element
             elif name not in (*OTHER_KEYS, "unit") and not name.startswith("_"):
@@ -415,7 +418,7 @@ class MessageReader:
         return matrix[np.tril_indices(count)]
 
     def _number_in_si(self, value: object, column: SensorColumn) -> float:
-        """Return the value of a sensor in SI units; NaN if it is no number."""
+        """Return the value of a sensor in SI units; NaN if it is not a number."""
         if isinstance(value, bool):
             return math.nan
         try:
@@ -424,7 +427,7 @@ class MessageReader:
             return math.nan
 
     def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
-        """Return, in words, the value that came in the place of a reading.
+        """Return, in words, the value that was given in the place of a reading.
 
         A strain that is too large and has no unit was probably sent in microstrain: then the text
         says how to give the unit.
@@ -434,7 +437,7 @@ class MessageReader:
         value : object
             The value in the message.
         number : float
-            The value in SI units; NaN if it is no number.
+            The value in SI units; NaN if it is not a number.
         column : SensorColumn
             The sensor, with the factor to SI units.
         """

@@ -159,7 +159,7 @@ class Topic(Feed):
 
         If the broker has taken the decision, the size of the acknowledged part of the journal is
         written to the disk. If it refuses it, all decisions without an answer are sent again after
-        a pause; the operator is told of the first refusal only.
+        a pause; the operator is notified of the first refusal only.
 
         Parameters
         ----------

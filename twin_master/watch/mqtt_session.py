@@ -219,7 +219,10 @@ class Session:
         if self._discards_session:
             return
         if self._has_session_at_broker and not flags.session_present:
-            self.note(f"The {self._where} has forgotten this watch: what came meanwhile is lost.")
+            self.note(
+                f"The {self._where} has forgotten this watch: messages that were sent meanwhile "
+                "are lost."
+            )
         # A retained message was published before the watch, at a time that nobody knows
         options = SubscribeOptions(qos=1, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
         client.subscribe(self._broker.topic, options=options)

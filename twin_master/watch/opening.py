@@ -1,5 +1,7 @@
 """A watch from its observations to its report, begun or resumed, and its run up to a step."""
 
+from __future__ import annotations
+
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -185,7 +187,7 @@ def copy_of_run_until(
         yield copy
 
 
-def open_run(folder: Path | str) -> "xr.DataTree":
+def open_run(folder: Path | str) -> xr.DataTree:
     """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
 
     A watch that goes on, or was killed, is read as it would be if it had ended after the last step
@@ -296,10 +298,10 @@ def watch(
     from_step : int, optional
         The first step in which the patch is believed.
     teach : bool
-        Whether to look for the cause of an alarm, and to believe in later steps what is named and
-        proved.
+        Whether to look for the cause of an alarm, and to believe an effect that is named and proved
+        in later steps.
     allow_unknown : bool
-        Whether to ignore keys and columns that are no sensor.
+        Whether to ignore keys and columns that are not sensors.
     ca_file : Path or str, optional
         The certificate of the authority of an ``mqtts://`` broker.
     replace : bool
@@ -427,8 +429,8 @@ def _open_watch(
     """Return a context manager that gives the new or resumed watch while its folder is locked."""
     if resume and (replace or overrides != Overrides()):
         raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that "
-            "changes it."
+            "a watch is resumed with the inputs in its folder: leave out options that would change "
+            "them."
         )
     if resume or loaded is None:
         return resume_watch(folder, loaded, progress)
@@ -478,4 +480,4 @@ def _advice_after_error(watched: Watch) -> str:
             "What was observed is kept: go on with "
             f"`uav-twin watch --resume --out {watched.folder}`."
         )
-    return "Nothing was observed yet: once this is mended, watch again with --replace."
+    return "Nothing was observed yet: correct the cause, and watch again with --replace."

@@ -113,7 +113,7 @@ def outcome_of_patch(
     compared: ComparedSteps = NO_STEPS,
     progress: Progress | None = None,
 ) -> PatchOutcome:
-    """Return what a patch would change in the steps of a watch.
+    """Return the changes that a patch would make in the steps of a watch.
 
     The steps from `from_step` on are filtered twice, without and with the patch.
 

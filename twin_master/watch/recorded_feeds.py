@@ -96,7 +96,7 @@ class RecordedFeed(Feed):
                 yield self.reader.read(content), beginning_of(line)
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
-        """Return the message in a line; None if the line is no message.
+        """Return the message in a line; None if the line is not a message.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class RunFeed(RecordedFeed):
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(
-                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {reason}."
+                f"{path} is not a NetCDF file with `observed/{role}` (step, sensor): {reason}."
             ) from None
         self._lines = "".join(f"{json.dumps(record)}\n" for record in records).encode()
 
@@ -167,8 +167,8 @@ class RunFeed(RecordedFeed):
         if not lengths <= {count} or has_unknown_control:
             shape = group[self.scenario.observation.role].shape
             raise ValueError(
-                f"{count} sensors and the controls of the scenario are expected, and the shape "
-                f"{shape} came"
+                f"{count} sensors and the controls of the scenario are expected, but the shape "
+                f"{shape} was given"
             )
 
     def _symmetric_matrix(self, triangle: Float) -> Float:

@@ -88,7 +88,7 @@ def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
 def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
     """Return the notices of a watch from a step on, each sentence once, with its step.
 
-    A notice that came before step 0 has the step 0.
+    A notice before the first observation has the step 0.
 
     Parameters
     ----------

@@ -114,14 +114,14 @@ class StreamNotices:
         count = next_step - first_missing
         if count == 1:
             sentence = (
-                f"{step_name.capitalize()} {first_missing}: no message came, and the belief is "
-                "predicted through"
+                f"{step_name.capitalize()} {first_missing}: no message was received, and the "
+                "belief is predicted over it"
             )
         else:
             sentence = (
-                f"{step_name.capitalize()}s {first_missing} to {next_step - 1}: no message came, "
-                f"and the belief is predicted through {count} {step_name}s by what the transitions "
-                "say alone"
+                f"{step_name.capitalize()}s {first_missing} to {next_step - 1}: no message was "
+                f"received, and the belief is predicted over {count} {step_name}s by the "
+                "transitions"
             )
         notice = Notice("gap", f"{sentence}{unit_advice(unit)}.", value=float(count))
         self._pending.append(notice)
@@ -176,7 +176,7 @@ class StreamNotices:
 
     @property
     def has_refusals_to_report(self) -> bool:
-        """Whether enough messages were refused in a row, and the operator was not told yet."""
+        """Whether enough messages were refused in a row, and the operator was not notified yet."""
         return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_reported
 
     def report_refusals(self, next_step: int) -> Notice:
@@ -196,8 +196,9 @@ class StreamNotices:
         if next_step:
             since = f"Since {self._words.step} {next_step - 1},"
         sentence = (
-            f"{since} {counted(count, 'message')} came, and all were refused (rejected.jsonl), the "
-            f"last one because {self.last_reason}.{self._likely_cause(next_step)}"
+            f"{since} {counted(count, 'message')} were received, and all were refused "
+            "(rejected.jsonl), the last one because "
+            f"{self.last_reason}.{self._likely_cause(next_step)}"
         )
         return Notice("refused", sentence, value=float(count))
 
@@ -218,8 +219,8 @@ class StreamNotices:
         step_name = self._words.step
         if len(set(steps)) == 1:
             return (
-                f" All belong to {step_name} {steps[0]}: see whether its counter stands still, and "
-                "whether `watch.seconds_per_step` and `watch.time_unit` are right."
+                f" All belong to {step_name} {steps[0]}: check whether its counter has stopped, "
+                "and whether `watch.seconds_per_step` and `watch.time_unit` are right."
             )
         if steps == sorted(set(steps)):
             listed = listing(map(str, steps))
@@ -243,8 +244,8 @@ class StreamNotices:
         is_blind : bool
             Whether the message has no reading of any sensor.
         ignored : dict of str to str
-            The names in the message that are no sensor. The value of a name is the known name that
-            it was probably meant to be, in words; it is empty if there is none.
+            The names in the message that are not sensors. The value of a name is the known name
+            that it was probably meant to be, in words; it is empty if there is none.
         """
         when = f"{self._words.step.capitalize()} {step}"
         notices = self.pop_pending()

@@ -63,8 +63,8 @@ def _no_wing_error(reason: str) -> MissionInputError:
     """Return the error for a scenario whose asset is not a wing that can be taught."""
     return MissionInputError(
         "--teach looks for what the model of a wing lacks: strains under the damage states z1 and "
-        "z2, predicted by a design or a calibration, are needed, and this scenario has "
-        f"{reason}: leave --teach out, alarms are given all the same."
+        f"z2, predicted by a design or a calibration, are needed, and this scenario has {reason}: "
+        "leave --teach out; alarms are raised without it, too."
     )
 
 

@@ -114,7 +114,7 @@ def caveats_of(verdict: VerdictJson) -> list[str]:
     gates = verdict["gates"]
     caveats = [str(gate["reason"]) for gate in gates if gate["passed"] is False]
     if not _has_tested_absolute_fit(gates):
-        caveats.append("Whether it leaves noise alone was not tested.")
+        caveats.append("It was not tested whether the residuals are noise.")
     if verdict["kind"] == GROUP and has_some_saturating_members(verdict):
         caveats.append(
             "A sensor that saturates and the other effects of the group differ at other loads, and "
@@ -186,8 +186,8 @@ def trial_sentence(verdict: VerdictRecord, outcome: PatchOutcome, step_name: str
         )
     sentence = (
         f"{comparison}: it is believed from {step_name} {first_step} on, and these {step_name}s "
-        "were filtered anew."
+        "were filtered again."
     )
     if verdict["kind"] == GROUP:
-        sentence += " It is one of a group: which of them is true these data cannot tell."
+        sentence += " It is one of a group, and these data cannot tell which of them is true."
     return f"{sentence} {outcome.record['policy_change']}".rstrip()

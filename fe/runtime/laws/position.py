@@ -13,10 +13,11 @@ from .interface import NOT_NEGATIVE, PARAMETERS, POSITIVE, FloatArray, PortForce
 
 
 class PowerStiffness(PortForce):
-    """F = coefficient |x / x0|^exponent sgn x; `side` 0: both signs of x, +1 or -1: one sign only.
+    """F = coefficient |x / x0|^exponent sgn x, for one or both signs of x.
 
-    A cubic spring has exponent 3 and side 0; a breathing crack has exponent 1, side -1 and a
-    negative coefficient. `coefficient` [N or N m] is the force at x0 = `reference_displacement`.
+    The law acts on both signs of x if `side` is 0, and on one sign only if it is +1 or -1. A cubic
+    spring has exponent 3 and side 0; a breathing crack has exponent 1, side -1 and a negative
+    coefficient. `coefficient` [N or N m] is the force at x0 = `reference_displacement`.
     """
 
     coefficient: Annotated[float, "N or N m"]

@@ -73,7 +73,7 @@ class Overflow(PortForce):
     v0 is `reference_velocity`.
 
     A flow that begins at a level, such as that of an overflow or a relief valve. At a port whose
-    speed is a filling level, F is a flow out of what is full.
+    speed is a filling level, F is a flow out of the full store.
     """
 
     depends_on_speed: ClassVar[bool] = True
@@ -188,7 +188,7 @@ def reversal_correction(
         Correction of the speed at the end.
     position : float
         Correction of the position at the end. If friction holds the port, it is instead the
-        distance from the position at the begin of the step to that of the reversal.
+        distance from the position at the beginning of the step to that of the reversal.
     is_held : float
         1 if friction holds the port from the reversal on, else 0.
     """

@@ -247,7 +247,7 @@ def test_damping_ratios_without_rayleigh_coefficients_are_refused():
 def test_a_posterior_at_the_end_of_the_model_is_refused():
     sharp = published_modes(frequency_1=0.001, frequency_2=0.03)
 
-    with pytest.raises(OutsideValidityError, match=r"pressed against 1\.15, where the model ends"):
+    with pytest.raises(OutsideValidityError, match=r"lies at 1\.15, the limit of the model"):
         draw_posterior(sharp, model_error=(0.0, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""The record of a whole calibration and its file: what it gives back, and what is no such file."""
+"""The record of a whole calibration and its file: what it gives back, and what is not one."""
 
 from dataclasses import fields, replace
 
@@ -274,12 +274,12 @@ def test_another_file_is_refused_with_its_reason(tmp_path, path, damage):
 
 
 def test_a_folder_is_no_calibration(tmp_path):
-    with pytest.raises(CalibrationRecordError, match="is no file"):
+    with pytest.raises(CalibrationRecordError, match="is not a file"):
         load_calibration(tmp_path)
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(CalibrationRecordError, match="is not there; give the calibration"):
+    with pytest.raises(CalibrationRecordError, match="is missing; give the calibration"):
         load_calibration(tmp_path / "d.nc")
 
 

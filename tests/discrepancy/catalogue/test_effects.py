@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH
 from benchmarks.effect_pages import FOLDER, pages
-from benchmarks.effect_pictures import FLOWS, draw, picture_setting
+from benchmarks.effect_pictures import FLOWS, REGION_LOSSES, draw, picture_setting
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
@@ -31,7 +31,8 @@ from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, se
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
-BEAM = [effect for effect in library() if effect.identifier not in FLOWS]  # flows need a store: test_outflow
+# flows need a store (test_outflow), losses of regions a structure with regions (test_regions_of_structures)
+BEAM = [effect for effect in library() if effect.identifier not in (*FLOWS, *REGION_LOSSES)]
 WARM = {"thermal_strain", "temperature_dependent_modulus"}
 VANISHING = pytest.mark.parametrize(
     "effect",
@@ -42,7 +43,7 @@ EFFECTS = pytest.mark.parametrize("effect", BEAM, ids=lambda effect: effect.iden
 
 
 def medians(effect):
-    """Prior medians; one deviation above zero where the median is no effect."""
+    """Prior medians; one deviation above zero where the median is not an effect."""
     return {item.name: item.prior.value(0.0) or item.prior.value(1.0) for item in effect.parameters}
 
 
@@ -283,7 +284,10 @@ def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
     reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
     absent = {name for name, reason in reasons.items() if reason is not None}
-    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock", "sensor_lag"}
+    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock", "sensor_lag", *REGION_LOSSES}
+    assert (
+        reasons["region_stiffness_loss"] == "The model 'Three-mass chain with a joint' has no damage region."
+    )
     assert all(reasons[name].endswith(".") for name in absent)
 
 
@@ -319,7 +323,7 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory():
     ("other", "places"), [("root", ("tip",)), ("span", ("tip", "span")), ("joint", ("tip", "joint"))]
 )
 def test_a_port_stands_for_the_others_of_a_wing_alone(other, places):
-    """A model with a port of another name is no wing: at all of its ports an effect is tried."""
+    """A model with a port of another name is not a wing: at all of its ports an effect is tried."""
     ports = f"""
         port = [{{ name = "tip", vector = [0.0, 1.0] }}, {{ name = "{other}", vector = [1.0, 0.0] }}]
         """

@@ -67,7 +67,7 @@ def test_files_with_one_effect_and_with_several_of_a_family_at_places(write, set
     assert gauge.patch(setting, {"g": 0.8}).to_list() == [
         {"kind": "sensor_gain", "channel": "g0", "gain": 0.5, "quantity": ""}
     ]
-    # a place that is no port, a value that no primitive can have
+    # a place that is not a port, a value that no primitive can have
     for old, new, place, sentence in (
         ('places = "ports"', 'places = ["flap"]', "flap", "has no port 'flap'; it has root, tip, span"),
         ('side = "2 - 1"', 'side = "0.5 * power"', "tip", "side must be a number"),

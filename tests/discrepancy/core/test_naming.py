@@ -125,7 +125,9 @@ def test_the_verdict_on_what_is_hidden(case, seed):
 
 @pytest.mark.parametrize("place", ["g1", "all strain"])
 def test_a_sensor_that_saturates_is_named_with_its_limit(place):
-    """A softening spring, a gain and a mass are beside it; one limit for all strain is no sum of gauges."""
+    """A softening spring, a gain and a mass are beside it; one limit for all strain is not a sum of
+    gauges.
+    """
     limit, rivals = 2e-4, RIVALS["soft or saturated"]
     channel, quantity = ("*", "strain") if place == "all strain" else (place, "")
     hidden = SensorSaturation(channel, limit, quantity)
@@ -206,7 +208,7 @@ def test_without_a_noise_record_the_sentence_says_so():
 
 
 def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_of_a_group():
-    """Which further effect stands beside it stays open; what does not fit alone is no name so."""
+    """Which further effect stands beside it stays open; what does not fit alone is not a name so."""
     problem = SMALL.problem(11, SMALL.patch(*FRICTION))
     found = reach_verdict(problem, kit.chosen(FRICTION[0]))[1]
     places = {"coulomb_friction": "joint", "load_cell": "", "gauge_gain": "g1"}
@@ -243,8 +245,8 @@ def test_the_rules_stand_in_the_page_in_their_order():
     ("reason", "sentence"),
     [
         (
-            "What is left follows the loads.",
-            "It is not named, because what is left follows the loads.",
+            "The residuals follow the loads.",
+            "It is not named, because the residuals follow the loads.",
         ),
         (
             "its probability is 0.4: a name needs 0.95",

@@ -31,7 +31,7 @@ from . import kit
 
 
 def test_pairs_and_gains_are_those_of_fits():
-    """For linear effects with wide priors the screen is the fit; one change alone is no pair."""
+    """For linear effects with wide priors the screen is the fit; one change alone is not a pair."""
     problem = kit.closed_problem(seed=12, effect=0.12, gain_deviation=0.2)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
@@ -155,9 +155,9 @@ def test_unknowns_are_judged_beside_their_priors():
     far = replace(found.point, shared=np.array([3.0, 1.0, 2.0, 0.0, 2.0]), effect=np.array([4.0]))
     told = dict(prior_tests(problem, replace(found, point=far)))
     wanted = {
-        "calibrated parameters beside their priors": chi2.sf(10.0, 2),
-        "gains beside their priors": chi2.sf(8.0, 3),
-        "size of offset beside its prior": chi2.sf(16.0, 1),
+        "calibrated parameters outside their priors": chi2.sf(10.0, 2),
+        "gains outside their priors": chi2.sf(8.0, 3),
+        "size of offset outside its prior": chi2.sf(16.0, 1),
     }
     assert told == pytest.approx(wanted)
 

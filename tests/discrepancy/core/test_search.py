@@ -187,7 +187,7 @@ def test_what_speaks_against_a_name_is_the_probability_or_the_evidence(
 
 
 def test_a_channel_whose_noise_record_is_not_white_has_no_test_of_whiteness():
-    """A weak colour, which is not whitened, is no gap where the record has it too."""
+    """A weak colour, which is not whitened, is not a gap where the record has it too."""
     bench = kit.chain_bench(amplitudes=(0.004, 0.002), samples=150)
     problem = bench.problem(3, ModelPatch())
     name, channel = next(iter(problem.campaign.channels.items()))

@@ -118,7 +118,7 @@ def test_a_model_that_is_not_fitted_gives_no_evidence_of_a_force():
     trials = [replace(trial, force=-trial.force) for trial in campaign.trials]
     found = investigate(replace(campaign, trials=tuple(trials)), MODEL, chosen("quadratic_damping"))
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
-    assert found.verdict.sentence.startswith("The model is not fitted: it leaves more of x in 'first'")
+    assert found.verdict.sentence.startswith("The model does not fit: its residuals of x in 'first'")
     assert found.verdict.force is None
 
 

@@ -98,7 +98,9 @@ def test_wrong_readings_at_the_ends_of_records_are_left_out():
 
 
 def test_verdicts_that_name_nothing():
-    """Nothing missing has no proof; microstrain for strain is no effect; an open verdict has experiments."""
+    """Nothing missing has no proof; microstrain for strain is not an effect; an open verdict has
+    experiments.
+    """
     result = judged(LABORATORY.measured(22))
     assert result.verdict.kind is VerdictKind.NOTHING_MISSING, result.verdict.sentence
     assert result.proof is None

@@ -151,8 +151,8 @@ def test_inputs_come_out_in_si(tmp_path):
     np.testing.assert_allclose(first.values[2], [22.0, np.pi])
     assert (first.begins, second.begins, second.inputs) == (Start.UNKNOWN, Start.SETTLED, ())
     said = " ".join(campaign.remarks)
-    assert "The trial 'first' is begun in a state that is fitted." in said
-    assert "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed" in said
+    assert "The trial 'first' is taken to begin in a state that is fitted." in said
+    assert "The trial 'second' is taken to begin at rest under the loads of the first sample (assumed" in said
     settled = (TOML, '"second.csv"', '"second.csv", begins = "settled"')
     held = (TOML, 'column = "x"', 'column = "x", hold = "linear", reference = true')
     kelvin = (TOML, '"degC"', '"K"')
@@ -220,7 +220,8 @@ def test_what_a_campaign_accepts_is_read_and_written(tmp_path):
 def test_a_word_that_is_no_fault_cannot_be_accepted(tmp_path):
     change = (TOML, 'name = "tip"', 'name = "tip"\naccept = ["frozen"]')
     with refused(
-        CampaignFileError, "'frozen' is no fault that can be accepted; these are clipped, dead, held"
+        CampaignFileError,
+        "'frozen' is not a fault that can be accepted; those that can are clipped, dead, held",
     ):
         read_campaign(campaign_folder(tmp_path / "a", PLAIN, change))
 
@@ -332,7 +333,7 @@ def repeats(rows, used=None):
 def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
     """With a free zero per trial, rows and trials are taken out: a two-way layout without interaction.
 
-    Another run is no repeat; a noise of twice the record's counts half.
+    Another run is not a repeat; a noise of twice the record's counts half.
     """
     readings = np.random.default_rng(4).normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
     rows = repeats(np.vstack((readings, [100.0, 200.0, 300.0, 400.0])))

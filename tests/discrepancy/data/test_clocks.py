@@ -161,7 +161,7 @@ def test_what_cannot_be_put_on_one_clock_is_one_sentence(tmp_path):
     assert "names and places contradict each other" in refusal(two_clocks(tmp_path, heads=crossed))
     heads = ("time a [s]", "time b [s]", "acc1 [m/s2]", "acc2 [m/s2]")
     beside = table(tmp_path, heads, FAST, FAST, readings(FAST), readings(FAST))
-    assert "neither names nor places say it" in refusal(beside)
+    assert "neither the names nor the places of the columns show it" in refusal(beside)
     back = [*SLOW[:4], "0.01", *SLOW[5:]]
     sentence = refusal(two_clocks(tmp_path, second=back), error=CampaignDataError)
     assert "the time of the column 'time2' does not increase after sample 4" in sentence
@@ -173,4 +173,4 @@ def test_what_cannot_be_put_on_one_clock_is_one_sentence(tmp_path):
     lines[5] = lines[5].replace(f",{late[4]},", ",,")
     (tmp_path / "lab.csv").write_text("\n".join(lines) + "\n", "utf-8")
     sentence = refusal(read_sheet(tmp_path / "lab.csv"))
-    assert "lab.csv, line 6: 'acc2' has a reading and 'time2' no time" in sentence
+    assert "lab.csv, line 6: 'acc2' has a reading, but 'time2' has no time" in sentence

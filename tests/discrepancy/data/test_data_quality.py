@@ -139,7 +139,9 @@ def test_unit_slips(campaign, name, factor, guess):
 
 @pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])
 def test_other_factors_are_no_unit_slips(campaign, factor):
-    """Strain that is 9.81 times too large is no strain in g, and beside ring-downs alone no fault at all."""
+    """Strain that is 9.81 times too large is not a strain in g, and beside ring-downs alone no fault at
+    all.
+    """
     faults = kinds_of(check_against_model(scaled(campaign, "g0", factor), CANTILEVER))
     assert FaultKind.UNIT_SLIP not in {kind for kind, _ in faults}
     if factor == 9.80665:
@@ -170,7 +172,7 @@ def test_slips_of_inputs(campaign):
     stated = {**campaign.channels, "x": replace(campaign.channels["x"], unit="mm")}
     inches = replace(scaled(campaign, "x", 1.0 / 25.4), channels=stated)
     (fault,) = check_against_model(inches, CANTILEVER)
-    assert "'x' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
+    assert "'x' shows about 0.0393701 times what the model predicts (inch given as mm?)" in fault.sentence
     assert fault.fatal
 
     def in_millimetres(trial):

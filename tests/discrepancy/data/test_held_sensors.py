@@ -151,7 +151,7 @@ def test_a_campaign_accepts_readings_that_look_held(place):
     campaign = campaign_of(freeze, trials=1)
     fault = only(check_data(campaign), FaultKind.FROZEN)
     assert fault.sentence.endswith(
-        """if the data are right, say accept = ["held"] in the [[trial]] 'ring 0' or the [[channel]] 'x'."""
+        """if the data are right, set accept = ["held"] in the [[trial]] 'ring 0' or the [[channel]] 'x'."""
     )
     if place == "top":
         campaign = replace(campaign, accept=("held",))

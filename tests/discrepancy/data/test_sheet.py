@@ -81,11 +81,11 @@ def test_an_output_of_a_driven_trial_may_be_called_force(tmp_path):
 
 def test_what_is_passed_over_is_told(tmp_path):
     sheet = sheet_of(tmp_path, bytes_of(ODD["title rows, units row, footer with statistics"]))
-    assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
+    assert sheet.remark == "lines 7 to 9, semicolons between cells; everything from 10 on is left out"
     sheet = sheet_of(tmp_path, b"t;w;e\n0;1;OL\n1;2;OL\n2;3;OL\n3;4;4\n4;5;5\n")
     assert sheet.remark.endswith("; the column 'e' holds 2 numbers and 3 texts and is left out")
     sheet = sheet_of(tmp_path, b"t;w;e\n0;1;2\n1;2;3\n2;rows;in all\n;1,5;2,5\nMean;1,5;2,5\n")
-    assert sheet.remark.endswith("; what stands from 4 on is left out")
+    assert sheet.remark.endswith("; everything from 4 on is left out")
 
 
 @pytest.mark.parametrize(("content", "sentence"), INPUTS.refused("sheets"))
@@ -314,7 +314,7 @@ def test_loggers_names_of_units_are_known(unit, quantity, in_si):
 )  # fmt: skip
 def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal(unit):
     assert quantities_of(unit) == (Quantity.SIGNAL,) * ("V/" in unit or "V/v" in unit)
-    with pytest.raises(ValueError, match=r"strain must have a unit such as .*, and '.*' came"):
+    with pytest.raises(ValueError, match=r"strain must have a unit such as .*, but '.*' was given"):
         factor_to_si(Quantity.STRAIN, unit)
 
 

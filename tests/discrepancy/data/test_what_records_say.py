@@ -40,7 +40,9 @@ def fatal(campaign):
 
 
 def test_what_is_left_of_each_prior():
-    """Beside least squares of x by the two parameters, by hand; a short push of a cart is no short record."""
+    """Beside least squares of x by the two parameters, by hand; a short push of a cart is not a short
+    record.
+    """
     campaign = pushed()
     left = posterior_to_prior_ratios(campaign, CART)
     time = campaign.trials[0].time

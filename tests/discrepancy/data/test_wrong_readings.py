@@ -127,7 +127,7 @@ def test_a_wrong_reading_is_found_at_the_ends(place):
     first, second = np.random.default_rng(1).standard_normal((2, 200))
     second[place] += 20.0
     assert ends(first, second) == [(place, 1)]
-    # in several channels at once, or within the record, it is no single reading at an end
+    # in several channels at once, or within the record, it is not a single reading at an end
     first[place] += 20.0
     assert ends(first, second) == []
     second[100] += 20.0

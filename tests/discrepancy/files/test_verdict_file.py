@@ -145,7 +145,12 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
     whole = GOLDEN.read_text(encoding="utf-8")
     nested = ('"remarks": [', f'"remarks": [{"[" * 3000}{"]" * 3000}, ', "nested deeper")
     cut = (whole, whole[: len(whole) // 2], "is not valid JSON")
-    for old, new, words in (cut, (whole, "[]", "no file of this kind"), nested, *INPUTS.refused("verdict")):
+    for old, new, words in (
+        cut,
+        (whole, "[]", "not a file of this kind"),
+        nested,
+        *INPUTS.refused("verdict"),
+    ):
         assert old in whole
         path.write_text(whole.replace(old, new, 1), encoding="utf-8")
         with refused(VerdictFileError, words):

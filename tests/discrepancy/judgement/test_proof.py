@@ -80,7 +80,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other()
     other = [replace(item, noise_deviation=3.0 * item.noise_deviation) for item in after.trials]  # its own
     gain = prove_effects(before, replace(after, trials=tuple(other))).log_score_gain
     assert gain == pytest.approx(proof.log_score_gain)
-    assert proof.remaining.startswith("Nothing that these data can show remains")
+    assert proof.remaining.startswith("These data show no remains")
     none = prove_effects(before, before)
     assert none.closed.value == 0.0
     assert none.log_score_gain == none.log_score_gain_error == 0.0
@@ -145,7 +145,7 @@ def test_a_share_of_few_blocks_has_no_interval():
 
 
 def test_one_noise_is_under_both_errors_where_none_is_recorded():
-    """What each hypothesis leaves in fitted trials is its own noise, which is no measure of its error."""
+    """What each hypothesis leaves in fitted trials is its own noise, which is not a measure of its error."""
     bare = with_noise(Bench(amplitudes=MANY, held_out=HELD).fit(np.random.default_rng(7)), None)
     trials = [replace(item, noise_deviation=0.01 * item.noise_deviation) for item in bare.trials]
     assert closed_share(bare, replace(bare, trials=tuple(trials))).value == pytest.approx(0.0)
@@ -253,7 +253,7 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
         left.append(float(np.sum((y - a @ x) ** 2) + p @ x**2))
     assert test.count == 2
     assert test.statistic == pytest.approx(left[0] - left[1], rel=1e-5)
-    # what is free already is no direction: the derivative by the effect itself, and one that is nothing
+    # what is free already is not a direction: the derivative by the effect itself, and one that is nothing
     own = {n: part.by_effect[0] for n, part in enumerate(found.trial_derivatives) if np.any(part.by_effect)}
     nothing = {0: np.zeros_like(problem.trials[0].weight)}
     assert score_tests(problem, found, {"own": {"offset": own}, "nothing": {"zero": nothing}}) == []

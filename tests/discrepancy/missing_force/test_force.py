@@ -143,7 +143,7 @@ def test_one_effect_at_two_places_has_a_prior():
 
 
 def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
-    """Its effect is one member: a force that goes with the square of the speed is no dry friction."""
+    """Its effect is one member: a force that goes with the square of the speed is not a dry friction."""
     problem = blind(tmp_path, CART_IN_AIR, samples=96)
     (friction,) = chosen("coulomb_friction")
     port, *_ = problem.model.ports
@@ -199,7 +199,9 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
 
 @pytest.mark.parametrize("gain", [1.0, 1.05])
 def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
-    """The same campaign with the model's own response and noise alone as its readings; a gain is no law."""
+    """The same campaign with the model's own response and noise alone as its readings; a gain is not a
+    law.
+    """
     problem, random = blind(tmp_path, CART), np.random.default_rng(8)
     every = problem.with_trials(problem.campaign.trials)
     start = every.prior_mean_point(Candidate())

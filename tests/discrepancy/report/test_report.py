@@ -126,7 +126,7 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
         assert f"p at least {gate.limit:g}</td>" in text
     assert f"at most {shape.limit:g} nat</td>" in text
     # no name, no gap to close, no absolute fit that could be judged, no proof
-    assert "The best hypothesis, which is no name, explains" in page_of(drag, kind=VerdictKind.GROUP)
+    assert "The best hypothesis, which is not named, explains" in page_of(drag, kind=VerdictKind.GROUP)
     untested = replace(drag.proof, closed=None, closed_reason="Held-out trials show no gap before.")
     assert "Held-out trials show no gap before." in page_of(replace(drag, proof=untested))
     larger = replace(closed, value=-0.2, low=-0.3, high=-0.1)
@@ -408,7 +408,7 @@ def test_an_old_verdict_is_not_lost(drag, tmp_path):
     assert not (folder / "notes.txt").exists()
     assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
     (other / "chapter.tex").write_text("x", encoding="utf-8")
-    for place, words in ((other, "not touched"), (other / "chapter.tex", "no folder")):
+    for place, words in ((other, "left unchanged"), (other / "chapter.tex", "no folder")):
         with pytest.raises(FileNotWrittenError, match=words):
             check_verdict_folder(place, replace_it=True)
 

@@ -80,7 +80,7 @@ def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_writte
 
 
 def test_published_records_are_read_as_they_were_measured(tmp_path):
-    """A fall is no short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
+    """A fall is not a short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
     assert is_sound(*rig("falling_phone", tmp_path))
     tanks, _ = rig("two_tanks", tmp_path)
     assert [trial.name for trial in tanks.held_out] == ["validation"]

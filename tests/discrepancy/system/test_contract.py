@@ -184,7 +184,7 @@ OF_ALL = [
     (TrialKind.STATIC, {"load_place": "nose"}, (), r"place (is )?'nose'"),
     (TrialKind.STATIC, {}, (PowerStiffness("nose", 1.0, 3.0, 0, 1.0),), "port 'nose', which"),
     (TrialKind.RINGDOWN, {"release": None}, (), "does not say how it was released"),
-    (TrialKind.STATIC, {"parameters": np.ones(9)}, (), "parameters, but 9 came"),
+    (TrialKind.STATIC, {"parameters": np.ones(9)}, (), "parameters, but 9 were given"),
 ]
 
 
@@ -199,7 +199,7 @@ OF_ALL = [
         ("lumped", TrialKind.STATIC, {"load_place": "middle"}, (LoadPlace(0.1, 0.0),), "no station_deriv"),
         ("lumped", TrialKind.STATIC, {}, (PowerStiffness("end", -900.0, 3.0, 0, 1e-3),), "not found"),
         ("lumped", TrialKind.STATIC, {"temperature": np.full(3, 500.0)}, (patch.ModulusTemperature(2e-3),),
-         "leaves 0 of the stiffness"),
+         "the factor on the stiffness would be 0"),
         ("wing", TrialKind.STATIC, {}, (patch.LocalStiffnessLoss(1.2, 0.2, 0.5),), "leave some stiffness"),
         ("FMU", TrialKind.STATIC, {}, (PointMass(0.1, 0.2),), "cannot carry the primitive 'point_mass'"),
         ("FMU", TrialKind.RINGDOWN, {}, (FreePlay("tip", 1.0, 1.0),), "port 'tip', which this model does"),

@@ -96,7 +96,7 @@ def test_a_port_changes_neither_the_structure_nor_its_fmu(write_ported_beam, tmp
     [
         (
             AT_POINT.replace("50, 10, 5", "100, 10, 5"),
-            "The port 'lug' of the structure beam moves as its port 'tip' does",
+            "The port 'lug' of the structure beam moves exactly as its port 'tip' does",
         ),
         (
             ON_SET.replace("middle", "centre"),

@@ -222,7 +222,7 @@ def test_it_is_its_fmu(kind: TrialKind, laws: tuple[PowerStiffness, ...], beam: 
 
 
 def test_what_no_trial_records_acts_always(write_beam, tmp_path: Path) -> None:
-    """Gravity, where it is no load factor: at rest and in motion, with a spring that stiffens."""
+    """Gravity, where it is not a load factor: at rest and in motion, with a spring that stiffens."""
     changes = {"load_factor": "gee", 'set = "end", force': "point = [100, 10, 5], force"}
     reduced = reduce_structure(load_and_assemble(write_beam(tmp_path, changes, cells=2))).model
     model, wanted = StructureModel(reduced), reduced.static_response({"push": 0.0})

@@ -43,7 +43,7 @@ def assert_holds(arrays: Any, values: Any) -> None:
 
 
 def assert_archive_refused(
-    content: bytes, sentence: str = "not a sound archive of plain arrays"
+    content: bytes, sentence: str = "not a valid archive of plain arrays"
 ) -> None:
     with refused(ReducedModelFileError, sentence):
         arrays_from_bytes(content, "x.npz", ["a"])
@@ -126,7 +126,7 @@ def test_a_truncated_record_is_refused_with_its_file(record, tmp_path):
     path = tmp_path / "kept.npz"
     path.write_bytes(record.to_bytes()[:1000])
 
-    with refused(ReducedModelFileError, r"kept\.npz is not a sound archive"):
+    with refused(ReducedModelFileError, r"kept\.npz is not a valid archive"):
         type(record).load(path)
 
 

@@ -439,10 +439,11 @@ CUBE_POINTS, CUBE = box("hexahedron", (1, 1, 1))
     [
         (
             [("hexahedron", CUBE), ("wedge", CUBE[:, :6]), ("hexahedron", CUBE)],
-            "one kind of elements is expected .*, but 2 8-node hexahedra, 1 6-node wedges",
+            r"one kind of elements is expected .*, but the mesh has 2 8-node hexahedra, 1 6-node "
+            "wedges",
         ),
-        ([("pyramid", CUBE[:, :5])], r"is expected \(.*\), but 1 pyramid came"),
-        ([("quad", CUBE[:, :4])], "but none that is solid came"),
+        ([("pyramid", CUBE[:, :5])], r"is expected \(.*\), but the mesh has 1 pyramid"),
+        ([("quad", CUBE[:, :4])], "but the mesh has none that is solid"),
     ],
     ids=["several kinds", "pyramid", "quadrangle"],
 )

@@ -91,7 +91,7 @@ def test_a_text_is_refused(tmp_path):
     path = tmp_path / "a.fmu"
     path.write_text("hello", encoding="utf-8")
 
-    assert_file_refused(path, r"not a sound FMU archive .* fetch or build it again")
+    assert_file_refused(path, r"not a valid FMU archive .* fetch or build it again")
 
 
 def test_an_archive_with_a_link_out_of_its_folder_is_refused(fmu, tmp_path):
@@ -124,7 +124,7 @@ def test_an_archive_of_deep_folders_is_refused(fmu, tmp_path):
 def test_a_start_value_that_is_no_number_is_refused_at_loading(fmu, tmp_path, scratch):
     strange = edited(fmu, tmp_path / "strange.fmu", ('start="1.0"', 'start="abc"'))
 
-    with pytest.raises(errors.FmuFileError, match=r"start value that is no number .*'abc'"):
+    with pytest.raises(errors.FmuFileError, match=r"start value that is not a number .*'abc'"):
         FmiAsset(strange, WING_BINDING).reset()
 
     assert not list(scratch.iterdir())
@@ -398,7 +398,7 @@ def test_a_range_that_the_fmu_does_not_keep_is_told(foreign_fmu):
 
     text = text_of(check, "range edges")
     assert check.passed
-    assert "1 of 4 ends of ranges fail, such as u = 10 m/s" in text
+    assert "1 of 4 limits of input ranges make it fail, such as u = 10 m/s" in text
     assert "u is too large" in text
 
 

@@ -18,6 +18,7 @@ from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.instance_host import worker_limits
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
+from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units
@@ -62,6 +63,93 @@ def test_a_bad_file_is_one_sentence(tmp_path, case):
     assert "binding.toml" in str(caught.value)
 
 
+BAD_FILE = """
+[binding]
+name = "room"
+step_size = 60.0
+stop_tim = 3.0
+[control.power]
+variable = "heater"
+[load.outside]
+variable = "ambient"
+unit = 3
+"""
+
+UNFIT = """
+[binding]
+name = "room"
+step_size = 60.0
+[control.power]
+variable = "heatr"
+unit = "W"
+[load.outside]
+variable = "ambient_t"
+unit = "m"
+[observation.room]
+variables = ["nothing", "nobody"]
+unit = "degC"
+"""
+
+
+def test_all_faults_of_a_file_are_told_at_once(tmp_path):
+    path = tmp_path / "room.toml"
+    path.write_text(BAD_FILE, encoding="utf-8")
+
+    with pytest.raises(BindingError) as caught:
+        load_binding(path)
+
+    sentence = str(caught.value)
+    assert sentence.startswith(f"{path}: ")
+    for fault in (
+        "'binding.stop_tim' is not a key of a binding; the nearest is `stop_time`",
+        "'control.power.unit' is missing",
+        "load.outside.unit: ",
+    ):
+        assert sentence.count(fault) == 1
+
+
+def test_faults_beside_the_schema_are_told_at_once_with_the_file(tmp_path):
+    path = tmp_path / "twice.toml"
+    twice = '[load.m]\nvariable = "n"\nunit = "1"\n'
+    text = GOOD_FILE[: GOOD_FILE.index("[observation.strain]")] + twice
+    path.write_text(text, encoding="utf-8")
+
+    with pytest.raises(BindingError) as caught:
+        load_binding(path)
+
+    assert str(caught.value) == (
+        f"In {path}, there is no [observation.<name>] table; say what is measured; the FMU "
+        "variable 'n' is set by both control.n and load.m; keep one."
+    )
+
+
+def test_all_entries_that_do_not_fit_the_fmu_are_told_at_once_with_the_file(foreign_fmu, tmp_path):
+    path = tmp_path / "room.toml"
+    path.write_text(UNFIT, encoding="utf-8")
+
+    with pytest.raises(BindingError) as caught:
+        FmiAsset(foreign_fmu("room2"), path)
+
+    first, *others = str(caught.value).splitlines()
+    assert first == f"3 entries of the binding room ({path}) do not fit the FMU:"
+    for line, entry in zip(
+        others, ("control.power", "load.outside", "observation.room"), strict=True
+    ):
+        assert line.startswith(f"{entry} of the binding room ({path}) ")
+
+
+def test_inputs_that_nobody_sets_are_named_with_their_start_values(room):
+    draft = parse_draft(room)
+    assert unset_inputs_sentence(room, draft) == ""
+
+    without_load = draft.model_copy(update={"load": {}})
+    sentence = unset_inputs_sentence(room, without_load)
+
+    assert "1 input stays at its start value, because nobody sets it: " in sentence
+    given_names = {"control": draft.control, "health": draft.health}
+    assert sentence == unset_inputs_sentence(room, draft, given_names)
+
+
 LIMITED = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})
 
 
@@ -79,7 +167,9 @@ def test_limits_of_the_caller_come_first():
 
 @pytest.mark.parametrize("memory", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_impossible_limit_is_refused(memory):
-    with pytest.raises(FmuInputError, match=r"the limits of the worker: memory: .*, but .* came"):
+    with pytest.raises(
+        FmuInputError, match=r"the limits of the worker: memory: .*, but .* was given"
+    ):
         worker_limits(LIMITED, None, None, memory)
 
 
@@ -217,7 +307,7 @@ def wing_draft(fmu) -> Binding:
 
 def test_inputs_and_strains_of_the_wing_are_drafted_as_they_are_bound(wing_draft):
     assert wing_draft.control == WING_BINDING.control
-    assert [*wing_draft.health.values()] == [*WING_BINDING.health.values()]
+    assert wing_draft.health == WING_BINDING.health
     assert wing_draft.observation["strain"] == WING_BINDING.observation["strain"]
 
 

@@ -139,7 +139,9 @@ def test_histories_that_do_not_fit_are_refused(spring, inputs, sentence):
 def test_an_unknown_role_of_inputs_is_refused(spring, name):
     start_again = getattr(spring, name)
 
-    with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'loads' came"):
+    with pytest.raises(
+        TypeError, match="Inputs are control, health, load, port, but 'loads' was given"
+    ):
         start_again(loads={})
 
 
@@ -560,7 +562,9 @@ def test_elements_of_an_array_go_in_and_a_whole_array_comes_out(port_of_arrays):
 
 
 def test_a_port_of_two_elements_takes_two_values(port_of_arrays):
-    with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
+    with pytest.raises(
+        errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 were given"
+    ):
         port_of_arrays.step(port={"p.force": 1.0})
 
 

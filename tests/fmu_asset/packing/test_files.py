@@ -491,7 +491,7 @@ def test_cmake_builds_the_sources(model, compiler, tmp_path):
 
 def test_an_error_of_the_compiler_is_shown_with_its_line(compiler):
     with pytest.raises(errors.FmuBuildError, match=r"failed with exit code 1.*(?s:.*)wing\.c:1"):
-        compile_library({"wing.c": b"this is no C;\n"})
+        compile_library({"wing.c": b"this is not a C;\n"})
 
 
 def test_a_compiler_is_chosen_with_its_options(compiler, monkeypatch):

@@ -91,7 +91,7 @@ def test_a_declared_base_step_is_the_step(pack_alarm, tmp_path, place, annotatio
 def test_a_negative_base_step_is_refused(pack_alarm):
     (sentence,) = check_ssp(pack_alarm(experiment=BASE_STEP.format("-1"))).problems
 
-    assert "baseStepSize must be a positive number of seconds, and '-1' came" in sentence
+    assert "baseStepSize must be a positive number of seconds, but '-1' was given" in sentence
 
 
 def test_the_stop_time_of_a_system_is_told_to_its_fmus(foreign_fmu, pack_alarm):

@@ -227,7 +227,9 @@ def test_a_mapping_may_name_values_that_its_set_lacks(join, tmp_path):
     wiring = join(('source="chance"', 'source="luck"'))
 
     assert {*wiring.left_out} == {"damage.seed"}
-    assert "damage.seed (its set lacks the value)" in left_out_sentence(wiring, tmp_path)
+    assert "damage.seed (its parameter set has no such value)" in left_out_sentence(
+        wiring, tmp_path
+    )
 
 
 def test_start_values_of_outputs_are_set(foreign_fmu):
@@ -303,7 +305,7 @@ def test_what_is_wrong_is_said_in_one_sentence(pack, case):
 def test_a_damaged_fmu_in_a_file_is_named(pack):
     (sentence,) = check_ssp(pack(**{"resources/wing.fmu": "no FMU"})).problems
 
-    expected = r"resources/wing\.fmu in \S+/theirs\.ssp is not a sound FMU archive"
+    expected = r"resources/wing\.fmu in \S+/theirs\.ssp is not a valid FMU archive"
     assert re.match(expected, sentence)
 
 
@@ -320,7 +322,7 @@ def test_a_member_outside_of_the_folder_is_refused(pack, tmp_path):
 def test_an_archive_without_a_description_is_refused(pack, tmp_path):
     file = pack(without="SystemStructure.ssd")
 
-    with pytest.raises(SspError, match="so it is no SSP file"):
+    with pytest.raises(SspError, match="so it is not an SSP file"):
         read_ssp(file, tmp_path / "fmus")
 
     assert not (tmp_path / "fmus").exists()
@@ -332,7 +334,7 @@ def test_half_of_a_file_is_refused(pack, tmp_path):
     damaged = tmp_path / "damaged.ssp"
     damaged.write_bytes(content[: len(content) // 2])
 
-    with pytest.raises(SspError, match=r"not a sound SSP archive|so it is no SSP file"):
+    with pytest.raises(SspError, match=r"not a valid SSP archive|so it is not an SSP file"):
         read_ssp(damaged, tmp_path / "fmus")
 
     assert not (tmp_path / "fmus").exists()

@@ -110,7 +110,7 @@ def cell(content: dict[str, Any], draw: str) -> list[float]:
         (lambda content: content.pop("observations"), "lacks the entry 'observations'"),
         (lambda content: content["observations"].pop("40"), "lacks the entry '40'"),
         (lambda content: cell(content, "0.994").pop(), r"\[20\]\[0\]\[3g\]\[0.994\] must hold 24 finite"),
-        (lambda content: cell(content, "mean").__setitem__(1, float("nan")), "NaN is no number in JSON"),
+        (lambda content: cell(content, "mean").__setitem__(1, float("nan")), "NaN is not a number in JSON"),
         (lambda content: content.update(states=[[0, 20]]), "levels of 2 regions"),
         (lambda _: '{"states": [[0', "not valid JSON"),
         (lambda _: "[1, 2]", "not in the published format"),
@@ -197,7 +197,7 @@ def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(wing, tmp_
         assert source.write_field(tmp_path / "wing.vtu", health, control)
     table["belief"]["patch"] = str(write_patch(tmp_path, SensorGain("g5", 0.1)))
     patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
-    with pytest.raises(MissionInputError, match="predicts strains, and `frequency`"):
+    with pytest.raises(MissionInputError, match="predicts strains, but `frequency`"):
         asset_source(patched).check()
 
 

@@ -150,7 +150,7 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     (group,) = fleet.groups
     (scenario,) = group.scenarios
     seedless = scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"seeds": ()})})
-    with pytest.raises(FleetError, match="every seed would fly the same life"):
+    with pytest.raises(FleetError, match="every seed would fly the same mission"):
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
 
 

@@ -149,7 +149,7 @@ def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monk
         file.write(64 * "0" + ' {"shard": 2, "fail')  # a line that the kill cut off
     outcome = fly_fleet(fleet, cut)
     assert (outcome.shards_kept, outcome.shards_flown) == (1, 2)
-    kept = [  # the journal keeps times and is no result
+    kept = [  # the journal keeps times and is not a result
         sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
         for folder in (cut, whole)
     ]
@@ -182,7 +182,7 @@ def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
     for opened in (open_fleet, learn_fleet, write_fleet_report):
         with pytest.raises(RunFolderError, match="not the folder of a fleet"):
             opened(tmp_path / "other")
-    with pytest.raises(RunFolderError, match="not touched"):
+    with pytest.raises(RunFolderError, match="left unchanged"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(other, folder, replace_old=True).twins == 3
     for lacking, sentence in (

@@ -390,10 +390,11 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
     )
     opening = (
         f"60 of 60 assets have flown. In {len(delay)} assets the damage called for another control; the "
-        f"fallback came within 2 steps of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
+        f"fallback came within 2 steps of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The asset "
+        "with the most damage is "
         f"{fleet.groups[0].members[int(np.argmax(mean.sum(axis=1)))].name} of growing_damage: "
     )
-    for words in (opening, "60 assets in 1 group", "The assets by health", "Who needs attention next"):
+    for words in (opening, "60 assets in 1 group", "The assets by health", "Assets that need attention next"):
         assert words in text
 
     scenario = fleet.groups[0].scenarios[0]
@@ -431,5 +432,5 @@ def test_the_report_names_who_needs_probability_of_leaving(grown):
     worst = np.lexsort((-mean.sum(axis=1), -printed, -alarms))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
-    table = fleet_page(folder, ATTENTION_ROWS).partition("Who needs attention next")[2]
+    table = fleet_page(folder, ATTENTION_ROWS).partition("Assets that need attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]

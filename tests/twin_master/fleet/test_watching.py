@@ -378,7 +378,7 @@ def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_f
     done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "north/wing-0 is not watched: " in done.stderr
-    assert "`colour` is no sensor" in done.stderr
+    assert "`colour` is not a sensor" in done.stderr
 
 
 def test_a_fleet_with_an_asset_whose_messages_are_refused_ends_with_exit_code_1(fleet_file, tmp_path):
@@ -399,7 +399,10 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
     assert "colour" in failures["north/wing-0"]
     assert "void.csv is empty" in failures["north/void"]
     assert journals(tmp_path / "out")[:2] == alone[1:]
-    for line, words in ((LOGS.replace("logs", "none"), "no recording fits"), ("count = 2", "north has none")):
+    for line, words in (
+        (LOGS.replace("logs", "none"), "no recording matches"),
+        ("count = 2", "north has none"),
+    ):
         with pytest.raises(FleetError, match=words):
             FleetWatch(load_fleet(fleet_of(tmp_path, line)), tmp_path / "none", print, print)
 

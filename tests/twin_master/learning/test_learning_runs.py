@@ -193,7 +193,7 @@ def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
     """And no mean: that of litres a minute, newton metres, degrees and bars says nothing."""
     given: dict[str, Any] = {"mission": {"steps": 2}, "calibration": {"draws": 4}}
     given |= {"learning": {"gauge_offset": [0.5, 0.4, 1.0, 0.1]}}
-    plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is no strain
+    plain = changed_scenario("pump_wear", given | {"observation": {"unit": "1"}})  # which is not a strain
     assert printed_unit_of_quantity("gauge_offset", "1", plain.scenario) == (1.0, "")
     fly(changed_scenario("pump_wear", given), tmp_path, report=False)
     summary, units = json.loads((tmp_path / "summary.json").read_text()), ["L/min", "N.m", "degC", "bar"]

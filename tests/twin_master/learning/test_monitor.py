@@ -81,8 +81,8 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     (alarm,) = (notice for one in watched for notice in one.notices if notice.kind == "alarm")
     assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
     assert (
-        ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
-        f"softened, since about step {alarm.since}"
+        ": gauge 2 (spar) shows too much, or the asset near it differs from the model, for example "
+        f"because it has softened, since about step {alarm.since}"
     ) in alarm.sentence
     assert alarm.sentence.endswith("alarm from 100)")
     assert np.abs(found.filtered - plain.filtered).max() > 0.1
@@ -354,11 +354,13 @@ def test_belief_and_decision_follow_what_holds_now(between):
     assert "least gauges 17 and " in alarms[1].sentence  # of those that are off it was, too
     sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
-    assert (
-        "Or the asset near it is not as the model says, as where it has softened: these data" in sentences[0]
-    )
+    softened = "Or the asset near it differs from the model, for example because it has softened: these data"
+    assert softened in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]
-    assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
+    assert (
+        "no state explains the gauges: no state is believed, and the twin proposes the safest control"
+        in sentences[-2]
+    )
 
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():

@@ -259,7 +259,7 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
             wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
     for name, words in (
         ("missing", "there is no observation library"), ("noise", "not a whole NetCDF"),
-        ("other", "no observation library of this version"),
+        ("other", "not an observation library of this version"),
         ("observation", "finite"), ("control_speed", "finite"), ("wear", "finite"),
     ):  # fmt: skip
         with refused(MissionInputError, words):

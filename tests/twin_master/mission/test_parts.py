@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from tests.command_line import refused, said
+from tests.command_line import command, refused, said
 from tests.twin_master.runs import changed_scenario
 from twin_master.errors import FleetError, MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME
@@ -192,3 +192,47 @@ def test_the_command_line_flies_parts_by_name_alone_and_under_many_seeds(library
     told = refused("run", "growing_damage", "--estimator", "nothing", "--out", tmp_path / "never")
     assert "there is no estimator 'nothing'" in told
     assert not (tmp_path / "never").exists()
+
+
+SHARP = """
+from uav_twin import GaussianSensorModel
+
+class Sharp(GaussianSensorModel):
+    def log_likelihood(self, observation, control_index):
+        return 2.0 * super().log_likelihood(observation, control_index)
+
+def sharp(twin):
+    return Sharp(twin.sensor_model.value_per_draw, twin.sensor_model.standard_deviation)
+
+def plain(twin):
+    return GaussianSensorModel(twin.sensor_model.value_per_draw, twin.sensor_model.standard_deviation)
+"""
+
+
+def test_a_run_says_once_that_alarms_do_not_use_the_likelihood_of_a_sensor_model_of_ones_own(
+    library_file, tmp_path
+):
+    (tmp_path / "sharp.py").write_text(SHARP, encoding="utf-8")
+    words = ["run", "level_turns", "--strain-library", library_file]
+    sentence = "take the noise of the gauges as Gaussian"
+    told = said(*words, "--sensor-model", f"{tmp_path / 'sharp.py'}:sharp", "--out", tmp_path / "sharp")
+    assert told.count(sentence) == 1
+    assert "sensor model Sharp" in told
+    assert (tmp_path / "sharp" / "report.html").read_text("utf-8").count(sentence) == 1
+    words.append("--no-report")
+    told = said(*words, "--sensor-model", f"{tmp_path / 'sharp.py'}:plain", "--out", tmp_path / "plain")
+    assert sentence not in told
+
+
+def test_an_ensemble_says_that_notices_make_it_slow_and_flies_without_them(library_file, tmp_path):
+    words = ["run", "level_turns", "--strain-library", library_file, "--seeds", "0:2", "--workers", 0]
+    words.append("--no-report")
+    slow = command(*words, "--out", tmp_path / "slow")
+    assert slow.returncode == 0, slow.stderr
+    assert slow.stderr.count("the 2 twins fly one after the other because they give notices") == 1
+    assert "`--no-notices`" in slow.stderr
+    fast = command(*words, "--no-notices", "--out", tmp_path / "fast")
+    assert fast.returncode == 0, fast.stderr
+    assert "one after the other" not in fast.stderr
+    groups = [uav_twin.open_fleet(tmp_path / name)["level_turns"] for name in ("slow", "fast")]
+    assert [group.attrs["gives_notice"] for group in groups] == [1, 0]

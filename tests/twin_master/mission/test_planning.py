@@ -139,7 +139,7 @@ def test_a_policy_file_is_flown_by_a_twin_that_learns_and_gives_notice_and_its_r
     (tmp_path / "empty").touch()
     for wrong in (path, tmp_path / "empty"):
         told = refused("run", path, "--policy", wrong, "--out", folder)
-        assert "is no policy" in told
+        assert "is not a policy" in told
         assert "pickle" not in told
     said("run", path, "--policy", policy, "--out", folder, "--no-report")
     kept = load_knowledge(folder, read_scenario(folder)).plan.on_belief

@@ -246,8 +246,8 @@ POLICY = np.eye(2)[[0] * 25]
 ZEROS = np.zeros((3, 25))
 AT_1_7 = np.arange(75).reshape(3, 25) == 32
 REFUSED = [
-    (lambda: SPACE.index((0.3, 0.5)), r"0\.3 is no level of factor 'z1'"),
-    (lambda: SPACE.index((np.nan, 0.5)), "no level"),
+    (lambda: SPACE.index((0.3, 0.5)), r"0\.3 is not a level of factor 'z1'"),
+    (lambda: SPACE.index((np.nan, 0.5)), "not a level"),
     (lambda: SPACE.index((0.4,)), "one level for each"),
     (lambda: SPACE.marginal(np.full(15, 1 / 15), "z3"), "no factor is named 'z3'"),
     *((lambda bad=bad: Factor("z1", bad), "'z1'") for bad in ((), (0.2, 0.1), (0.0, 0.0), (0.0, np.inf))),

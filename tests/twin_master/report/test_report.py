@@ -271,7 +271,7 @@ def test_the_last_steps_of_a_watch_have_their_numbers_and_what_nobody_knows_is_l
     assert "step 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
     assert lost_ranges(watched) == "gauge 3 at steps 1008–1009; all gauges at step 1007"
     for now in (49, 999, 1050):
-        with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
+        with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, but {now} was given"):
             report.write_report(tmp_path, now=now)
     text = report.render_page(watched, dict.fromkeys(figures, DRAWING), figures)
     assert text.count("<figure") == 6

@@ -296,9 +296,14 @@ def test_what_options_change_and_what_stays_the_scenarios(folder):
     [
         ("level_turns", (), LIBRARY | FILE, "a strain library brings its own samples"),
         ("level_turns", (OF_CALIBRATION,), {}, "there is no calibration file: give --calibration"),
-        ("three_fmus", (OF_CALIBRATION,), {}, "the design of a calibration is asked for, and there is no"),
+        (
+            "three_fmus",
+            (OF_CALIBRATION,),
+            {},
+            "the scenario asks for the design of a calibration, but there is no",
+        ),
         ("level_turns", (), {"calibration": "half.nc"}, "damaged"),
-        ("level_turns", (), {"calibration": "none.nc"}, "not there"),
+        ("level_turns", (), {"calibration": "none.nc"}, "is missing"),
         ("level_turns", ((BOUND, f'{BOUND}patch = "q.json"\n'),), {}, r"q\.json cannot be read"),
         ("level_turns", (FLOWN_PATCH, HIDDEN), {}, r"effect\.hiden\.active"),
         ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
@@ -365,7 +370,7 @@ def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario
 
 
 def missing_in(table: dict[str, Any]) -> str:
-    """Return why a table is no scenario."""
+    """Return why a table is not a scenario."""
     with pytest.raises(ScenarioError) as caught:
         parse_scenario(table, "mine.toml")
     return str(caught.value)

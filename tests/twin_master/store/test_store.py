@@ -118,6 +118,19 @@ def test_fallback(gentle, truth, delay, early):
     assert told[3:] == [None if early == 29 else delay, early]
 
 
+def test_a_true_state_between_the_levels_calls_for_the_fallback_from_the_nearest_level_on():
+    """Levels of 25 % stand for a script of 20 % a time: 40 % is nearest to the 50 % of the policy."""
+    table = table_of("level_turns")
+    for factor in table["state"]:
+        factor["levels_percent"] = [0, 25, 50, 75, 80]
+    states = build_graphical_model(loaded_from(table, "level_turns").scenario).states
+    policy = np.where(states.coordinates[:, 0] > 0.49, 0, 1)
+    found = find_fallback(states, policy, 1, controls(*range(21, 50)), TRUTH)
+    assert (found.switch_level, found.called_for_step) == (0.5, 20)
+    assert (found.delay, found.early_step) == (1, None)
+    assert find_fallback(states, policy, 1, controls(15, *range(21, 50)), TRUTH).early_step == 15
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e-13, 1e9])
 def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
     """History, fallback and credible sets of leaks of square millimetres, told in square metres, too."""

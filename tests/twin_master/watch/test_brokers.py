@@ -82,7 +82,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
-    assert not [*watch.folder.glob("*.mqtt")]  # a client that never was in is no client that was forgotten
+    assert not [*watch.folder.glob("*.mqtt")]  # a client that never was in is not a client that was forgotten
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
     with watching(where, watch, steps):
         listener, heard = heard_at(broker, "listener")

@@ -206,7 +206,7 @@ def test_a_cut_without_a_copy_is_told(begun_log, steps, left):
     size = path.stat().st_size
     path.write_text(HEADER + "".join(map(row, left)))
     assert str(next(messages)[0]) == (
-        f"log.csv was cut at byte {size}, and no copy is beside it: what stood behind that and was not read "
+        f"log.csv was cut at byte {size}, and no copy is beside it: what followed and was not read "
         "yet is lost"
     )
     assert new(messages) == left
@@ -232,7 +232,7 @@ def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp
 
 @pytest.mark.parametrize("allows_unknown", [False, True])
 def test_a_row_in_the_place_of_the_header_is_no_header(base, tmp_path, allows_unknown):
-    """Also where names that are no sensor are passed over."""
+    """Also where names that are not sensors are passed over."""
     scenario = base.scenario.with_changes("watch", allow_unknown=allows_unknown)
     path = tmp_path / "log.csv"
     path.write_text(row(2))
@@ -249,5 +249,5 @@ def test_a_row_in_the_place_of_the_header_is_no_header(base, tmp_path, allows_un
 def test_columns_of_which_none_is_known_are_refused_also_where_names_are_passed_over(base, tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("strian_1,battery\n1e-4,3.3\n")
-    with pytest.raises(MissionInputError, match="`strian_1` and `battery` are no sensors"):
+    with pytest.raises(MissionInputError, match="`strian_1` and `battery` are not sensors"):
         CsvFeed(path, base.scenario.with_changes("watch", allow_unknown=True))

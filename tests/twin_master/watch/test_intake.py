@@ -277,7 +277,7 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
         reader = MessageReader(scenario.model_copy(update={"observation": leak}))
         np.testing.assert_allclose(reader.read({f"operation_2 [{unit}]": 3.0}).observed[1], 3.0 * size)
     refused = MessageReader(allowing).read(b'{"strain_2_bar": 1e-4}')  # a gauge that is there
-    assert "`bar` is no unit of sensor 2" in str(refused)
+    assert "`bar` is not a unit of sensor 2" in str(refused)
 
 
 @pytest.mark.parametrize(("text", "shown"), [*INPUTS.refused("unreadable"), ("9" * 5000, "Infinity")])

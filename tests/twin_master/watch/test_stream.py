@@ -96,7 +96,9 @@ def test_a_gap_of_a_clock_that_is_known_is_a_gap_however_long(watch, mission):
     decisions = decisions_of(watch, messages)
     assert decisions[-1]["step"] == 1001
     told = sentence(decisions, "gap")
-    assert told.startswith("Steps 2 to 1000: no message came, and the belief is predicted through 999 steps")
+    assert told.startswith(
+        "Steps 2 to 1000: no message was received, and the belief is predicted over 999 steps"
+    )
     assert "milliseconds" not in told
 
 
@@ -104,7 +106,7 @@ def test_a_gap_is_told_once_by_a_watch_that_ends_within(watch, mission, tmp_path
     messages = [line(mission, step, step=step) for step in (0, 1, 9)]
     decisions = decisions_of(watch, messages, steps=4) + decisions_of(watch, messages[2:])
     assert kinds(decisions) == [(2, "gap")]
-    assert sentence(decisions, "gap").startswith("Steps 2 to 8: no message came")
+    assert sentence(decisions, "gap").startswith("Steps 2 to 8: no message was received")
     assert decisions[-1]["step"] == 9
 
 
@@ -113,7 +115,7 @@ def test_refusals_in_a_row_are_told_once_and_that_messages_are_taken_again(watch
     bad = {"step": "one"}
     decisions = decisions_of(watch, [good[0], bad, bad, good[1], *[bad] * 5, good[2]])
     assert kinds(decisions) == [(1, "refused"), (2, "taken")]
-    assert "Since step 1, 3 messages came, and all were refused" in sentence(decisions, "refused")
+    assert "Since step 1, 3 messages were received, and all were refused" in sentence(decisions, "refused")
     assert "after 5 were refused" in sentence(decisions, "taken")
     assert decisions[2]["told_again"]  # the last decision, with the notice
     assert watch.intake.complaint() == ""

@@ -51,7 +51,7 @@ if kind is None:
     sys.exit("Nothing can be said.")
 place = out.with_name("." + out.name)
 place.mkdir()
-gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves only noise."}]
 verdict = {"kind": kind, "sentence": "It is so.", "gates": gates, "effects": []}
 (place / "verdict.json").write_text(json.dumps({"verdict": verdict}))
 (place / "patch.json").write_text(json.dumps(patch))
@@ -202,8 +202,8 @@ def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
     ("name", "passed", "caveat"),
     [
         ("absolute fit", False, "It leaves three noises."),
-        ("absolute fit", None, "Whether it leaves noise alone was not tested."),
-        ("shape", True, "Whether it leaves noise alone was not tested."),
+        ("absolute fit", None, "It was not tested whether the residuals are noise."),
+        ("shape", True, "It was not tested whether the residuals are noise."),
         ("held-out trials", False, "It leaves three noises."),
     ],
 )
@@ -226,7 +226,7 @@ def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp
 )
 def test_a_group_that_differs_at_other_loads_is_not_tried(tmp_path, members, tried):
     """Gauge 17 showed 12 % too little; saturation was the most probable of its group, and was adopted."""
-    gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves noise alone."}]
+    gates = [{"name": "absolute fit", "passed": True, "reason": "It leaves only noise."}]
     folder = verdict_folder(tmp_path / "verdict", gates)
     effects = [{"patch": ModelPatch((member,)).to_list()} for member in members]
     verdict = {"kind": "group", "sentence": "Either is missing.", "gates": gates, "effects": effects}

@@ -220,7 +220,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"step": 2}', b'"step": 1}'), *lines[4:]]))
     ran(watch, feed, 198)
     with pytest.raises(
-        NotResumableError, match=r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
+        NotResumableError, match=r"line 4 .*damaged.*; 3 before it and 195 after it are valid"
     ):
         notices_since(watch, 0)
     # Another watch takes in all but what the line said, and refuses that by name; the refusal says so.
@@ -268,7 +268,7 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
         return [(said["step"], [notice["kind"] for notice in said["notices"]]) for said in told]
 
     def refused_message_is_sent() -> bool:
-        """Send one, which is no step; return whether the silence was told."""
+        """Send one, which is not a step; return whether the silence was told."""
         os.write(write, b'{"step": 0, "no_sensor": 1.0}\n')
         return any(notice["kind"] == "quiet" for said in told for notice in said["notices"])
 

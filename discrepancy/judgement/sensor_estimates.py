@@ -1,0 +1,142 @@
+"""Gains and zeros of channels as they were fitted, beside what the campaign states of them."""
+
+from math import inf, nan
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.units import UNITS
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import trial_jacobian
+from discrepancy.fits.problem import Problem
+from discrepancy.verdict import SensorEstimate, SensorValue
+
+
+def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimate, ...]:
+    """Return the fitted gains, and the fitted zeros of each trial, in the order of the channels.
+
+    Gains and zeros that the campaign states as exact are not fitted, and have no entry.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    fit : CandidateFit
+        The fit, with the posterior covariance of what the trials share.
+    """
+    estimates = _gain_estimates(problem, fit)
+    # a channel without a noise record has the noise that its residuals show
+    noise_precision = np.where(
+        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
+    )
+    for trial_index in range(len(problem.trials)):
+        estimates += _zero_estimates(problem, fit, trial_index, noise_precision)
+    order = list(problem.campaign.channels)
+    return tuple(sorted(estimates, key=lambda estimate: order.index(estimate.channel)))
+
+
+def _gain_estimates(problem: Problem, fit: CandidateFit) -> list[SensorEstimate]:
+    """Return the relative errors of the gains that were fitted; the stated value is zero."""
+    layout = problem.shared
+    deviations = layout.scale * np.sqrt(np.diag(fit.covariance)[: layout.unknown_count])
+    values = layout.centre + layout.scale * fit.point.shared
+    estimates = []
+    for index, channel in enumerate(layout.gain_channels, start=layout.parameter_count):
+        estimates.append(
+            _estimate(
+                channel=channel,
+                kind=SensorValue.GAIN,
+                trial="",
+                value=float(values[index]),
+                deviation=float(deviations[index]),
+                stated_deviation=_stated_deviation(layout.scale[index], layout.precision[index]),
+                unit="1",
+            )
+        )
+    return estimates
+
+
+def _zero_estimates(
+    problem: Problem, fit: CandidateFit, trial_index: int, noise_precision: FloatArray
+) -> list[SensorEstimate]:
+    """Return the zeros that were fitted in a trial; the stated value is zero.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    fit : CandidateFit
+        The fit.
+    trial_index : int
+        The index of the trial.
+    noise_precision : (channels,) array
+        The estimated noise precision of each channel over the recorded one.
+    """
+    data = problem.trials[trial_index]
+    layout = data.unknowns
+    if not layout.zero_count:
+        return []
+    deviations = layout.scale * _local_deviations(problem, fit, trial_index, noise_precision)
+    values = layout.scale * fit.point.local[trial_index]
+    estimates = []
+    for index, column in enumerate(layout.zero_columns):
+        channel = data.trial.channels[column]
+        estimates.append(
+            _estimate(
+                channel=channel,
+                kind=SensorValue.ZERO,
+                trial=data.trial.name,
+                value=float(values[index]),
+                deviation=float(deviations[index]),
+                stated_deviation=_stated_deviation(layout.scale[index], layout.precision[index]),
+                unit=UNITS[problem.campaign.channels[channel].quantity].si,
+            )
+        )
+    return estimates
+
+
+def _local_deviations(
+    problem: Problem, fit: CandidateFit, trial_index: int, noise_precision: FloatArray
+) -> FloatArray:
+    """Return the posterior standard deviations (L,) of the scaled unknowns of a trial.
+
+    Given the shared unknowns, the trial's unknowns have the covariance A^-1, where A is their block
+    of the normal equations. They follow a change of the shared unknowns, which adds the covariance
+    of these.
+    """
+    rows = trial_jacobian(problem, trial_index, fit, fit.candidate, noise_precision)
+    factor, local_per_shared = rows.eliminate_local()
+    inverse_factor = np.linalg.inv(np.triu(factor))
+    conditional_variance = np.sum(inverse_factor**2, axis=1)
+    shared_covariance = fit.covariance[np.ix_(rows.shared_indices, rows.shared_indices)]
+    added_variance = np.einsum("lk,km,lm->l", local_per_shared, shared_covariance, local_per_shared)
+    return np.asarray(np.sqrt(conditional_variance + np.maximum(added_variance, 0.0)))
+
+
+def _stated_deviation(scale: float, precision: float) -> float:
+    """Return the stated standard deviation of an unknown; infinite if it has a flat prior."""
+    return float(scale) if precision > 0.0 else inf
+
+
+def _estimate(
+    *,
+    channel: str,
+    kind: SensorValue,
+    trial: str,
+    value: float,
+    deviation: float,
+    stated_deviation: float,
+    unit: str,
+) -> SensorEstimate:
+    """Return the record of an estimate, with its distance from the stated value, which is zero."""
+    deviations = value / stated_deviation if stated_deviation < inf else nan
+    return SensorEstimate(
+        channel=channel,
+        kind=kind,
+        trial=trial,
+        value=value,
+        deviation=deviation,
+        stated_deviation=stated_deviation,
+        deviations=deviations,
+        unit=unit,
+    )

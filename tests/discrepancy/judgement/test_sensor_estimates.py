@@ -1,0 +1,147 @@
+"""Fitted gains and zeros stand beside each channel; where they hide an error, the verdict says so."""
+
+from dataclasses import replace
+from math import hypot, inf, isnan
+
+import numpy as np
+import pytest
+
+from discrepancy.catalogue.library import library
+from discrepancy.files.verdict import read_verdict_file, write_verdict
+from discrepancy.fits.normal_equations import normal_equations
+from discrepancy.judgement.moved_unknowns import unknowns_moved_within_prior
+from discrepancy.judgement.sensor_estimates import sensor_estimates
+from discrepancy.report.figures import ReportInput
+from discrepancy.report.page import render_report, verdict_card
+from discrepancy.report.printed import verdict_lines
+from discrepancy.report.sensor_table import MOST_PRINTED_SENSORS, printed_sensor_table
+from discrepancy.verdict import SensorValue, VerdictKind
+from discrepancy.workflow import investigate
+from reporting.page import Table
+from tests.discrepancy.core import kit
+from tests.discrepancy.rigs import ORIGIN, chosen, simulated
+from tests.discrepancy.system.test_regions_of_structures import beam_file, model  # noqa: F401
+
+GAIN = 0.03
+"""Relative error of the gain that is hidden in the channel g2."""
+
+
+def with_stated_gains(campaign, deviation, *names):
+    """Return a campaign of which these channels, or all, state their gains to a standard deviation."""
+    channels = dict(campaign.channels)
+    for name in names or channels:
+        channels[name] = replace(channels[name], gain_deviation=deviation)
+    return replace(campaign, channels=channels)
+
+
+@pytest.fixture(scope="module")
+def wide_gain(model):  # noqa: F811
+    """The beam under static loads, whose gauge g2 reads 3 % too much and is stated to 5 %."""
+    campaign = simulated(model, "static", 3)
+    trials = [
+        replace(trial, values=trial.values * (1.0 + GAIN * (np.array(trial.channels) == "g2")))
+        for trial in campaign.trials
+    ]
+    campaign = with_stated_gains(replace(campaign, trials=tuple(trials)), 0.05, "g2")
+    return investigate(campaign, model, chosen("load_cell", "region_stiffness_loss"), seed=3)
+
+
+def test_the_deviations_are_those_of_all_unknowns_together():
+    """Inverted at once, the normal equations give the same deviations as with the trials eliminated."""
+    problem = kit.closed_problem(seed=1, gain_deviation=0.02)
+    fitted = kit.fitted(problem)
+    equations = normal_equations(problem, fitted, fitted.candidate, np.ones(len(problem.channel_names)))
+    deviations = np.sqrt(np.diag(np.linalg.inv(equations.matrix)))
+    first = problem.shared.unknown_count
+    wanted = {}
+    for index, channel in enumerate(problem.shared.gain_channels, start=problem.shared.parameter_count):
+        wanted[channel, ""] = problem.shared.scale[index] * deviations[index]
+    for data in problem.trials:
+        for index, column in enumerate(data.unknowns.zero_columns):
+            name = data.trial.channels[column], data.trial.name
+            wanted[name] = data.unknowns.scale[index] * deviations[first + index]
+        first += data.unknowns.unknown_count
+    estimates = {(item.channel, item.trial): item for item in sensor_estimates(problem, fitted)}
+    assert estimates.keys() == wanted.keys()
+    for name, estimate in estimates.items():
+        assert estimate.deviation == pytest.approx(wanted[name], rel=1e-6)
+        assert estimate.deviations == pytest.approx(estimate.value / estimate.stated_deviation)
+        assert (estimate.kind is SensorValue.GAIN) == (name[1] == "")
+
+
+def test_a_zero_that_was_not_stated_has_no_distance():
+    problem = kit.closed_problem(seed=1, offset_deviation=inf)
+    estimates = sensor_estimates(problem, kit.fitted(problem))
+    assert estimates
+    assert all(isnan(item.deviations) and item.stated_deviation == inf for item in estimates)
+    (row, *_) = printed_sensor_table(estimates, problem.campaign.channels).rows
+    assert row[4:] == ["not stated", ""]
+
+
+def test_a_fitted_gain_is_shown_in_the_output_the_file_and_the_page(wide_gain, tmp_path):
+    verdict = wide_gain.verdict
+    gains = {item.channel: item for item in verdict.sensors if item.kind is SensorValue.GAIN}
+    assert gains.keys() == set(wide_gain.campaign.channels)
+    estimate = gains["g2"]
+    own_deviation = 0.005  # of the simulated gauge, before the gain is hidden
+    assert abs(estimate.value - GAIN) < 3.0 * hypot(estimate.deviation, own_deviation)
+    assert estimate.deviation < 0.005
+    # printed
+    content = ReportInput(wide_gain, ORIGIN)
+    (printed,) = [item for item in verdict_lines(content) if isinstance(item, Table)]
+    (row,) = [row for row in printed.rows if list(row[:2]) == ["g2", "gain error"]]
+    assert row[3:5] == ["%", "0 ± 5"]
+    assert float(row[2].split(" ± ")[0]) == pytest.approx(100.0 * estimate.value, abs=0.1)
+    assert float(row[5]) == pytest.approx(estimate.deviations, abs=0.06)
+    # in the file
+    path = write_verdict(tmp_path / "verdict.json", verdict, None, ORIGIN)
+    assert read_verdict_file(path).verdict.sensors == verdict.sensors
+    # on the page
+    page = render_report(content, {}, {})
+    assert "Gains and zeros of the channels" in page
+    assert row[2] in page
+
+
+def test_of_many_channels_the_farthest_are_printed():
+    problem = kit.closed_problem(seed=1, gain_deviation=0.02)
+    (some, *_) = sensor_estimates(problem, kit.fitted(problem))
+    channel = problem.campaign.channels[some.channel]
+    names = [f"g{number}" for number in range(30)]
+    many = [replace(some, channel=name, deviations=0.1 * number) for number, name in enumerate(names)]
+    printed = printed_sensor_table(many, dict.fromkeys(names, channel))
+    assert [row[0] for row in printed.rows] == names[-MOST_PRINTED_SENSORS:]
+
+
+def test_nothing_missing_says_which_gain_an_error_may_hide_in(model):  # noqa: F811
+    """A stiffness loss of 20 % hides in gains that are stated to 12 %."""
+    hidden = ("region_stiffness_loss", {"loss": 0.2}, "z2")
+    campaign = with_stated_gains(simulated(model, "static", 3, hidden), 0.12)
+    verdict = investigate(campaign, model, library(), seed=3).verdict
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+    moved = {unknown.name: unknown for unknown in verdict.moved_within_prior}
+    assert "gain of g3" in moved
+    assert all(1.0 <= abs(unknown.deviations) <= 2.0 for unknown in moved.values())
+    assert (
+        f"the gain of g3 by {100.0 * moved['gain of g3'].value:+.3g} % (stated to 12 %;" in verdict.sentence
+    )
+    assert "an error of the model of this size would not show" in verdict.sentence
+    assert "gain of g3 moved by" in verdict_card(verdict)
+
+
+def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(model):  # noqa: F811
+    verdict = investigate(simulated(model, "static", 3), model, chosen("load_cell"), seed=3).verdict
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+    farthest = verdict.moved[0]
+    assert abs(farthest.deviations) > 2.0
+    assert f"{abs(farthest.deviations):.1f} deviations)" in verdict.sentence
+    assert "where an error of the model may hide" in verdict.sentence
+    assert farthest.name in verdict_card(verdict)
+
+
+def test_a_prior_that_is_narrow_hides_nothing():
+    """Gains within a fifth of a per cent move by up to two deviations, which is no error of a model."""
+    problem = kit.closed_problem(seed=1, gain_deviation=0.002)
+    fitted = kit.fitted(problem)
+    far = replace(fitted.point, shared=np.full_like(fitted.point.shared, 1.5))
+    names = {item.name for item in unknowns_moved_within_prior(problem, replace(fitted, point=far))}
+    assert not any(name.startswith("gain of ") for name in names)
