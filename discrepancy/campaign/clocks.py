@@ -375,7 +375,7 @@ def _fill_between_samples(
     positions : sequence of int
         The indices of the load's own samples among the cells.
     hold : Hold
-        The course between the samples, by which the load is interpolated.
+        The course of the load between its samples, which decides how it is interpolated.
     """
     if len(positions) < 2 or not all(cells[position] for position in positions):
         return

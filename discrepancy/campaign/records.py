@@ -389,7 +389,7 @@ class Campaign:
 
     @property
     def largest_magnitudes(self) -> dict[str, float]:
-        """Largest loads and times of the campaign, by which parameters of effects are scaled.
+        """The largest loads and times of the campaign, which scale the parameters of effects.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
         ``duration`` the longest record of a motion [s], ``campaign_time`` the time from the first

@@ -119,7 +119,7 @@ def _describe_copy(
     original_used, copy_used : (N,) ndarrays of bool
         False for samples that are left out.
     shift : int
-        The number of samples by which the copy comes later than the original.
+        The delay of the copy behind the original, in samples.
 
     Returns
     -------

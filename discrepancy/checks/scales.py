@@ -28,13 +28,12 @@ _LEAST_RELATIVE_ERROR = 0.02
 def data_scales(
     campaign: Campaign, predictions: Mapping[str, FloatArray]
 ) -> dict[tuple[str, str], float]:
-    """Return the factors by which readings differ from their prediction, by channel and trial.
+    """Return the ratios of readings to predicted readings, by channel and trial.
 
-    A factor is the ratio of readings to predicted readings, with a sign. For readings at rest
-    (static and flight trials) it is the robust slope of the readings over the prediction. For
-    records in time it is the ratio of their amplitudes, because the model need not predict their
-    phase. A channel whose predicted amplitude in a trial is too small to determine the factor is
-    left out.
+    A ratio has a sign. For readings at rest (static and flight trials) it is the robust slope of
+    the readings over the prediction. For records in time it is the ratio of their amplitudes,
+    because the model need not predict their phase. A channel is left out in a trial in which its
+    predicted amplitude is too small to determine the ratio.
 
     Parameters
     ----------
@@ -46,7 +45,7 @@ def data_scales(
     Returns
     -------
     dict of (str, str) to float
-        The factor by the names of channel and trial.
+        The ratio by the names of channel and trial.
     """
     scales = {}
     for trial in campaign.trials:

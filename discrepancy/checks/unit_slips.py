@@ -249,7 +249,7 @@ def _channel_faults(
     name : str
         The name of the channel.
     slip : Slip
-        The unit that was stated, and the one that was probably meant.
+        The unit that was stated, and the unit that was probably meant.
     trials : sequence of Trial
         The trials that show it.
     """

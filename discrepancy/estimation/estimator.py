@@ -76,7 +76,7 @@ class MotionEstimator(GaussNewton):
     def follow_to_small_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
     ) -> MotionEstimate | None:
-        """Return an estimate that is followed from large missing forces to small ones.
+        """Follow an estimate from large missing forces to small missing forces, and return it.
 
         The windows of speeds are narrowed first, then the missing forces are lowered.
 

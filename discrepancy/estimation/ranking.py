@@ -46,7 +46,7 @@ def rank_by_missing_force(
 ) -> list[ForceHypothesis]:
     """Return hypotheses on the missing force, the most probable first.
 
-    The best ones are estimated together with the motion. Of long records, only the leading
+    The best hypotheses are estimated together with the motion. Of long records, only the leading
     hypotheses and the one without effects are returned.
 
     Parameters

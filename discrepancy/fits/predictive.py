@@ -242,7 +242,7 @@ class _TrialPredictions:
     def _leverage_and_variance(
         self, trial_index: int, data: TrialData, factors: _CovarianceFactors
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the leverage of the readings and the variance of a new reading, both (N, C).
+        """Return the leverage (N, C) of the readings, and the variance (N, C) of a new reading.
 
         Both are relative to the noise variance; `FittedTrial` defines the leverage.
         """

@@ -23,7 +23,7 @@ def smoother_corrections(
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the vector and matrix by which later readings correct the state at each sample.
+    """Return the vector and the matrix that correct the state at each sample by later readings.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
     1085-1088), which inverts no covariance. In his letters the correction is r, the information N,

@@ -163,7 +163,7 @@ def fit_missing_forces(
     median_processes : mapping of int to Process
         The prior medians of the missing forces, by the numbers of their ports.
     initial_processes : mapping of int to Process
-        The missing forces from which the search for the most probable ones begins.
+        The missing forces with which the search for the most probable missing forces begins.
     candidate : Candidate
         The effects of the hypothesis, each at its place.
     effect : (E,) array

@@ -521,7 +521,7 @@ class ColumnBuilder:
         return trial.divide_by_noise(change * gains)
 
     def _linearisation_point(self, trial: PortedTrial) -> tuple[FloatArray, FloatArray]:
-        """Return the shared unknowns (K,) and those of a trial (L,) about which it is linear."""
+        """Return the shared (K,) and the local (L,) unknowns about which a trial is linear."""
         shared_count = self.problem.shared.unknown_count
         shared_values, local_values = np.split(trial.linearisation_point, [shared_count])
         return shared_values, local_values

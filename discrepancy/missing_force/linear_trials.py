@@ -298,7 +298,7 @@ class LinearTrials:
             The missing forces, by the number of the port.
         fixed_solution : Solution, optional
             The values of the shared unknowns and of the effect parameters; by default the most
-            ones.
+            probable values.
         """
         solution = fixed_solution or self.solve(processes)
         local_of_trials = []

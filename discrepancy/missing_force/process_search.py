@@ -54,7 +54,7 @@ def prior_log_density(median_processes: Processes, processes: Processes) -> floa
 
 
 def _ratios_to_median(process: Process, median_process: Process) -> tuple[float, float]:
-    """Return the size and the correlation time of a process over those of the median."""
+    """Return the ratios of size and correlation time between a process and its prior median."""
     return (
         process.standard_deviation / median_process.standard_deviation,
         process.correlation_time / median_process.correlation_time,

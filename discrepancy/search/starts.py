@@ -51,7 +51,7 @@ def report_each(
     on_progress : callable
         The function to which progress is reported, as a line of text.
     items : sequence
-        The items of which each is reported.
+        The items to yield.
     describe : callable
         Returns a phrase on how an item is processed, such as "fitting gain".
     """
