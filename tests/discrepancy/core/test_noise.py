@@ -133,15 +133,15 @@ def test_ljung_box_allows_for_samples_that_do_not_count():
     used[40:70] = False
     used[generator.choice(150, 20, replace=False)] = False
     rows = generator.standard_normal((4000, 150))
-    p = np.array([ljung_box(row, used=used)[1] for row in rows])
+    p = np.array([ljung_box(row, is_used=used)[1] for row in rows])
     for level in (0.2, 0.05, 0.01, 0.0025):
         assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * np.sqrt(level / 4000) + 0.2 * level)
     rows[:, ~used] = 100.0
-    assert ljung_box(rows[0], used=used)[1] == p[0]
-    assert ljung_box(rows[0], used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
+    assert ljung_box(rows[0], is_used=used)[1] == p[0]
+    assert ljung_box(rows[0], is_used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
     every = np.ones(150, dtype=bool)
     again = generator.standard_normal(150)
-    assert ljung_box(again, used=every)[0] == pytest.approx(ljung_box(again)[0], rel=1e-12)
+    assert ljung_box(again, is_used=every)[0] == pytest.approx(ljung_box(again)[0], rel=1e-12)
 
 
 def test_weights_of_the_pooled_variance_have_the_most_power():
