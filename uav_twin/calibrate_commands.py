@@ -70,24 +70,24 @@ def calibrate_campaign(
     name = check_name(data.name if asset is None else asset)
     if out is not None:
         check_folder(out, name, wing=False)
-    chosen = choose_model(model)
-    result = calibrate_parameters(data, chosen, asset=name, samples=samples, seed=seed)
-    written = None
+    chosen_model = choose_model(model)
+    result = calibrate_parameters(data, chosen_model, asset=name, samples=samples, seed=seed)
+    written_file = None
     if out is not None:
-        written = write_calibration_folder(result, out, report=not no_report)
-    print_calibration(result, written, json=json, report=not no_report)
+        written_file = write_calibration_folder(result, out, report=not no_report)
+    print_calibration(result, written_file, json=json, report=not no_report)
 
 
 def print_calibration(
-    result: "Calibration", written: Path | None, *, json: bool, report: bool
+    result: "Calibration", written_file: Path | None, *, json: bool, report: bool
 ) -> None:
     """Print the posterior of a calibration, and the files that were written.
 
     Parameters
     ----------
     result : Calibration
-        The calibration.
-    written : Path or None
+        The result of the calibration.
+    written_file : Path or None
         The file of the calibration, if one was written.
     json : bool
         Whether to print JSON.
@@ -95,18 +95,18 @@ def print_calibration(
         Whether a report was written beside the file.
     """
     if json:
-        file = None if written is None else str(written)
+        file = None if written_file is None else str(written_file)
         terminal.print_json({"calibration": file} | _calibration_record(result))
         return
     _print_posterior(result)
-    if written is None:
+    if written_file is None:
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
     from calibration.result.folder import REPORT_NAME
 
-    terminal.say(f"Calibration: {written}")
+    terminal.say(f"Calibration: {written_file}")
     if report:
-        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+        terminal.say(f"Report: {written_file.with_name(REPORT_NAME)}")
 
 
 def _print_posterior(result: "Calibration") -> None:
@@ -237,10 +237,10 @@ def calibrate_wing(
         from calibration.paper.figures import printed_table_1
 
         terminal.show([printed_table_1(calibration.table_1).table])
-    written = None
+    written_file = None
     if out is not None:
-        written = write_wing_folder(calibration, out, report=not no_report)
-    print_calibration(calibration.result, written, json=json, report=not no_report)
+        written_file = write_wing_folder(calibration, out, report=not no_report)
+    print_calibration(calibration.result, written_file, json=json, report=not no_report)
 
 
 def calibrate_ringdown(
@@ -332,7 +332,7 @@ class RingDownRow(NamedTuple):
         The mean over the trials, the standard deviation between trials, and the standard error of
         the mean.
     paper : float
-        The published figure.
+        The value that the paper publishes.
     """
 
     figure: str

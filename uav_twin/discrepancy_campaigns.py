@@ -489,14 +489,14 @@ def example(
     from fe.runtime.patch import ModelPatch
 
     refuse_filled(out, "folder")
-    chosen = choose_model(model).model
-    plan = usual_plan(chosen)
+    chosen_model = choose_model(model).model
+    plan = usual_plan(chosen_model)
     patch = ModelPatch()
     if effect:
-        plain = example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks
+        plain_campaign = example_campaign(chosen_model, kind, seed, plan)  # type: ignore[arg-type]  # it checks
         for text in effect:
-            patch = patch + _patch_of_hidden_effect(text, chosen, plain)
-    campaign = write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
+            patch = patch + _patch_of_hidden_effect(text, chosen_model, plain_campaign)
+    campaign = write_example(chosen_model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
     arguments = _shell_arguments(out, model)
     terminal.say(f"Wrote {out}: {_campaign_size(campaign)}; hidden: {hidden}.")
@@ -542,8 +542,10 @@ def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> 
         raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
     places = effect.places(setting)
     if at_sign and place not in places:
-        known = ", ".join(repr(name) for name in places)
-        raise CatalogueError(f"{identifier} cannot act at {place!r} here; its places are {known}.")
+        known_places = ", ".join(repr(name) for name in places)
+        raise CatalogueError(
+            f"{identifier} cannot act at {place!r} here; its places are {known_places}."
+        )
     values = _usual_values(effect)
     if numbers or has_names:
         values |= _parameter_values(text, identifier, numbers.split(","), list(values))
@@ -558,11 +560,11 @@ def _usual_values(effect: "Effect") -> dict[str, float]:
     """
     values = {}
     for parameter in effect.parameters:
-        median = parameter.prior.value(0.0)
-        if parameter.magnitude and median == 0.0:
+        median_value = parameter.prior.value(0.0)
+        if parameter.magnitude and median_value == 0.0:
             values[parameter.name] = parameter.prior.value(1.0)
         else:
-            values[parameter.name] = median
+            values[parameter.name] = median_value
     return values
 
 
@@ -580,7 +582,7 @@ def _parameter_values(
     numbers : list of str
         "VALUE" in the order of the names, or "NAME=VALUE".
     names : list of str
-        Names of the parameters.
+        The names of the parameters.
 
     Raises
     ------

@@ -155,15 +155,15 @@ def _origin_of_verdict(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     choice : ModelChoice
         The model that it is compared with.
     effects : list of Path
-        Files of further effects.
+        The paths of files with further effects.
     command : str
         The command that repeats the investigation in any folder.
     seed : int
-        Seed of all draws.
+        The seed of all random draws.
     """
     from discrepancy.document import Origin
     from reporting.files import hash_file
@@ -227,7 +227,7 @@ def _assess_campaign(
     calibrate : int or None
         The number of simulated campaigns.
     seed : int
-        Seed of their draws.
+        The seed of the random draws.
 
     Returns
     -------
@@ -287,7 +287,7 @@ def _print_conclusion(
     Parameters
     ----------
     content : ReportInput
-        The investigation.
+        The results of the investigation.
     folder : Path
         The folder of the verdict.
     report : Path or None
@@ -434,17 +434,21 @@ def check(
     from discrepancy.workflow import check_and_prepare
 
     catalogue = load_catalogue(effects or ())
-    chosen = choose_model(model).model
-    data, faults = check_and_prepare(read_campaign(campaign), chosen)
+    chosen_model = choose_model(model).model
+    prepared_campaign, faults = check_and_prepare(read_campaign(campaign), chosen_model)
     separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
-            setting = Setting(data, chosen, chosen.scales(data))
-            separability = compute_separability(data, chosen, setting, catalogue)
+            setting = Setting(
+                prepared_campaign, chosen_model, chosen_model.scales(prepared_campaign)
+            )
+            separability = compute_separability(prepared_campaign, chosen_model, setting, catalogue)
     if json:
-        terminal.print_json(_check_record(data, chosen.name, faults, separability))
+        terminal.print_json(
+            _check_record(prepared_campaign, chosen_model.name, faults, separability)
+        )
     else:
-        _print_check(data, chosen, catalogue, faults, separability)
+        _print_check(prepared_campaign, chosen_model, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
             "Correct the faults first: conclusions from these data would be wrong."
@@ -478,11 +482,11 @@ def _check_record(
     Parameters
     ----------
     data : Campaign
-        The campaign.
+        The campaign after the checks of its data.
     model : str
-        Name of the model.
+        The name of the model.
     faults : sequence of DataFault
-        Faults of the data.
+        The faults that were found in the data.
     separability : Separability or None
         The detectability of each effect, and the groups of effects that the campaign cannot tell
         apart; None if a fault is fatal. A magnitude that is detectable at no value is null.

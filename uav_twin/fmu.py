@@ -248,7 +248,7 @@ def _build_script(script: str, target: Path, *, replace: bool) -> None:
     script : str
         The name of a shipped script, or the path of a script.
     target : Path
-        The FMU to write.
+        The path of the FMU to write.
     replace : bool
         Whether to replace an existing file.
     """
@@ -298,7 +298,7 @@ def _build_wing(
         calibrated_wing = load_calibration(calibration)
         wing_design = calibrated_wing.wing_design
         tailored = tailoring(calibrated_wing)
-    packed = pack_wing(
+    packed_fmu = pack_wing(
         wing_design,
         target,
         kind=kind,
@@ -312,7 +312,7 @@ def _build_wing(
     )
     if calibration is not None:
         terminal.say(f"Calibrated for {calibrated_wing.asset}.")
-    print_packed_fmu(packed)
+    print_packed_fmu(packed_fmu)
 
 
 def info(
@@ -452,21 +452,21 @@ def _refuse_what_is_no_system(what: str) -> None:
     """
     from fe.structure.design import is_structure
 
-    needed = "`ssp export` takes a scenario, which says what is connected, or a wing design"
+    takes = "`ssp export` takes a scenario, which says what is connected, or a wing design"
     suffix = Path(what).suffix.lower()
     if suffix == ".fmu":
         raise SspError(
-            f'{what} is an FMU, and {needed}: write a scenario with `[asset]`, `kind = "fmu"`, '
+            f'{what} is an FMU, and {takes}: write a scenario with `[asset]`, `kind = "fmu"`, '
             f'`file = "{what}"` and a `binding` of `uav-twin fmu bind {what}`, and export that '
             "scenario."
         )
     if suffix == ".ssp":
         raise SspError(
-            f"{what} is an SSP file already, and {needed}: see `uav-twin ssp check {what}`."
+            f"{what} is an SSP file already, and {takes}: see `uav-twin ssp check {what}`."
         )
     if is_structure(_table_of_file(what)):
         raise SspError(
-            f"{what} is a structure, and {needed}: write a scenario with `[asset]`, `kind = "
+            f"{what} is a structure, and {takes}: write a scenario with `[asset]`, `kind = "
             f'"structure"` and `structure = "{what}"`, and export that scenario.'
         )
 

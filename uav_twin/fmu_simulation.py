@@ -253,7 +253,7 @@ def simulate_system(
 
 
 def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
-    """Refuse result files of an unknown format, and existing ones that are not to be replaced.
+    """Refuse result files of an unknown format, and existing files that may not be replaced.
 
     This is checked before the simulation, so that its result is not lost.
     """
@@ -289,7 +289,7 @@ def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     Parameters
     ----------
     binding : Binding
-        The binding.
+        The binding of the FMU's variables to roles.
     kind : str or None
         The value of `--interpolation`; None leaves the binding as it is.
     """
@@ -319,11 +319,11 @@ def _write_and_print_history(
     asset : FmiAsset
         The FMU, at the end of the simulation.
     history : ObservationHistory
-        Its outputs over time.
+        The outputs of the FMU over time.
     file : Path
         The file of the FMU.
     out, plot : Path or None
-        Files for the history and for its picture.
+        The files for the history and for its picture.
     """
     from fmu_asset.client.history_files import write_history
     from reporting.files import hash_file
@@ -506,24 +506,24 @@ def sample(
             )
         else:
             library_grid = grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
-        sampled = sample_library(
+        sampling_outcome = sample_library(
             library_grid, out, workers=workers, resume=resume, replace_existing=replace
         )
-    _print_library(sampled)
+    _print_library(sampling_outcome)
 
 
-def _print_library(sampled: "SamplingOutcome") -> None:
+def _print_library(outcome: "SamplingOutcome") -> None:
     """Print the file of an observation library, its shape, and the effort of the sampling.
 
     The effort is the number of processes, the time, and, after an interruption, the number of
     blocks that were kept and not sampled again.
     """
-    library = sampled.library
+    library = outcome.library
     shape = " x ".join(map(str, library.values.shape))
     kept_blocks = ""
-    if sampled.kept_blocks:
-        kept_blocks = f", {sampled.kept_blocks} of {sampled.block_count} blocks kept"
+    if outcome.kept_blocks:
+        kept_blocks = f", {outcome.kept_blocks} of {outcome.block_count} blocks kept"
     terminal.say(
-        f"{sampled.path}: {shape} (draws, states, controls, sensors), {sampled.workers} processes, "
-        f"{sampled.seconds:.1f} s{kept_blocks}, FMU {library.fmu_hash[:12]}"
+        f"{outcome.path}: {shape} (draws, states, controls, sensors), {outcome.workers} processes, "
+        f"{outcome.seconds:.1f} s{kept_blocks}, FMU {library.fmu_hash[:12]}"
     )

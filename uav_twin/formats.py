@@ -24,7 +24,7 @@ class FileFormat:
     Attributes
     ----------
     name : str
-        Its name on the command line.
+        The name of the format on the command line.
     title : str
         What a file of it is, for people.
     sources : tuple of str

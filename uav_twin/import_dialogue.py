@@ -84,7 +84,7 @@ class ImportDialogue:
 
     @property
     def open_count(self) -> int:
-        """The number of questions that are open now; an answer may open further ones."""
+        """The number of questions that are open now; an answer may raise further questions."""
         questions = sum(len(subjects) for subjects in self.understanding.questions.values())
         return questions + sum(len(texts) for texts in self.understanding.assumptions.values())
 
@@ -126,14 +126,16 @@ class ImportDialogue:
         """
         # Questions and assumptions have the key (option, form of its value)
         if self.understanding.questions:
-            option, expected = next(iter(self.understanding.questions))
-            subject = self.understanding.questions[option, expected][0]
+            option, expected_answer = next(iter(self.understanding.questions))
+            subject = self.understanding.questions[option, expected_answer][0]
             default = None
         else:
-            option, expected = next(iter(self.understanding.assumptions))
-            subject, default = next(iter(self.understanding.assumptions[option, expected].items()))
+            option, expected_answer = next(iter(self.understanding.assumptions))
+            subject, default = next(
+                iter(self.understanding.assumptions[option, expected_answer].items())
+            )
         owner = f"{subject}: " if subject else ""
-        question = f"({self.open_count} open) {owner}{option.replace('-', ' ')}, {expected}"
+        question = f"({self.open_count} open) {owner}{option.replace('-', ' ')}, {expected_answer}"
         try:
             answer: str = typer.prompt(question, default=default)
         except typer.Abort:

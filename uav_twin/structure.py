@@ -64,7 +64,7 @@ def find_structure(file: Path) -> Path:
 
 
 def is_structure_file(design: Path) -> bool:
-    """Return whether a design file is that of a structure, and not of a wing."""
+    """Return whether a design file describes a structure, and not a wing."""
     from fe.structure.design import is_structure
     from reporting.toml_file import read_toml
 
@@ -253,11 +253,13 @@ def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) 
         except ValueError:
             value = nan  # outside every range
         if name in values or not low <= value <= high:
-            known = [f"{name} from {low:g} to {high:g}" for name, (low, high) in ranges.items()]
+            known_ranges = [
+                f"{name} from {low:g} to {high:g}" for name, (low, high) in ranges.items()
+            ]
             raise typer.BadParameter(
                 f"NAME=VALUE is expected, each name once, but {text!r} was given; there are "
-                f"{comma_list(known)}. Give a value inside, or widen its range in the structure "
-                "file.",
+                f"{comma_list(known_ranges)}. Give a value inside, or widen its range in the "
+                "structure file.",
                 param_hint="--at",
             )
         values[name] = value
@@ -313,8 +315,10 @@ def _print_reduced_model(model: "ReducedModel") -> None:
     """Print the ranges of a reduced model's inputs, and the sizes of its bases and outputs."""
     kinds = _input_kinds(model)
     rows = []
-    for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
-        rows.append((kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"))
+    for (name, (low, high)), nominal_value in zip(
+        model.validity.items(), model.nominal, strict=True
+    ):
+        rows.append((kinds[name], name, f"{low:g}", f"{nominal_value:g}", f"{high:g}"))
     if rows:
         terminal.print_table(("what", "name", "least", "nominal", "largest"), rows)
     terminal.say(
@@ -424,7 +428,9 @@ def fmu(
         )
 
 
-def print_packed_fmu(packed: "FmuInfo") -> None:
+def print_packed_fmu(packed_fmu: "FmuInfo") -> None:
     """Print the file of an FMU that was packed, its size and its GUID."""
-    design = f", design {packed.design_hash[:12]}" if packed.design_hash else ""
-    terminal.say(f"{packed.path}: {packed.size / 1024:.0f} KiB, GUID {packed.guid}{design}")
+    design = f", design {packed_fmu.design_hash[:12]}" if packed_fmu.design_hash else ""
+    terminal.say(
+        f"{packed_fmu.path}: {packed_fmu.size / 1024:.0f} KiB, GUID {packed_fmu.guid}{design}"
+    )

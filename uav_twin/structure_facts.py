@@ -105,7 +105,7 @@ class StructurePart:
     of : str
         What is counted, such as "elements".
     note : str
-        A remark.
+        A remark that is printed beside the figures.
     """
 
     what: str

@@ -52,7 +52,7 @@ def wing(
     bendings = ("first flapwise bending", "second flapwise bending")
     name_of_mode = dict(zip(modes.followed, bendings, strict=True))
     mass_of_structure = structural_mass(wing_design)
-    written = [] if vtu is None else _write_wing_fields(vtu, wing_design, state)
+    written_files = [] if vtu is None else _write_wing_fields(vtu, wing_design, state)
     record = {
         "design": wing_design.name,
         "design_hash": wing_design.hash,
@@ -68,7 +68,7 @@ def wing(
             }
             for index, frequency in enumerate(modes.frequency)
         ],
-        "written": [str(path) for path in written],
+        "written": [str(path) for path in written_files],
     }
     if as_json:
         terminal.print_json(record)
@@ -97,7 +97,7 @@ def _write_wing_fields(
 
 
 def _print_wing(record: dict[str, Any]) -> None:
-    """Print masses, stiffness and frequencies of a wing beside the published ones.
+    """Print masses, stiffness and frequencies of a wing beside their published values.
 
     The files that were written are printed, too.
     """

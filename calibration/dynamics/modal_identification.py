@@ -120,7 +120,7 @@ def identify_modes(
 
 
 def _centred_record(acceleration: ArrayLike) -> Float:
-    """Return a record (N, A) without its mean."""
+    """Return a record of N samples of A accelerometers without the mean of each."""
     record = np.array(acceleration, dtype=np.float64)
     if record.ndim == 1:
         record = record[:, None]

@@ -46,13 +46,13 @@ class IdentifiedPoles(NamedTuple):
 
     @property
     def is_structural(self) -> NDArray[np.bool_]:
-        """Whether each pole (P,) is damped as a mode of a structure is."""
+        """Whether each of the P poles is damped like a mode of a structure."""
         ratio = -self.pole.real / np.abs(self.pole)
         return np.asarray((ratio > 0.0) & (ratio < LARGEST_RATIO))
 
     @property
     def is_beyond_noise(self) -> NDArray[np.bool_]:
-        """Whether each pole (P,) is larger than poles of noise alone are."""
+        """Whether each of the P poles is larger than a pole of noise alone would be."""
         # Bonferroni: the probability of a false mode is divided among the independent
         # frequencies. Unknowns of a pole: Re s and Im s, and for each channel two complex
         # factors.

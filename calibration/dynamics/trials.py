@@ -190,8 +190,8 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
             f"{band[1]:.3g} Hz, but there is {peak_text}; "
             "check the record, its sampling and the release."
         )
-    first, second = sorted(peaks[:2])
-    return first, second
+    lower_frequency, higher_frequency = sorted(peaks[:2])
+    return lower_frequency, higher_frequency
 
 
 def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
@@ -268,14 +268,14 @@ def fit_ring_down(
     candidates = []
     for ratio in _STARTING_RATIOS:
         candidates.append(model.fit((1j - ratio) * omega, frequencies_fitted=frequencies_fitted))
-    best = min(candidates, key=lambda candidate: float(candidate.deviation[0]))
-    low, high = sorted(best.modes, key=lambda mode: mode.pole.imag)
+    best_fit = min(candidates, key=lambda candidate: float(candidate.deviation[0]))
+    low, high = sorted(best_fit.modes, key=lambda mode: mode.pole.imag)
     refuse_growing((low, high), record.source)
     return RingDownFit(
         modes=(low, high),
         record=record,
-        fitted=best.fitted[:, 0],
-        residual_deviation=float(best.deviation[0]),
+        fitted=best_fit.fitted[:, 0],
+        residual_deviation=float(best_fit.deviation[0]),
         frequencies_fitted=frequencies_fitted,
     )
 

@@ -154,8 +154,8 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
             # Ratio of the variance of Student's t with n - 1 degrees of freedom to that of a
             # Gaussian. It is infinite for up to three trials; 4 is taken then, while four trials
             # have 3.
-            widening = (count - 1) / (count - 3) if count > 3 else 4.0
-            return _Estimate(mean, math.sqrt(widening * sum_of_squares / (count - 1) / count))
+            variance_ratio = (count - 1) / (count - 3) if count > 3 else 4.0
+            return _Estimate(mean, math.sqrt(variance_ratio * sum_of_squares / (count - 1) / count))
     return _Estimate(mean, math.sqrt(expected_variance / count))
 
 

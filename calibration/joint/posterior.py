@@ -164,7 +164,7 @@ class _WhitenedPosterior:
         self._whitening = right_vectors / singular_values[:, None]
 
     def states(self, points: Float) -> Float:
-        """Return the states (N, P) of whitened coordinates (N, P)."""
+        """Return the N states, each of P parameters, at whitened coordinates (N, P)."""
         return self._states(self._optimum_u + points @ self._whitening)
 
     def _states(self, u: Float) -> Float:

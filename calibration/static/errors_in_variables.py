@@ -148,7 +148,7 @@ def log_likelihood(
         The standard deviation of the zero offset of the displacement that the pairs of a loading
         run share [m]. The measure "ratio" has no likelihood with an offset.
     """
-    total = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
+    log_likelihoods = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
     k = curve.stiffness(np.atleast_1d(young_modulus_factor))
     variance = residual_variance(data, k)
     offset_variance = (k * zero_offset_standard_deviation) ** 2  # as a load
@@ -159,8 +159,8 @@ def log_likelihood(
         eigenvalue = variance + is_in_run.sum() * offset_variance
         residual_sum = data.load[is_in_run].sum() - k * data.displacement[is_in_run].sum()
         explained = offset_variance * residual_sum**2 / (variance * eigenvalue)
-        total += 0.5 * (explained - np.log(eigenvalue / variance))
-    return np.asarray(total)
+        log_likelihoods += 0.5 * (explained - np.log(eigenvalue / variance))
+    return np.asarray(log_likelihoods)
 
 
 def exact_posterior(

@@ -22,14 +22,15 @@ class Questionnaire:
     Parameters
     ----------
     answers : mapping
-        Answers by option and subject; the subject is a column, a file, or empty for all of them.
+        The answers by option and subject; the subject is a column, a file, or empty for all of
+        them.
 
     Attributes
     ----------
     questions : dict of (str, str) to list of str
-        Subjects of open questions, by option and what it expects.
+        The subjects of open questions, by option and what it expects.
     assumptions : dict of (str, str) to dict of str to str
-        Default answers that were used, by subject, by option and what it expects.
+        The default answers that were used, by subject, by option and what it expects.
     """
 
     def __init__(self, answers: Answers) -> None:
@@ -44,16 +45,18 @@ class Questionnaire:
         """
         return self.answers.get(option, {}).get(subject)
 
-    def ask(self, option: str, subject: str, expected: str, choices: Collection[str] = ()) -> str:
+    def ask(
+        self, option: str, subject: str, expected_answer: str, choices: Collection[str] = ()
+    ) -> str:
         """Return an answer; if there is none, note an open question and return an empty text.
 
         Parameters
         ----------
         option : str
-            The option, without dashes.
+            The name of the option, without dashes.
         subject : str
             The column or file; empty for all.
-        expected : str
+        expected_answer : str
             What the option expects, for the user.
         choices : collection of str
             The answers that are allowed; any if empty.
@@ -66,7 +69,7 @@ class Questionnaire:
         answers = self.answers.get(option, {})
         answer = answers.get(subject, answers.get(""))
         if answer is None:
-            subjects = self.questions.setdefault((option, expected), [])
+            subjects = self.questions.setdefault((option, expected_answer), [])
             if subject not in subjects:
                 subjects.append(subject)
             return ""
@@ -77,7 +80,12 @@ class Questionnaire:
         return answer
 
     def ask_or_assume(
-        self, default: str, option: str, subject: str, expected: str, choices: Collection[str] = ()
+        self,
+        default: str,
+        option: str,
+        subject: str,
+        expected_answer: str,
+        choices: Collection[str] = (),
     ) -> str:
         """Return an answer; if there is none, note the default as assumed and return it.
 
@@ -85,9 +93,9 @@ class Questionnaire:
         """
         answers = self.answers.get(option, {})
         if subject not in answers and "" not in answers:
-            self.assumptions.setdefault((option, expected), {})[subject] = default
+            self.assumptions.setdefault((option, expected_answer), {})[subject] = default
             return default
-        return self.ask(option, subject, expected, choices)
+        return self.ask(option, subject, expected_answer, choices)
 
     def is_assumed(self, option: str, subject: str) -> bool:
         """Return whether the default answer of an option was used for a subject."""
@@ -103,11 +111,11 @@ def check_subjects(answers: Answers, heads: Collection[str], files: Collection[s
     Parameters
     ----------
     answers : mapping
-        Answers by option and subject.
+        The answers by option and subject.
     heads : collection of str
-        Heads of all columns, in order.
+        The heads of all columns, in order.
     files : collection of str
-        Names of all files, in order.
+        The names of all files, in order.
 
     Raises
     ------
@@ -116,11 +124,11 @@ def check_subjects(answers: Answers, heads: Collection[str], files: Collection[s
     """
     for option in (*OF_COLUMNS, *OF_FILES):
         subjects = heads if option in OF_COLUMNS else files
-        allowed = {*subjects}
+        allowed_subjects = {*subjects}
         if option in OF_FILES or option in OF_ALL_COLUMNS:
-            allowed.add("")
-        for name in answers.get(option, {}).keys() - allowed:
-            expected = listing(map(repr, filter(None, subjects)), "or")
+            allowed_subjects.add("")
+        for name in answers.get(option, {}).keys() - allowed_subjects:
+            expected_subjects = listing(map(repr, filter(None, subjects)), "or")
             raise CampaignFileError(
-                f"--{option} must be NAME=... about {expected}, but {name!r} was given."
+                f"--{option} must be NAME=... about {expected_subjects}, but {name!r} was given."
             )

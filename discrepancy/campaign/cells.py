@@ -42,7 +42,7 @@ def plain_number(cell: str, mark: str) -> str | None:
     Parameters
     ----------
     cell : str
-        The cell.
+        The text of the cell.
     mark : str
         Decimal mark: a point or a comma.
     """
@@ -77,7 +77,7 @@ def _seconds_of_cell(cell: str, place: str) -> Decimal:
     Parameters
     ----------
     cell : str
-        The cell.
+        The text of the cell.
     place : str
         File and line, for messages.
 
@@ -119,12 +119,12 @@ def seconds_of_clock_times(
     columns : sequence of tuple of str
         Cells (N,) of each column.
     places : sequence of str
-        File and line of each row, for messages.
+        The file and line of each row, for messages.
 
     Returns
     -------
     dict of int to tuple of str
-        Cells of the columns of clock times, by the number of the column.
+        The cells of the columns of clock times, by the number of the column.
     """
     seconds_of_columns: dict[int, dict[int, Decimal]] = {}
     starts: dict[bool, Decimal] = {}  # first time of columns with, and without, a date
@@ -168,8 +168,8 @@ def _continue_past_midnight(times: Sequence[Decimal]) -> list[Decimal]:
     """
     days = 0
     continued = [times[0]]
-    for previous, time_of_day in pairwise(times):
-        if time_of_day < previous - _HALF_DAY:
+    for previous_time, time_of_day in pairwise(times):
+        if time_of_day < previous_time - _HALF_DAY:
             days += 1
         continued.append(time_of_day + days * _DAY)
     return continued
@@ -185,11 +185,11 @@ def decimal_mark(
     columns : sequence of sequence of str
         Cells (N,) of each column.
     lines : sequence of int
-        Line of the file for each row.
+        The line of the file for each row.
     place : str
-        Name of the file and what its rows are called, for messages.
+        The name of the file and what its rows are called, for messages.
     separator : str
-        Character between the cells.
+        The character between two cells.
 
     Returns
     -------

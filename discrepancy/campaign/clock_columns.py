@@ -49,12 +49,12 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
             f"has which is not clear ({reason}): put each column of times before its columns, or "
             "leave all but one out with --column NAME=-."
         )
-    used = {column.head: column for column in columns if column.role != LEFT_OUT}
+    used_columns = {column.head: column for column in columns if column.role != LEFT_OUT}
     clocks = []
     for time in times:
-        stamped = tuple(used[head] for head in stamped_heads[time] if head in used)
+        stamped = tuple(used_columns[head] for head in stamped_heads[time] if head in used_columns)
         if stamped:
-            clocks.append(TableClock(used[time], stamped))
+            clocks.append(TableClock(used_columns[time], stamped))
     return tuple(clocks)
 
 
@@ -67,21 +67,21 @@ def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str,
         For each column of times the names of the columns that were read at these times. None if a
         column of readings fits no column of times or several, or if a column of times gets none.
     """
-    common = shared_words(times)
-    labels = {time: words_of_head(time) - common for time in times}
+    common_words = shared_words(times)
+    labels = {time: words_of_head(time) - common_words for time in times}
     stamped: dict[str, list[str]] = {time: [] for time in times}
     for head in readings:
-        matching = [
+        matching_times = [
             time for time, label in labels.items() if label and label <= words_of_head(head)
         ]
-        if len(matching) != 1:
+        if len(matching_times) != 1:
             return None
-        stamped[matching[0]].append(head)
+        stamped[matching_times[0]].append(head)
     return stamped if all(stamped.values()) else None
 
 
 def _columns_by_position(
-    time_columns: Sequence[str], columns: Sequence[str]
+    time_columns: Sequence[str], all_columns: Sequence[str]
 ) -> dict[str, list[str]] | None:
     """Assign columns of readings to columns of times, by the order of the columns in a table.
 
@@ -92,7 +92,7 @@ def _columns_by_position(
     ----------
     time_columns : sequence of str
         The names of the columns of times.
-    columns : sequence of str
+    all_columns : sequence of str
         The names of all columns, in the order of the table.
 
     Returns
@@ -103,7 +103,7 @@ def _columns_by_position(
         no columns of readings.
     """
     # If times stand after their readings, the table is read backwards.
-    in_reading_order = columns if columns[0] in time_columns else columns[::-1]
+    in_reading_order = all_columns if all_columns[0] in time_columns else all_columns[::-1]
     if in_reading_order[0] not in time_columns:
         return None
     stamped: dict[str, list[str]] = {}
@@ -119,5 +119,7 @@ def _columns_by_position(
     # The columns of readings are returned in the order of the table, even if it was read backwards.
     in_table_order: dict[str, list[str]] = {}
     for time_column, stamped_columns in stamped.items():
-        in_table_order[time_column] = [column for column in columns if column in stamped_columns]
+        in_table_order[time_column] = [
+            column for column in all_columns if column in stamped_columns
+        ]
     return in_table_order

@@ -34,9 +34,9 @@ class MergedTable(NamedTuple):
     cells : dict of str to tuple of str
         Cells (N,) of each column by its title.
     lines : tuple of int
-        Line of the file for each row.
+        The line of the file for each row.
     sentence : str
-        Remark on how the clocks were merged.
+        The remark on how the clocks were merged.
     """
 
     cells: dict[str, tuple[str, ...]]
@@ -51,7 +51,7 @@ class _ClockTimes:
     Attributes
     ----------
     seconds : (n,) ndarray
-        Times [s], strictly increasing.
+        The times [s], which increase strictly.
     rows : list of int
         Rows of the table in which they stand.
     """
@@ -75,11 +75,11 @@ def merge_clocks(
     clocks : sequence of TableClock
         One clock or more, of one table.
     kind : str
-        Kind of its trial, or `NOISE`.
+        The kind of its trial, or `NOISE`.
     decimal : str
-        Decimal mark of its numbers.
+        The decimal mark of its numbers.
     holds : mapping of str to str or None
-        Course of a load between its samples, by the head of its column; None means linear.
+        The course of a load between its samples, by the head of its column; None means linear.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
     filled_loads : sequence of str
         Loads that were filled in between their samples, and how.
     outside : int
-        Number of stamps before or after the records of these loads.
+        The number of stamps before or after the records of these loads.
     """
     remark = ""
     if filled_loads:
@@ -188,18 +188,18 @@ def _hold_of_load(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> 
 def _place_cells(
     cells: Sequence[str], rows: Sequence[int], positions: Sequence[int], count: int
 ) -> list[str]:
-    """Return `count` cells, with cells of a table at some positions and empty ones elsewhere.
+    """Return `count` cells: cells of a table at some positions, and empty cells elsewhere.
 
     Parameters
     ----------
     cells : sequence of str
-        Cells of a column of the table.
+        The cells of a column of the table.
     rows : sequence of int
         Rows of the table whose cells are taken.
     positions : sequence of int
-        Position of each of them in the result.
+        The position of each of them in the result.
     count : int
-        Number of cells of the result.
+        The number of cells of the result.
     """
     result = [""] * count
     for position, row in zip(positions, rows, strict=True):
@@ -222,11 +222,11 @@ def _line_numbers(
     clocks : sequence of TableClock
         The clocks of one table.
     times : sequence of _ClockTimes
-        Times of each clock.
+        The times of each clock of the file.
     positions : sequence of sequence of int
         For each clock, the indices of its times among the merged times.
     count : int
-        Number of merged times.
+        The number of times that were merged.
     """
     lines_of_rows = clocks[0].times.sheet.lines
     lines = [0] * count
@@ -300,16 +300,16 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
                     f"{sheet.name}, line {sheet.lines[row]}: {column.head!r} has a reading, but "
                     f"{clock.times.head!r} has no time: give the time, or leave the reading out."
                 )
-    printed = [cells[row] for row in rows]
-    seconds = np.array([float(cell) for cell in printed])
+    printed_times = [cells[row] for row in rows]
+    seconds = np.array([float(cell) for cell in printed_times])
     backwards = np.flatnonzero(np.diff(seconds) <= 0.0)
     if backwards.size:
         user = f"the column {clock.times.head!r}"
         raise CampaignDataError(
-            decreasing_times_message(sheet.name, user, printed, int(backwards[0]))
+            decreasing_times_message(sheet.name, user, printed_times, int(backwards[0]))
         )
     if len(rows) > 1:
-        seconds = undo_rounding(seconds, printed)
+        seconds = undo_rounding(seconds, printed_times)
     return _ClockTimes(seconds, rows)
 
 
@@ -322,7 +322,7 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
     Parameters
     ----------
     times : sequence of _ClockTimes
-        Times of each clock.
+        The times of each clock of the file.
 
     Returns
     -------
@@ -371,9 +371,9 @@ def _fill_between_samples(
     seconds : (N,) ndarray
         Times of all cells [s].
     positions : sequence of int
-        Indices of the load's own samples among the cells.
+        The indices of the load's own samples among the cells.
     hold : Hold
-        Course between the samples, by which the load is interpolated.
+        The course of the load between its samples, which decides how it is interpolated.
     """
     if len(positions) < 2 or not all(cells[position] for position in positions):
         return
@@ -386,14 +386,14 @@ def _fill_between_samples(
         values = CubicSpline(sample_times, samples)(seconds)
     else:
         values = np.interp(seconds, sample_times, samples)
-    sampled = set(positions)
+    is_sampled = set(positions)
     for index in range(len(seconds)):
-        if index not in sampled:
+        if index not in is_sampled:
             cells[index] = f"{values[index]:.15g}"
 
 
 def _stamped_columns_text(clocks: Sequence[TableClock]) -> str:
-    """Return the beginning of a remark: which columns are stamped by which column of times."""
+    """Return the beginning of a remark, which lists the columns that a column of times stamps."""
     phrases = []
     for clock in clocks:
         heads = listing(repr(column.head) for column in clock.columns)

@@ -44,7 +44,7 @@ class ColumnReader:
     questionnaire : Questionnaire
         The answers of the user; it notes the questions that stay open.
     kinds : mapping of str to str
-        Kind of each file.
+        The kind of trial of each file, by the name of the file.
     quantity_of : callable or None
         Returns the quantity of a model's output. Without it any name can be that of an output.
     outputs : sequence of str
@@ -174,8 +174,8 @@ class ColumnReader:
         if self._output_quantity(head) is not None:
             return head
         other_roles = f"{', '.join(INPUT_COLUMNS[:4])}, {INPUT}NAME, or {LEFT_OUT} to leave it out"
-        expected = f"the model's output that it measures, {other_roles}"
-        return self._questionnaire.ask("column", head, expected)
+        expected_answer = f"the model's output that it measures, {other_roles}"
+        return self._questionnaire.ask("column", head, expected_answer)
 
     def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity that a channel or an input measures.
@@ -184,18 +184,18 @@ class ColumnReader:
         asked, and the result is None.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
-        possible = possible_quantities(unit, answer)
+        quantities = possible_quantities(unit, answer)
         if self._quantity_of is not None and role and INPUT not in role:
             modelled = self._quantity_of(role)
-            if modelled is not None and modelled in possible:
-                possible = (modelled,)
+            if modelled is not None and modelled in quantities:
+                quantities = (modelled,)
         # a length is taken as a displacement rather than as a level, and a unit of strain as strain
         # rather than as a plain number
-        is_usual = possible[0] is Quantity.DISPLACEMENT or _STRAIN.fullmatch(unit)
-        if len(possible) == 1 or is_usual:
-            return possible[0]
-        expected = f"{listing(possible, 'or')}: {unit} is a unit of each"
-        self._questionnaire.ask("quantity", head, expected)
+        is_usual = quantities[0] is Quantity.DISPLACEMENT or _STRAIN.fullmatch(unit)
+        if len(quantities) == 1 or is_usual:
+            return quantities[0]
+        expected_answer = f"{listing(quantities, 'or')}: {unit} is a unit of each"
+        self._questionnaire.ask("quantity", head, expected_answer)
         return None
 
 

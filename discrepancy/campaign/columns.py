@@ -46,15 +46,15 @@ class LaboratoryColumn:
         `LEFT_OUT`, a column that every table may have such as "time" or "force", `INPUT` with the
         name of an input, or the name of the model's output that a channel measures.
     unit : str
-        Unit of its cells, as the file or the user states it.
+        The unit of its cells, as the file or the user states it.
     si : str
-        Unit of its values in SI.
+        The unit of its values in SI.
     quantity : Quantity or None
-        Quantity of a channel or an input.
+        The quantity of a channel or an input.
     to_si : float or None
-        Factor from its cells to SI, which includes the option `--scale`.
+        The factor from its cells to SI, which includes the option `--scale`.
     read_in : str
-        Unit of its readings after `--scale`; equal to `unit` without a scale.
+        The unit of its readings after `--scale`; equal to `unit` without a scale.
     """
 
     sheet: Sheet
@@ -73,7 +73,7 @@ class LaboratoryColumn:
 
     @property
     def title(self) -> str:
-        """Name of the column in the campaign."""
+        """The name of the column in the campaign."""
         return self.head if self.is_channel else self.role.removeprefix(INPUT)
 
     def cells_in_si(self, decimal: str) -> tuple[str, ...]:
@@ -82,7 +82,7 @@ class LaboratoryColumn:
         Parameters
         ----------
         decimal : str
-            Decimal mark of the file, or an empty text.
+            The decimal mark of the file, or an empty text.
         """
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
@@ -112,11 +112,11 @@ def role_by_unit(
     Parameters
     ----------
     head : str
-        Name of the column.
+        The name of the column as printed at its head.
     heads, units : sequence of str
-        Names and units of all columns of the table; a unit is empty if it is not known.
+        The names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        Roles that a unit may determine. It lacks "force" for trials that do not read a column
+        The roles that a unit may determine. It lacks "force" for trials that do not read a column
         `force`, in which a column in newtons may be a channel.
     """
     if head in time_heads(heads, units):
@@ -132,18 +132,18 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     Parameters
     ----------
     head : str
-        Name of the column.
+        The name of the column as printed at its head.
     unit : str
-        Unit of its cells; empty if the file does not state it.
+        The unit of its cells; empty if the file does not state it.
     scale : str
         The option, such as `200 N/V`; `200 N` is for cells without a unit, and `-1` keeps the unit.
 
     Returns
     -------
     cell_unit, reading_unit : str
-        Units of the cells and of the readings.
+        The units of the cells and of the readings.
     factor : float
-        Factor from cells to readings.
+        The factor from cells to readings.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
         The value of the option: a standard deviation such as `0.1mm`, a percentage of the largest
         reading such as `1%`, `exact` (there is no offset) or `free` (nothing is known of it).
     largest : float
-        Largest reading of the column [SI].
+        The largest reading of the column [SI].
 
     Returns
     -------
@@ -243,7 +243,7 @@ def gain_deviation(head: str, answer: str) -> float | str:
 
 
 def degrees_celsius(answer: str) -> float:
-    """Return the option `--reference-temperature` [degC].
+    """Return the temperature that the option `--reference-temperature` states [degC].
 
     Raise CampaignFileError if it is not a number.
     """
@@ -261,7 +261,7 @@ def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
     Parameters
     ----------
     unit : str
-        Unit of its readings.
+        The unit of the readings.
     answer : str or None
         The option `--quantity`, which decides.
 
@@ -330,9 +330,9 @@ def units_of_columns(
     Parameters
     ----------
     columns : iterable of LaboratoryColumn
-        Columns of all tables.
+        The columns of all tables.
     kinds : mapping of str to str
-        Kind of each table's trial, by the name of the table.
+        The kind of each table's trial, by the name of the table.
     """
     units: dict[str, str] = {}
     for column in columns:
@@ -345,21 +345,23 @@ def units_of_columns(
     return units
 
 
-def origin_remark(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[str, str]) -> str:
+def origin_remark(
+    sheet: Sheet, columns: Sequence[LaboratoryColumn], scales: Mapping[str, str]
+) -> str:
     """Return the remark on the source file of a table and on the role of each of its columns.
 
     Parameters
     ----------
     sheet : Sheet
         The table.
-    used : sequence of LaboratoryColumn
-        Its columns that are not left out.
+    columns : sequence of LaboratoryColumn
+        The columns of the table that are not left out.
     scales : mapping of str to str
         Values of the option `--scale` of the import, by the head of the column they apply to.
     """
     phrases = []
     empty_cell_count = 0
-    for column in used:
+    for column in columns:
         scale = f" times {scales[column.head]}" if column.head in scales else ""
         phrases.append(f"{column.head!r} [{column.unit}]{scale} is {column.role}")
         empty_cell_count += sheet.columns[sheet.heads.index(column.head)].count("")
@@ -384,13 +386,11 @@ def missing_answers(questions: Mapping[tuple[str, str], Sequence[str]]) -> str:
         names of the files, that need a value. A single empty name means one value for all.
     """
     option_phrases = []
-    for (option, expected), subjects in questions.items():
+    for (option, expected_answer), subjects in questions.items():
         placeholder = "..."
         if subjects[0]:
             placeholder = f"NAME=... for {listing(map(repr, subjects))}"
-        option_phrases.append(f"--{option} {placeholder} ({expected})")
-    missing = sum(map(len, questions.values()))
-    return (
-        f"{counted(missing, 'answer')} {is_or_are(missing)} missing, and nothing was written: "
-        f"give {'; '.join(option_phrases)}."
-    )
+        option_phrases.append(f"--{option} {placeholder} ({expected_answer})")
+    answer_count = sum(map(len, questions.values()))
+    answers_text = f"{counted(answer_count, 'answer')} {is_or_are(answer_count)} missing"
+    return f"{answers_text}, and nothing was written: give {'; '.join(option_phrases)}."

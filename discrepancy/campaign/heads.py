@@ -22,9 +22,9 @@ def split_head(text: str, unit: str) -> tuple[str, str]:
     Parameters
     ----------
     text : str
-        The head.
+        The text at the head of the column.
     unit : str
-        Unit from a row of units below the heads, which comes first; empty if there is none.
+        The unit from a row of units below the heads, which comes first; empty if there is none.
     """
     match = _HEAD.fullmatch(text[:_LONGEST_HEAD])
     if match is None:
@@ -69,7 +69,7 @@ def time_heads(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     Parameters
     ----------
     heads : sequence of str
-        Names of the columns.
+        The names of the columns as printed at their heads.
     units : sequence of str
         Their units; empty where a unit is not known.
     """
@@ -88,5 +88,5 @@ def words_of_head(head: str) -> frozenset[str]:
 
 def shared_words(heads: Sequence[str]) -> frozenset[str]:
     """Return the words, without numbers, that all of several heads have in common."""
-    common = frozenset.intersection(*map(words_of_head, heads))
-    return frozenset(word for word in common if not word.isdigit())
+    common_words = frozenset.intersection(*map(words_of_head, heads))
+    return frozenset(word for word in common_words if not word.isdigit())

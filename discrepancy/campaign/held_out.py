@@ -85,9 +85,9 @@ def _choose_trials(
     trials : sequence of Trial
         All trials of the kind.
     campaign : Campaign
-        The whole campaign.
+        The campaign with all of its trials.
     held_out_before : set of str
-        Names of the trials of other kinds that are held out already.
+        The names of the trials of other kinds that are held out already.
     """
     if len(trials) < LEAST_TRIALS:
         return set()
@@ -130,7 +130,7 @@ def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
 
 
 def _stays_covered(
-    candidate: Trial, remaining: Sequence[Trial], of_other_kinds: Sequence[Trial]
+    candidate: Trial, other_trials: Sequence[Trial], of_other_kinds: Sequence[Trial]
 ) -> bool:
     """Return whether the trials that remain cover a candidate: channels, run, load place and level.
 
@@ -138,20 +138,20 @@ def _stays_covered(
     ----------
     candidate : Trial
         The trial that may be held out.
-    remaining : sequence of Trial
+    other_trials : sequence of Trial
         The other trials of its kind that are fitted.
     of_other_kinds : sequence of Trial
-        Fitted trials of other kinds, which cover the run only.
+        The fitted trials of other kinds, which cover the run only.
     """
-    channels = {name for trial in remaining for name in trial.channels}
+    channels = {name for trial in other_trials for name in trial.channels}
     if not channels.issuperset(candidate.channels):
         return False
-    if not any(trial.run == candidate.run for trial in (*remaining, *of_other_kinds)):
+    if not any(trial.run == candidate.run for trial in (*other_trials, *of_other_kinds)):
         return False
-    if not any(trial.load_place == candidate.load_place for trial in remaining):
+    if not any(trial.load_place == candidate.load_place for trial in other_trials):
         return False
     # without the extreme level the model would be proved beyond the levels that it was fitted to
-    levels = [trial.level for trial in remaining]
+    levels = [trial.level for trial in other_trials]
     is_above_lowest = min(levels) <= candidate.level * (1.0 + 1e-9)
     is_below_highest = max(levels) >= candidate.level * (1.0 - 1e-9)
     return is_above_lowest and is_below_highest
@@ -165,7 +165,7 @@ def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | Non
     trial : Trial
         A static or flight trial.
     names : set of str
-        Names of the existing trials, which the new held-out trial must not have.
+        The names of the existing trials, which the new held-out trial must not have.
 
     Returns
     -------

@@ -48,10 +48,10 @@ class LaboratoryImport:
     Parameters
     ----------
     sheets : sequence of Sheet
-        Tables of the files.
+        The tables of all files.
     answers : mapping
-        Answers of the user, by option (`OF_COLUMNS`, `OF_FILES`, "reference-temperature") and by
-        the column or file that they are about.
+        The answers of the user, by option (`OF_COLUMNS`, `OF_FILES`, "reference-temperature") and
+        by the column or file that they are about.
     quantity_of : callable, optional
         Returns the quantity of a model's output. Without it any name can be that of an output.
     outputs : sequence of str
@@ -136,16 +136,16 @@ class LaboratoryImport:
         return "To have the outputs of your model listed, give --model."
 
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
-        """Return the import with one more answer.
+        """Return a new import that takes one more answer of the user into account.
 
         Parameters
         ----------
         option : str
-            Option that is answered, without dashes.
+            The option that is answered, without dashes.
         subject : str
-            Column or file that the answer is about.
+            The column or file that the answer is about.
         answer : str
-            The answer.
+            The answer that the user gave.
         """
         of_option = {**self.answers.get(option, {}), subject: answer}
         answers = {**self.answers, option: of_option}
@@ -154,7 +154,7 @@ class LaboratoryImport:
     # ---------------------------------------------------------------- files
 
     def _kind_of_file(self, file: str) -> str:
-        """Return the kind of a file: that of its trial, or `NOISE`."""
+        """Return the kind of the trial in a file, or `NOISE` if the file is a record of noise."""
         return self._questionnaire.ask("kind", file, listing(KINDS, "or"), KINDS)
 
     def _only_noise_file(self) -> str | None:
@@ -170,8 +170,8 @@ class LaboratoryImport:
         """Return the decimal mark of a file; ask if its numbers can be read in two ways."""
         if sheet.decimal:
             return sheet.decimal
-        expected = f". or ,: {sheet.unclear} can be read as both"
-        return self._questionnaire.ask("decimal", sheet.name, expected, (".", ","))
+        expected_answer = f". or ,: {sheet.unclear} can be read as both"
+        return self._questionnaire.ask("decimal", sheet.name, expected_answer, (".", ","))
 
     def _sampling_interval(self, sheet: Sheet) -> float | None:
         """Return the sampling interval of a table [s], given the answer of the user.
@@ -196,8 +196,8 @@ class LaboratoryImport:
         roles_are_known = all(column.role for column in columns)
         if not roles_are_known or self.kinds[sheet.name] not in _RECORDED_IN_TIME:
             return None
-        expected = "seconds between its rows, because no column is a time"
-        answer = self._questionnaire.ask("interval", sheet.name, expected)
+        expected_answer = "seconds between its rows, because no column is a time"
+        answer = self._questionnaire.ask("interval", sheet.name, expected_answer)
         return sampling_interval(answer) if answer else None
 
     def _begin_of_trial(self, file: str) -> str | None:
@@ -210,12 +210,12 @@ class LaboratoryImport:
                 )
             return None
         choices = [*map(str, Start)]
-        expected = (
+        expected_answer = (
             f"how it begins, {listing(choices, 'or')}: at rest under the first loads, at rest "
             "without loads, or in an unknown state"
         )
         answer = self._questionnaire.ask_or_assume(
-            Start.SETTLED.value, "begins", file, expected, choices
+            Start.SETTLED.value, "begins", file, expected_answer, choices
         )
         return None if self._questionnaire.is_assumed("begins", file) else answer
 
@@ -230,22 +230,24 @@ class LaboratoryImport:
                     f"--held-out is for trials, but {file} holds samples at rest."
                 )
             return False
-        expected = "whether it is held out for the proof and not fitted, yes or no"
-        answer = self._questionnaire.ask_or_assume("no", "held-out", file, expected, ("yes", "no"))
+        expected_answer = "whether it is held out for the proof and not fitted, yes or no"
+        answer = self._questionnaire.ask_or_assume(
+            "no", "held-out", file, expected_answer, ("yes", "no")
+        )
         return answer == "yes"
 
     def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
-        expected = "displacement at which the release point was held, such as 15.5mm"
-        answer = self._questionnaire.ask("release", file, expected)
+        expected_answer = "displacement at which the release point was held, such as 15.5mm"
+        answer = self._questionnaire.ask("release", file, expected_answer)
         return release_in_si(answer or "1m")
 
     def _reference_temperature(self) -> float | None:
         """Return the reference temperature [degC]; None if no column is a temperature."""
         if not any(column.role == "temperature" for column in self.columns):
             return None
-        expected = "degC, at which the model's parameters hold"
-        answer = self._questionnaire.ask("reference-temperature", "", expected)
+        expected_answer = "degC, at which the model's parameters hold"
+        answer = self._questionnaire.ask("reference-temperature", "", expected_answer)
         return degrees_celsius(answer) if answer else None
 
     # ---------------------------------------------------------------- loads
@@ -263,9 +265,9 @@ class LaboratoryImport:
     def _hold_of_load(self, column: LaboratoryColumn) -> str | None:
         """Return the course of a load between its samples; None if nobody stated it."""
         choices = [*map(str, Hold)]
-        expected = f"what it does between its samples, {listing(choices, 'or')}"
+        expected_answer = f"what it does between its samples, {listing(choices, 'or')}"
         answer = self._questionnaire.ask_or_assume(
-            Hold.LINEAR.value, "hold", column.head, expected, choices
+            Hold.LINEAR.value, "hold", column.head, expected_answer, choices
         )
         return None if self._questionnaire.is_assumed("hold", column.head) else answer
 
@@ -348,7 +350,7 @@ class LaboratoryImport:
         return units_of_columns(self.columns, self.kinds)
 
     def _trial_table(self, file: str) -> dict[str, Any]:
-        """Return the table `[[trial]]` of a file."""
+        """Return the table `[[trial]]` that `campaign.toml` needs for the trial in a file."""
         load_places = self.answers.get("load-place", {})
         hold = None
         for column in self.columns:
@@ -363,9 +365,9 @@ class LaboratoryImport:
             "begins": self.begins[file],
             "held_out": self.held_out[file] or None,
         }
-        stated = {key: value for key, value in optional_keys.items() if value is not None}
+        stated_keys = {key: value for key, value in optional_keys.items() if value is not None}
         title = _NOT_TITLE.sub("", file)
-        return {"name": title, "kind": self.kinds[file], "file": file, **stated}
+        return {"name": title, "kind": self.kinds[file], "file": file, **stated_keys}
 
     def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
         """Return a table with several columns of times on one clock.
@@ -408,11 +410,11 @@ class LaboratoryImport:
         CampaignFileError
             If two of its columns have one name in the campaign.
         """
-        used = [
+        used_columns = [
             column for column in self.columns if column.sheet is sheet and column.to_si is not None
         ]
         clock = self.merge_clocks_of(sheet)
-        titles = [column.title for column in used if clock is None or column.role != "time"]
+        titles = [column.title for column in used_columns if clock is None or column.role != "time"]
         for title in titles:
             if titles.count(title) > 1:
                 raise CampaignFileError(
@@ -424,15 +426,15 @@ class LaboratoryImport:
         interval = self.intervals[sheet.name]
         if interval is not None:
             columns["time"] = tuple(f"{row * interval:.15g}" for row in range(len(sheet.lines)))
-        for column in used:
+        for column in used_columns:
             columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 
     def _origin_remark(self, sheet: Sheet) -> str:
         """Return the remark on the file of a table, its columns, and its clocks."""
-        used = [
+        used_columns = [
             column for column in self.columns if column.sheet is sheet and column.role != LEFT_OUT
         ]
-        origin = origin_remark(sheet, used, self.answers.get("scale", {}))
+        origin = origin_remark(sheet, used_columns, self.answers.get("scale", {}))
         clock = self.merge_clocks_of(sheet)
         return origin if clock is None else f"{origin} {clock.sentence}."

@@ -28,9 +28,9 @@ class MatlabTable(NamedTuple):
     Attributes
     ----------
     heads : tuple of str
-        Names of its C columns.
+        The names of its C columns.
     columns : tuple of tuple of str
-        Cells (C, N).
+        The cells of C columns with N rows each.
     remark : str
         How many rows there are, and which variables are left out.
     """
@@ -70,11 +70,11 @@ def read_matlab(path: Path) -> MatlabTable:
     cells = [_cells(column) for column in table.values()]
     row_count = max(map(len, cells))
     # shorter columns end with empty cells
-    padded = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
+    padded_columns = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
     remark = f"rows 1 to {row_count} of {counted(len(table), 'vector')}"
     if passed_over:
         remark += f"; left out: {listing(map(repr, passed_over))}"
-    return MatlabTable(tuple(table), padded, remark)
+    return MatlabTable(tuple(table), padded_columns, remark)
 
 
 def _variables(path: Path) -> Iterator[tuple[str, object]]:
@@ -132,24 +132,26 @@ def _hdf5_content(path: Path) -> dict[str, object]:
     """
     variables: dict[str, object] = {}
     with h5py.File(path, "r") as file:
-        for name, stored in file.items():
+        for name, stored_object in file.items():
             if name.startswith("#"):  # references that the format keeps for itself
                 continue
-            if isinstance(stored, h5py.Group):
-                variables[name] = {field: _hdf5_array(value) for field, value in stored.items()}
+            if isinstance(stored_object, h5py.Group):
+                variables[name] = {
+                    field: _hdf5_array(value) for field, value in stored_object.items()
+                }
             else:
-                variables[name] = _hdf5_array(stored)
+                variables[name] = _hdf5_array(stored_object)
     return variables
 
 
-def _hdf5_array(stored: h5py.Dataset | h5py.Group) -> np.ndarray | None:
+def _hdf5_array(stored_object: h5py.Dataset | h5py.Group) -> np.ndarray | None:
     """Return a matrix, which HDF5 has transposed; None for a group, a text or an empty array."""
-    if isinstance(stored, h5py.Group):
+    if isinstance(stored_object, h5py.Group):
         return None
-    is_text = stored.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
-    if is_text or "MATLAB_empty" in stored.attrs:
+    is_text = stored_object.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
+    if is_text or "MATLAB_empty" in stored_object.attrs:
         return None
-    return np.transpose(stored[()])
+    return np.transpose(stored_object[()])
 
 
 def _columns(name: str, value: object) -> dict[str, np.ndarray]:

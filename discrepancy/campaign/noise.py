@@ -56,11 +56,11 @@ class NoiseModel:
         n0, the degrees of freedom of the estimate s0; infinite if s0 is exact, zero if s0 is only a
         stand-in because the channel has no noise record.
     autoregression : (p,) ndarray
-        Coefficients a of e_t = x_t - sum_k a_k x_(t-k); empty for white noise.
+        The coefficients a of e_t = x_t - sum_k a_k x_(t-k); empty for white noise.
     interval : float or None
-        Sampling interval to which the autoregression belongs [s].
+        The sampling interval to which the autoregression belongs [s].
     lines : tuple of float
-        Mains frequencies found in the record [Hz].
+        The mains frequencies found in the record [Hz].
     """
 
     standard_deviation: float
@@ -78,8 +78,8 @@ class NoiseModel:
         columns : (..., N) ndarray
             Residuals of a dynamic trial, or their derivatives; samples along the last axis.
         interval : float or None
-            Sampling interval of the records [s]; None if they are unevenly sampled. If it differs
-            from the interval of the noise record, the records are returned unchanged.
+            The sampling interval of the records [s]; None if they are unevenly sampled. If it
+            differs from the interval of the noise record, the records are returned unchanged.
 
         Returns
         -------
@@ -89,11 +89,11 @@ class NoiseModel:
         if not self.can_whiten(interval):
             return columns
         filter_taps = np.r_[1.0, -self.autoregression]
-        white = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
+        white_residuals = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
         sample_count = columns.shape[-1]
         for sample, weights in enumerate(self._start_up_weights[:sample_count]):
-            white[..., sample] = columns[..., : sample + 1] @ weights
-        return white
+            white_residuals[..., sample] = columns[..., : sample + 1] @ weights
+        return white_residuals
 
     @cached_property
     def _start_up_weights(self) -> tuple[FloatArray, ...]:
@@ -125,7 +125,7 @@ class NoiseModel:
         Parameters
         ----------
         interval : float or None
-            Sampling interval of the records [s]; None if they are unevenly sampled.
+            The sampling interval of the records [s]; None if they are unevenly sampled.
         """
         if not self.autoregression.size or self.interval is None or interval is None:
             return False
@@ -180,7 +180,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
     channel : Channel
         The channel, with or without a noise record.
     fallback : float
-        Standard deviation to use if the channel has no noise record [channel's unit]. The model
+        The standard deviation to use if the channel has no noise record [channel's unit]. The model
         then has zero degrees of freedom, which marks this value as a stand-in.
 
     Returns
@@ -232,16 +232,16 @@ def remove_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tupl
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
 
     Returns
     -------
     residual : (n,) ndarray
         The record minus these lines.
     frequencies : tuple of float
-        Nominal mains frequencies of the lines that were removed [Hz].
+        The nominal mains frequencies of the lines that were removed [Hz].
     """
     frequencies: list[float] = []
     residual = samples
@@ -268,13 +268,13 @@ def strongest_line_near(
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     frequency : float
-        Centre of the band that is searched [Hz].
+        The centre of the band that is searched [Hz].
     half_width : float
-        Half of the band's width [Hz].
+        Half the width of the band [Hz].
 
     Returns
     -------
@@ -312,11 +312,11 @@ def _strongest_line(samples: FloatArray, interval: float, low: float, high: floa
     Parameters
     ----------
     samples : (n,) ndarray
-        The record, mean removed.
+        The samples of the record, minus their mean.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     low, high : float
-        Ends of the band of frequencies that is searched [Hz].
+        The ends of the band of frequencies that is searched [Hz].
 
     Returns
     -------
@@ -345,14 +345,14 @@ def fit_autoregression(series: FloatArray) -> tuple[FloatArray, float]:
     Parameters
     ----------
     series : (n,) ndarray
-        Samples, mean removed.
+        The samples of the record, minus their mean.
 
     Returns
     -------
     coefficients : (p,) ndarray
-        Coefficients a of x_t = sum_k a_k x_(t-k) + e_t; p is at most `LARGEST_ORDER`.
+        The coefficients a of x_t = sum_k a_k x_(t-k) + e_t; p is at most `LARGEST_ORDER`.
     variance : float
-        Variance of the innovation e.
+        The variance of the innovation e.
     """
     count = len(series)
     covariance = np.array(

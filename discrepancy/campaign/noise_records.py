@@ -30,7 +30,7 @@ def pre_trigger_record(
         Sampling interval [s]; None if the samples are not evenly spaced, so that their correlation
         in time is not known.
     name, source : str
-        Name of the channel, and of the file, for messages.
+        The name of the channel, and of the file, for messages.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class RepeatedReadings(NamedTuple):
     trials : list of Trial
         The trials; they have one noise factor.
     values : (R, N) ndarray
-        Readings [channel's unit].
+        The readings of R repeated trials at N samples [unit of the channel].
     used : (R, N) ndarray of bool
         False for readings that are left out.
     """
@@ -137,12 +137,12 @@ def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[Repeate
         if len(group) == 1:
             continue
         values = []
-        used = []
+        is_used = []
         for trial in group:
             column = trial.channels.index(channel)
             values.append(trial.values[:, column])
-            used.append(trial.used[:, column])
-        yield RepeatedReadings(group, np.array(values), np.array(used))
+            is_used.append(trial.used[:, column])
+        yield RepeatedReadings(group, np.array(values), np.array(is_used))
 
 
 def _is_repeat(trial: Trial, other_trial: Trial) -> bool:
@@ -169,8 +169,8 @@ def _acting_histories(trial: Trial) -> dict[str, FloatArray]:
         "load_factor": trial.load_factor,
         "temperature": trial.temperature,
     }
-    for recorded in trial.inputs:
-        histories[f"input {recorded.name}"] = recorded.values
+    for recorded_input in trial.inputs:
+        histories[f"input {recorded_input.name}"] = recorded_input.values
     for region, loss in zip(trial.regions, trial.health.T, strict=True):
         if np.any(loss):
             histories[f"loss of {region}"] = loss

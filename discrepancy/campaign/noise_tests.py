@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
@@ -20,6 +21,8 @@ LAGS = 20
 """Largest number of autocorrelations in the Ljung-Box test."""
 LARGEST_LAG_SHARE = 0.25
 """Largest lag of an autocorrelation, as a fraction of the record."""
+LEAST_P_VALUE, LARGEST_P_VALUE = 1e-300, 1.0 - 1e-16
+"""Limits of a p-value whose logarithm or normal score is taken, so that these are finite."""
 LEAST_DRAWS = 8_000
 """Fewest series from which the distribution of the Ljung-Box statistic is taken."""
 
@@ -35,11 +38,11 @@ def variance_p_value(
     Parameters
     ----------
     mean_square : float
-        Mean square of residuals over the variance of the noise [1].
+        The mean square of residuals over the variance of the noise [1].
     freedom : float
-        Degrees of freedom of the residuals.
+        The degrees of freedom of the residuals.
     noise_freedom : float
-        Degrees of freedom of the noise record; infinite if its variance is exact.
+        The degrees of freedom of the noise record; infinite if its variance is exact.
     small : bool
         True for the probability of a smaller mean square; by default it is that of a larger one.
     """
@@ -68,12 +71,12 @@ def pooled_variance_p_value(
     p_values : (C,) ndarray
         p-value of each channel, from `variance_p_value`.
     freedom : (C,) ndarray
-        Degrees of freedom of each channel's residuals.
+        The degrees of freedom of each channel's residuals.
     noise_freedom : (C,) ndarray
-        Degrees of freedom of each channel's noise record.
+        The degrees of freedom of each channel's noise record.
     """
     weights = np.sqrt(freedom / (1.0 + freedom / noise_freedom))
-    scores = stats.norm.isf(np.clip(p_values, 1e-300, 1.0 - 1e-16))
+    scores = stats.norm.isf(np.clip(p_values, LEAST_P_VALUE, LARGEST_P_VALUE))
     return float(stats.norm.sf(weights @ scores / np.sqrt(weights @ weights)))
 
 
@@ -85,14 +88,14 @@ class SeriesTest(NamedTuple):
     statistic : float
         The statistic of the test.
     p_value : float
-        Probability of a larger statistic if the series is white.
+        The probability of a larger statistic if the series is white.
     """
 
     statistic: float
     p_value: float
 
 
-def ljung_box(series: FloatArray, used: BoolArray | None = None) -> SeriesTest:
+def ljung_box(series: FloatArray, is_used: BoolArray | None = None) -> SeriesTest:
     """Test whether a series of residuals is white by the statistic of Ljung and Box.
 
     With the autocorrelations rho_k, Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20, n / 5) lags
@@ -105,23 +108,23 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> SeriesTest:
     ----------
     series : (N,) ndarray
         Residuals, with a mean of zero.
-    used : (N,) ndarray of bool, optional
+    is_used : (N,) ndarray of bool, optional
         False for samples that are left out. Then n is the number of used samples, and n - k is
         replaced by the number of pairs of used samples at lag k, which keeps the mean of Q exact.
     """
-    if used is None:
+    if is_used is None:
         count = series.size
         values = series
     else:
-        count = int(used.sum())
-        values = np.where(used, series, 0.0)
+        count = int(is_used.sum())
+        values = np.where(is_used, series, 0.0)
     lags = min(LAGS, count // 5)
     if lags < 1 or not np.any(values):
         return SeriesTest(0.0, 1.0)
-    if used is None:
+    if is_used is None:
         pairs = count - np.arange(1.0, lags + 1)
     else:
-        pairs = lag_products(used.astype(float), lags)[0, 1:]
+        pairs = lag_products(is_used.astype(float), lags)[0, 1:]
     statistic = float(_portmanteau(values[np.newaxis], count, pairs)[0])
     mean, deviation, skewness = _portmanteau_moments(count, lags)
     # the standardised gamma distribution of this skewness (Pearson's type III)
@@ -139,9 +142,9 @@ def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     Parameters
     ----------
     rows : (M, N) or (N,) ndarray
-        Series.
+        One series of N samples, or M of them.
     lags : int
-        Largest lag.
+        The largest lag, in samples.
 
     Returns
     -------
@@ -160,14 +163,14 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     Parameters
     ----------
     series : sequence of (N,) ndarray
-        Records of any lengths.
+        The records, of any lengths.
 
     Returns
     -------
     rho : (K,) ndarray
         Autocorrelation at lags 1 .. K, with K a quarter of the longest record.
     chance : (K,) ndarray
-        Variance of `rho` if the records are white.
+        The variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
     lags = max(int(LARGEST_LAG_SHARE * longest), 2)
@@ -178,7 +181,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
         lag_count = len(record_products)
         products[:lag_count] += record_products
         pair_counts[:lag_count] += len(record) - np.arange(lag_count)
-    rho = products[1:] / max(products[0], 1e-300)
+    rho = products[1:] / max(products[0], LEAST_DIVISOR)
     # for white noise: (number of pairs) sigma^4 over (sum of squares = n sigma^2)^2
     return rho, pair_counts[1:] / pair_counts[0] ** 2
 
@@ -186,7 +189,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
 def statistical_inefficiency(
     rho: FloatArray, white_variance: FloatArray, ratio: float = 1.0
 ) -> float:
-    """Return the number of samples over the effective number of independent ones.
+    """Return how many samples of a correlated record count as one independent sample.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
     zero even for white noise, so the expected sum of their squares by chance is subtracted. That
@@ -195,9 +198,9 @@ def statistical_inefficiency(
     Parameters
     ----------
     rho, white_variance : (K,) ndarray
-        Autocorrelation and its variance for white noise, from `autocorrelation`.
+        The autocorrelation and its variance for white noise, from `autocorrelation`.
     ratio : float
-        Factor on the autocorrelation `rho`, if the correlation of the samples in question is
+        The factor on the autocorrelation `rho`, if the correlation of the samples in question is
         weaker or stronger than that of the whole series.
 
     Returns
@@ -219,9 +222,9 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
     rows : (M, N) ndarray
         Series; samples that are left out are zero.
     count : int
-        Number of samples that are used.
+        The number of samples that are used.
     pairs : (lags,) ndarray
-        Number of pairs of them at each lag.
+        The number of pairs of them at each lag.
     """
     products = lag_products(rows, len(pairs))
     rho = products[:, 1:] / products[:, :1]
@@ -237,9 +240,9 @@ def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
     Parameters
     ----------
     count : int
-        Number n of samples of the series.
+        The number n of samples of the series.
     lags : int
-        Number of lags in the statistic.
+        The number of lags in the statistic.
     """
     generator = np.random.default_rng(20260101)
     draws_at_once = max(20, 400_000 // count)
@@ -273,10 +276,10 @@ def cumulative_periodogram(series: FloatArray) -> SeriesTest:
     Biometrika 56, 1-15).
     """
     ordinates = periodogram(series)
-    total = float(ordinates.sum())
-    if total == 0.0 or ordinates.size < 3:
+    total_power = float(ordinates.sum())
+    if total_power == 0.0 or ordinates.size < 3:
         return SeriesTest(0.0, 1.0)
-    fractions = np.cumsum(ordinates)[:-1] / total
+    fractions = np.cumsum(ordinates)[:-1] / total_power
     test = stats.kstest(np.clip(fractions, 0.0, 1.0), "uniform")
     return SeriesTest(float(test.statistic), float(test.pvalue))
 
@@ -289,9 +292,9 @@ class LineTest(NamedTuple):
     statistic : float
         Fisher's g: the largest ordinate of the periodogram over the sum of all.
     p_value : float
-        Probability of a larger g for white noise.
+        The probability of a larger g for white noise.
     frequency_index : int
-        Index j of the largest ordinate; the frequency is j / n per sample.
+        The index j of the largest ordinate; the frequency is j / n per sample.
     """
 
     statistic: float
@@ -306,11 +309,11 @@ def fisher_g(series: FloatArray) -> LineTest:
     as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
     """
     ordinates = periodogram(series)
-    total = float(ordinates.sum())
-    if total == 0.0:
+    total_power = float(ordinates.sum())
+    if total_power == 0.0:
         return LineTest(0.0, 1.0, 0)
     largest = int(np.argmax(ordinates))
-    g = float(ordinates[largest]) / total
+    g = float(ordinates[largest]) / total_power
     first_term = ordinates.size * (1.0 - g) ** (ordinates.size - 1)
     return LineTest(g, float(-np.expm1(-first_term)), largest + 1)
 
@@ -321,7 +324,7 @@ def combine_p_values(p_values: Sequence[float]) -> float:
     Fisher's sum -2 sum log p detects many small departures, and Bonferroni's least p-value a single
     large one. The factor two allows for the choice between them.
     """
-    values = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1.0)
+    values = np.clip(np.asarray(p_values, dtype=float), LEAST_P_VALUE, 1.0)
     if values.size == 1:
         return float(values[0])
     fisher = float(stats.chi2.sf(-2.0 * np.log(values).sum(), 2 * values.size))
@@ -336,12 +339,12 @@ def holm_rejections(p_values: Sequence[float], level: float) -> tuple[bool, ...]
     """
     values = np.asarray(p_values, dtype=float)
     tested = np.flatnonzero(np.isfinite(values))
-    rejected = np.zeros(values.size, dtype=bool)
+    is_rejected = np.zeros(values.size, dtype=bool)
     for rank, index in enumerate(tested[np.argsort(values[tested])]):
         if values[index] > level / (tested.size - rank):
             break
-        rejected[index] = True
-    return tuple(bool(value) for value in rejected)
+        is_rejected[index] = True
+    return tuple(bool(value) for value in is_rejected)
 
 
 def benjamini_yekutieli(p_values: FloatArray, rate: float) -> BoolArray:

@@ -39,7 +39,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     Parameters
     ----------
     folder : path
-        Folder with `campaign.toml` and the tables that it names.
+        The folder with `campaign.toml` and the tables that it names.
 
     Returns
     -------
@@ -61,8 +61,8 @@ def read_campaign(folder: str | Path) -> Campaign:
         folder = folder.parent
     path = folder / CAMPAIGN_FILE
     if not path.exists():
-        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
-        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
+        missing_path = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
+        raise CampaignFileError(f"There is no {missing_path}: give the folder of a campaign.")
     content = read_toml(path, CampaignFileError, what="campaign")
     section = schema.parse_campaign(content, str(path))
     table_names = {trial.file for trial in section.trial}
@@ -95,9 +95,9 @@ def assemble_campaign(
     Parameters
     ----------
     section : CampaignSection
-        Content of `campaign.toml`.
+        The content of `campaign.toml`.
     tables : mapping of str to TextTable
-        Tables by the names that the description has for them.
+        The tables by the names that the description has for them.
     data_hash : str
         SHA-256 of all that was read.
 
@@ -110,9 +110,9 @@ def assemble_campaign(
     trials = tuple(
         read_trial(trial, tables[trial.file], section, remarks) for trial in section.trial
     )
-    measured = {name for trial in trials for name in trial.channels}
+    measured_channels = {name for trial in trials for name in trial.channels}
     for channel in section.channel:
-        if channel.name not in measured:
+        if channel.name not in measured_channels:
             table = tables[section.trial[0].file]
             raise CampaignFileError(
                 f"The channel {channel.name!r} is in no trial: no table has a column "
@@ -141,11 +141,14 @@ def _remarks_on_unused_columns(
     section: schema.CampaignSection, tables: Mapping[str, TextTable]
 ) -> list[str]:
     """Return a remark on each column that no channel and no input reads."""
-    used = {*schema.INPUT_COLUMNS, *(recorded.table_column for recorded in section.columns)}
+    used_columns = {
+        *schema.INPUT_COLUMNS,
+        *(recorded_input.table_column for recorded_input in section.columns),
+    }
     files_of_columns: dict[str, list[str]] = {}
     for file in dict.fromkeys(trial.file for trial in section.trial):
         for column in tables[file].columns:
-            if column not in used and not column.startswith(schema.OF_REGION):
+            if column not in used_columns and not column.startswith(schema.OF_REGION):
                 files_of_columns.setdefault(column, []).append(file)
     remarks = []
     for column, files in files_of_columns.items():
@@ -163,11 +166,12 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Parameters
     ----------
     events : iterable of Event
-        Events of a file. An event without trials happened in all trials that are records in time.
+        The events of a file. An event without trials happened in all trials that are records in
+        time.
     trials : tuple of Trial
-        Trials of the campaign.
+        The trials of the campaign.
     source : str
-        Name of the file, for messages.
+        The name of the file, for messages.
 
     Raises
     ------
@@ -213,13 +217,13 @@ def _check_trial_of_event(
 
 def _check_moments(event: Event, trial: Trial) -> None:
     """Refuse an event whose begin or end lies outside the record of a trial."""
-    first, last = trial.time[[0, -1]].tolist()
+    first_time, last_time = trial.time[[0, -1]].tolist()
     for key, moment in (("time", event.time), ("until", event.until)):
-        if moment is not None and not first <= moment <= last:
+        if moment is not None and not first_time <= moment <= last_time:
             raise CampaignDataError(
                 f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
-                f"{trial.name!r} goes from {first:g} to {last:g} s: times count from the trial's "
-                "start."
+                f"{trial.name!r} goes from {first_time:g} to {last_time:g} s: times count from the "
+                "trial's start."
             )
 
 
@@ -281,13 +285,13 @@ def _read_channels(
     Parameters
     ----------
     section : CampaignSection
-        Content of `campaign.toml`.
+        The content of `campaign.toml`.
     tables : mapping of str to TextTable
-        Tables by name.
+        The tables by their names.
     trials : tuple of Trial
         The trials, among which repeats are searched.
     remarks : list of str
-        Remarks of the reader, to which that on noise from repeats is added.
+        The remarks of the reader, to which that on noise from repeats is added.
     """
     samples_at_rest = _samples_at_rest(section, tables)
     channels = {}

@@ -60,7 +60,7 @@ class TrialKeys:
     name : str
         Name, unique in the campaign.
     kind : TrialKind
-        What was done.
+        The kind of the trial: what was done in it.
     file : str
         Name of its table; empty if it was not read from a file.
     run : str
@@ -175,7 +175,7 @@ class Trial(TrialKeys):
         Parameters
         ----------
         name : str
-            Name of the trial.
+            The name of the trial.
         kind : TrialKind
             What is done in it.
         channels : tuple of str
@@ -212,7 +212,10 @@ class Trial(TrialKeys):
         fields: dict[str, Any] = {}
         for key in _FIELDS_OF_ROWS:
             fields[key] = getattr(self, key)[rows]
-        inputs = tuple(replace(recorded, values=recorded.values[rows]) for recorded in self.inputs)
+        inputs = tuple(
+            replace(recorded_input, values=recorded_input.values[rows])
+            for recorded_input in self.inputs
+        )
         return replace(self, inputs=inputs, **{**fields, **changes})
 
     def noise_deviation(self, channel: Channel) -> float:
@@ -229,7 +232,7 @@ class Trial(TrialKeys):
         """Names of the recorded inputs of the trial; the force of a forced trial is "force"."""
         if self.kind is TrialKind.FORCED:
             return ("force",)
-        return tuple(recorded.name for recorded in self.inputs)
+        return tuple(recorded_input.name for recorded_input in self.inputs)
 
     @property
     def load(self) -> FloatArray:
@@ -269,9 +272,9 @@ class Campaign:
     Attributes
     ----------
     name : str
-        Title.
+        The title of the sheet or variable.
     channels : mapping of str to Channel
-        The channels by name.
+        The channels of the campaign by name.
     trials : tuple of Trial
         In the order of the file.
     reference_temperature : float or None
@@ -325,7 +328,7 @@ class Campaign:
         return frozenset(faults)
 
     def moment_names(self, trial: str) -> frozenset[str]:
-        """Return the names by which expressions know the moments of events in a trial."""
+        """Return the names that expressions use for the moments of the events in a trial."""
         names: set[str] = set()
         for event in self.events:
             if trial in event.trials:
@@ -338,7 +341,7 @@ class Campaign:
         Parameters
         ----------
         trial : str
-            Name of the trial.
+            The name of the trial.
         names : collection of str
             Names of the moments that an expression uses, such as `pump_on` and `pump_on_until`.
 
@@ -386,7 +389,7 @@ class Campaign:
 
     @property
     def largest_magnitudes(self) -> dict[str, float]:
-        """Largest loads and times of the campaign, by which parameters of effects are scaled.
+        """The largest loads and times of the campaign, which scale the parameters of effects.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
         ``duration`` the longest record of a motion [s], ``campaign_time`` the time from the first
@@ -405,9 +408,9 @@ class Campaign:
                 sample_times.append(trial.time)
         campaign_time = 0.0
         if sample_times:
-            first = min(float(np.min(times)) for times in sample_times)
-            last = max(float(np.max(times)) for times in sample_times)
-            campaign_time = last - first
+            first_time = min(float(np.min(times)) for times in sample_times)
+            last_time = max(float(np.max(times)) for times in sample_times)
+            campaign_time = last_time - first_time
         return {
             "force": force,
             "load_factor": load_factor,

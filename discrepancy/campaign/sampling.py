@@ -36,11 +36,12 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     Parameters
     ----------
     time : (N,) ndarray
-        Times [s].
+        The times of the samples [s].
     cells : sequence of str
         The same times as printed in the file.
     user, file : str
-        Name of the trial or record that the times belong to, and name of the file, for messages.
+        The name of the trial or record that the times belong to, and name of the file, for
+        messages.
 
     Returns
     -------
@@ -71,11 +72,11 @@ def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: 
     Parameters
     ----------
     file, user : str
-        Name of the file, and name of the trial or record that the times belong to.
+        The name of the file, and name of the trial or record that the times belong to.
     cells : sequence of str
-        Times as printed [s].
+        The times as printed in the file [s].
     index : int
-        Index of the time that the next one does not exceed.
+        The index of the time that the next one does not exceed.
     """
     return (
         f"{file}: the time of {user} does not increase after sample {index + 1} "
@@ -96,7 +97,7 @@ def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     Parameters
     ----------
     time : (N,) ndarray
-        Times in any unit.
+        The times of the samples, in any unit.
     cells : sequence of str
         The same times as printed.
 
@@ -209,20 +210,20 @@ def least_beyond_rounding(differences: FloatArray) -> float:
     Parameters
     ----------
     differences : (M,) ndarray
-        Differences between readings, of any sign.
+        The differences between readings, of any sign.
 
     Returns
     -------
     float
         The smallest true difference; 0 if no difference is positive.
     """
-    ordered = np.sort(differences[differences > 0.0])
-    if not ordered.size:
+    sorted_differences = np.sort(differences[differences > 0.0])
+    if not sorted_differences.size:
         return 0.0
-    jumps = np.flatnonzero(ordered[1:] > ROUNDING_GAP * ordered[:-1]) + 1
+    jumps = np.flatnonzero(sorted_differences[1:] > ROUNDING_GAP * sorted_differences[:-1]) + 1
     jumps_above_rounding = jumps[jumps >= LEAST_ROUNDED]
     first_true_difference = jumps_above_rounding[0] if jumps_above_rounding.size else 0
-    return float(ordered[first_true_difference])
+    return float(sorted_differences[first_true_difference])
 
 
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:

@@ -55,12 +55,12 @@ class NoiseFileSection(Section):
     """Sampling interval, in place of the column `time` [s]."""
 
 
-def _unit_in_si(recorded: records.InTables) -> float:
+def _unit_in_si(record: records.InTables) -> float:
     """Return the factor from the unit of a channel or input to SI."""
     try:
-        return factor_to_si(recorded.quantity, recorded.unit)
+        return factor_to_si(record.quantity, record.unit)
     except ValueError as cause:
-        raise ValueError(f"the unit of {recorded.name!r}: {cause}") from None
+        raise ValueError(f"the unit of {record.name!r}: {cause}") from None
 
 
 def _with_scaled_deviations(channel: records.Channel, scale: float) -> records.Channel:
@@ -99,7 +99,7 @@ ChannelInFile = Annotated[
 """A channel in a file, where its standard deviations are in its own unit instead of SI."""
 
 
-def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
+def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput:
     """Return an input of a file with the deviation of its offset in SI.
 
     A motion is smooth between its samples, unless it is a reference that a controller follows.
@@ -109,22 +109,23 @@ def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
     ValueError
         If its column is reserved, or the file states another course than smooth for a motion.
     """
-    deviation = _unit_in_si(recorded) * recorded.offset_deviation
-    column = recorded.table_column
+    deviation = _unit_in_si(recorded_input) * recorded_input.offset_deviation
+    column = recorded_input.table_column
     if column in INPUT_COLUMNS and column != "force":
         raise ValueError(
-            f"the column {column!r} is reserved: give the input {recorded.name!r} another column"
+            f"the column {column!r} is reserved: give the input {recorded_input.name!r} another "
+            "column"
         )
-    hold = recorded.hold
-    if recorded.quantity.motion_chain and not recorded.reference:
+    hold = recorded_input.hold
+    if recorded_input.quantity.motion_chain and not recorded_input.reference:
         if hold not in (None, records.Hold.SMOOTH):
             raise ValueError(
-                f"the input {recorded.name!r} is a motion, which no drive makes in steps or "
+                f"the input {recorded_input.name!r} is a motion, which no drive makes in steps or "
                 "corners: leave `hold` out, set it to smooth, or set reference = true if a "
                 "controller follows the motion"
             )
         hold = records.Hold.SMOOTH
-    return replace(recorded, offset_deviation=deviation, hold=hold)
+    return replace(recorded_input, offset_deviation=deviation, hold=hold)
 
 
 def _checked_force_unit(unit: str) -> str:
@@ -215,8 +216,8 @@ class TrialSection(records.TrialKeys):
 
 def _first_repeated(names: Iterable[str]) -> str | None:
     """Return the alphabetically first name that occurs more than once; None if there is none."""
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    return min(repeated, default=None)
+    repeated_names = [name for name, count in Counter(names).items() if count > 1]
+    return min(repeated_names, default=None)
 
 
 class CampaignSection(Section):
@@ -260,7 +261,7 @@ class CampaignSection(Section):
         return (*self.channel, *self.input)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the rules on several tables of the file together, each with its message.
+        """Yield the rules that concern several tables of the file, each with its message.
 
         The first entry of a fault is true if the file breaks the rule.
         """
@@ -283,7 +284,7 @@ class CampaignSection(Section):
             no_trial_has_inputs,
             '[[input]] is for trials of the kind "driven" or "static", but there is none',
         )
-        repeated = _first_repeated(recorded.table_column for recorded in self.columns)
+        repeated = _first_repeated(recorded_input.table_column for recorded_input in self.columns)
         readers = "channel or input" if self.input else "channel"
         yield (
             repeated,
@@ -300,9 +301,9 @@ class CampaignSection(Section):
                 f"give the channel {channel.name!r} another column",
             )
         in_kelvin: set[bool] = set()
-        for recorded in self.columns:
-            if recorded.quantity is records.Quantity.TEMPERATURE:
-                in_kelvin.add(recorded.unit == "K")
+        for recorded_input in self.columns:
+            if recorded_input.quantity is records.Quantity.TEMPERATURE:
+                in_kelvin.add(recorded_input.unit == "K")
         yield (
             len(in_kelvin) > 1,
             "temperatures are given in degC and in K: use one of the two units for all of them",
@@ -323,17 +324,18 @@ class CampaignSection(Section):
         """Yield the rules on the key `loggers`: each channel and input must be on one logger."""
         if not self.loggers:
             return
-        inputs = {recorded.name for recorded in self.input}
+        inputs = {recorded_input.name for recorded_input in self.input}
         if self._has_trial_of(records.TrialKind.FORCED):
             inputs.add("force")
-        expected = [*(channel.name for channel in self.channel), *sorted(inputs)]
+        expected_names = [*(channel.name for channel in self.channel), *sorted(inputs)]
         logged = [name for names in self.loggers.values() for name in names]
         for name in logged:
             yield (
-                name not in expected,
-                f"`loggers` names {name!r}, but the channels and inputs are {', '.join(expected)}",
+                name not in expected_names,
+                f"`loggers` names {name!r}, but the channels and inputs are "
+                f"{', '.join(expected_names)}",
             )
-        for name in expected:
+        for name in expected_names:
             logger_count = "more than one" if name in logged else "none"
             yield (
                 logged.count(name) != 1,

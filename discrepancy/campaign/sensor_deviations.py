@@ -29,18 +29,18 @@ class SensorDeviations:
     questionnaire : Questionnaire
         The answers of the user; it notes the defaults that are used.
     columns : sequence of LaboratoryColumn
-        Columns of all tables.
+        The columns of all tables.
     kinds : mapping of str to str
-        Kind of each file.
+        The kind of trial of each file, by the name of the file.
     decimals : mapping of str to str
-        Decimal mark of each file.
+        The decimal mark of each file.
 
     Attributes
     ----------
     zeros : dict of str to (float or str)
-        Standard deviation of the zero of each channel and input [SI], or "free", by head.
+        The standard deviation of the zero of each channel and input [SI], or "free", by head.
     gains : dict of str to (float or str)
-        Relative standard deviation of the gain of each channel, or "free", by head.
+        The relative standard deviation of the gain of each channel, or "free", by head.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class SensorDeviations:
     def _zero(self, column: LaboratoryColumn) -> float | str:
         """Return the standard deviation of a channel's or input's zero [SI], or "free"."""
         default = ASSUMED_ZERO if column.is_channel else EXACT
-        expected = (
+        expected_answer = (
             "how well its zero is known in each trial: a standard deviation such as "
             f"0.1{column.read_in} or 1% of the largest reading, {EXACT} or {FREE}"
         )
-        answer = self._questionnaire.ask_or_assume(default, "zero", column.head, expected)
+        answer = self._questionnaire.ask_or_assume(default, "zero", column.head, expected_answer)
         return zero_deviation(column, answer, self._largest_reading(column.head))
 
     def _largest_reading(self, head: str) -> float:
@@ -93,11 +93,11 @@ class SensorDeviations:
 
     def _gain(self, head: str) -> float | str:
         """Return the relative standard deviation of a channel's gain, or "free"."""
-        expected = (
+        expected_answer = (
             f"how well its gain is known: a standard deviation such as 2%, {EXACT}, or {FREE} for "
             "a signal"
         )
-        answer = self._questionnaire.ask_or_assume(ASSUMED_GAIN, "gain", head, expected)
+        answer = self._questionnaire.ask_or_assume(ASSUMED_GAIN, "gain", head, expected_answer)
         return gain_deviation(head, answer)
 
     @property

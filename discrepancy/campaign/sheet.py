@@ -59,15 +59,16 @@ class Sheet:
     Attributes
     ----------
     name, digest : str
-        Name of the file (for an Excel workbook with that of the sheet, if it was stated), and its
-        SHA-256.
+        The name of the file (for an Excel workbook with that of the sheet, if it was stated), and
+        its SHA-256.
     heads, units : tuple of str
-        Heads and units of the columns with numbers; a unit is empty if the file does not state it.
+        The heads and units of the columns with numbers; a unit is empty if the file does not state
+        it.
     columns : tuple of tuple of str
-        Cells of each column as in the file; clock times are converted to seconds since the first
-        row.
+        The cells of each column as in the file; clock times are converted to seconds since the
+        first row.
     lines : tuple of int
-        Number of the line or row of the file for each row of the table.
+        The number of the line or row of the file for each row of the table.
     decimal : str or None
         Decimal mark; None if numbers can be read in two ways.
     unclear : str
@@ -94,9 +95,9 @@ class Sheet:
         Parameters
         ----------
         head : str
-            Name of the column.
+            The name of the column as printed at its head.
         decimal : str
-            Decimal mark of its cells.
+            The decimal mark of its cells.
         """
         cells = self.columns[self.heads.index(head)]
         return tuple((plain_number(cell, decimal) or cell) if cell else "" for cell in cells)
@@ -138,7 +139,7 @@ def _sheet_of_rows(
     Parameters
     ----------
     name : str
-        Name of the table, for messages.
+        The name of the table, for messages.
     file : path
         The file that the rows are from.
     rows : list of (int, list of str)
@@ -146,7 +147,7 @@ def _sheet_of_rows(
     unit_of_place : str
         What the rows are called in messages: "line" or "row".
     separator : str
-        Character between cells; empty for a workbook.
+        The character between cells; empty for a workbook.
     """
     place = f"{name}, {unit_of_place}"
     layout = find_table(rows, name, place)
@@ -288,9 +289,9 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
     Parameters
     ----------
     path : path
-        The workbook.
+        The path of the workbook.
     sheet_name : str
-        Name of the sheet; empty for the only one that is not empty.
+        The name of the sheet; empty for the only one that is not empty.
 
     Raises
     ------

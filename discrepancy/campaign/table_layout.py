@@ -28,18 +28,18 @@ def _is_single_column(rows: Rows) -> bool:
     rows_of_numbers = [index for index, cell in enumerate(cells) if is_value(cell)]
     if not rows_of_numbers or rows_of_numbers[0] == 0:
         return False
-    first = rows_of_numbers[0]
+    first_row = rows_of_numbers[0]
     numbers = [cells[index] for index in rows_of_numbers]
     has_blanks = any(" " in cell and not CLOCK.fullmatch(cell) for cell in numbers)
-    title = cells[first - 1]
+    title = cells[first_row - 1]
     is_separated = any(mark in title and mark in " ".join(numbers) for mark in SEPARATORS)
-    are_most = 2 * len(numbers) > len(cells) - first
+    are_most = 2 * len(numbers) > len(cells) - first_row
     return are_most and not has_blanks and not is_separated
 
 
 def _rows_of_longer_clocks(
     rows: Rows,
-    first: int,
+    first_index: int,
     head: Sequence[str],
     units: Sequence[str],
     places_of_values: Sequence[set[int]],
@@ -54,13 +54,13 @@ def _rows_of_longer_clocks(
     Parameters
     ----------
     rows : list of (int, list of str)
-        Rows below the table.
-    first : int
-        Index of the first of them.
+        The rows below the table: the number of the line, and its cells.
+    first_index : int
+        The index of the first of them.
     head, units : sequence of str
-        Heads and units of the table.
+        The heads and units of the table.
     places_of_values : sequence of set of int
-        Indices of the cells with numbers or times in each row of the file.
+        The indices of the cells with numbers or times in each row of the file.
     """
     names = []
     units_of_names = []
@@ -73,7 +73,7 @@ def _rows_of_longer_clocks(
     if len(time_columns) < 2:
         return []
     further_rows: list[int] = []
-    for index, (_, row) in enumerate(rows, start=first):
+    for index, (_, row) in enumerate(rows, start=first_index):
         filled_columns = {column for column, cell in enumerate(row) if cell}
         has_other_texts = bool(filled_columns - places_of_values[index])
         if not filled_columns & time_columns or has_other_texts:
@@ -94,7 +94,7 @@ class TableLayout(NamedTuple):
     body : list of (int, list of str)
         Rows of numbers, with their line.
     remark : str
-        Remark on the rows below it that are left out.
+        The remark on the rows below it that are left out.
     """
 
     head: list[str]
@@ -115,9 +115,9 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     rows : list of (int, list of str)
         Rows of the file that are not empty.
     name : str
-        Name of the file, for messages.
+        The name of the file, for messages.
     place : str
-        Start of the place of a row, for messages, before its number.
+        The start of the place of a row, for messages, before its number.
 
     Raises
     ------
@@ -147,22 +147,26 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
         )
     # from the first to the last row with a number in the first core column, other rows of numbers
     # belong to the table as well
-    first, last = body[0], body[-1]
+    first_row, last_row = body[0], body[-1]
     body = [
-        index for index in range(first, last + 1) if not has_text[index] and places_of_values[index]
+        index
+        for index in range(first_row, last_row + 1)
+        if not has_text[index] and places_of_values[index]
     ]
-    head, units = _head_and_units(rows, first)
-    body += _rows_of_longer_clocks(rows[last + 1 :], last + 1, head, units, places_of_values)
-    last = body[-1]
+    head, units = _head_and_units(rows, first_row)
+    body += _rows_of_longer_clocks(
+        rows[last_row + 1 :], last_row + 1, head, units, places_of_values
+    )
+    last_row = body[-1]
 
     width = 0
     for index in body:
         width = max(width, *(column + 1 for column, cell in enumerate(rows[index][1]) if cell))
-    _check_names(head, width, f"{place} {rows[first][0]}")
+    _check_names(head, width, f"{place} {rows[first_row][0]}")
     _check_other_rows(rows, body, core, places_of_values, head, place)
     if width == 1:
         _check_no_empty_lines(rows, body, place)
-    lines_below = [line for line, _ in rows[last + 1 :]]
+    lines_below = [line for line, _ in rows[last_row + 1 :]]
     remark = f"; everything from {lines_below[0]} on is left out" if lines_below else ""
     names = [cell.lstrip("# ") for cell in head[:width]]
     padded_units = [*units, *[""] * width][:width]
@@ -181,7 +185,7 @@ def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]
     return sorted(column for column, count in counts.items() if 2 * count >= len(rows_of_values))
 
 
-def _head_and_units(rows: Rows, first: int) -> tuple[list[str], list[str]]:
+def _head_and_units(rows: Rows, first_row: int) -> tuple[list[str], list[str]]:
     """Return the heads and the units of the columns, from the two rows above the first numbers.
 
     The row above the numbers holds the units if all its cells are units, and if the row above it
@@ -190,12 +194,12 @@ def _head_and_units(rows: Rows, first: int) -> tuple[list[str], list[str]]:
     Parameters
     ----------
     rows : list of (int, list of str)
-        Rows of the file.
-    first : int
-        Index of the first row of numbers.
+        The rows of the file: the number of the line, and its cells.
+    first_row : int
+        The index of the first row of numbers.
     """
-    row_above = rows[first - 1][1]
-    row_two_above = rows[first - 2][1] if first > 1 else []
+    row_above = rows[first_row - 1][1]
+    row_two_above = rows[first_row - 2][1] if first_row > 1 else []
     no_units = [""] * len(row_above)
     if sum(map(bool, row_two_above)) < sum(map(bool, row_above)):
         return row_above, no_units
@@ -228,16 +232,16 @@ def _check_other_rows(
     Below the table, only a row with numbers in the first and in at least half of the core columns
     is refused; other rows are a footer. Comments and repeated heads are allowed.
     """
-    first, last = body[0], body[-1]
-    other_rows = {*range(first, last)} - {*body}
-    for index in range(last + 1, len(rows)):
+    first_row, last_row = body[0], body[-1]
+    other_rows = {*range(first_row, last_row)} - {*body}
+    for index in range(last_row + 1, len(rows)):
         values = places_of_values[index]
         is_row_of_numbers = core[0] in values and 2 * len(values & {*core}) >= len(core)
         if is_row_of_numbers:
             other_rows.add(index)
     for index in sorted(other_rows):
         line, row = rows[index]
-        is_head = row in (head, rows[first - 1][1])
+        is_head = row in (head, rows[first_row - 1][1])
         if is_head or row[0].startswith("#"):
             continue
         cells = short_repr(listing(filter(None, row)))

@@ -46,21 +46,21 @@ def read_trial(
     section : TrialSection
         What `campaign.toml` states of the trial.
     table : TextTable
-        Its table.
+        The table of the trial.
     campaign : CampaignSection
         The whole content of `campaign.toml`.
     remarks : list of str
-        Remarks of the reader; those on this trial are added.
+        The remarks of the reader; those on this trial are added.
     """
     user = f"the trial {section.name!r}"
     time, start = _read_times(section, table, campaign, user)
     channels = _channels_of_trial(section, table, campaign)
     values = []
-    used = []
+    is_used = []
     for channel in channels:
         channel_values, channel_used = _read_channel(channel, section, table, remarks)
         values.append(channel_values)
-        used.append(channel_used)
+        is_used.append(channel_used)
     losses = _stiffness_losses(section, table, user)
     inputs = _read_inputs(section, table, campaign, user)
     load_factor = np.zeros(len(table))
@@ -70,7 +70,7 @@ def read_trial(
         **section.keys_in_file,
         channels=tuple(channel.name for channel in channels),
         values=np.stack(values, axis=1),
-        used=np.stack(used, axis=1),
+        used=np.stack(is_used, axis=1),
         time=time,
         force=_read_force(section, table, campaign, inputs),
         load_factor=load_factor,
@@ -92,9 +92,9 @@ def _read_inputs(
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
         return ()
     return tuple(
-        replace(recorded, values=numbers_in_si(table, recorded, user))
-        for recorded in campaign.input
-        if recorded.table_column in table.columns
+        replace(recorded_input, values=numbers_in_si(table, recorded_input, user))
+        for recorded_input in campaign.input
+        if recorded_input.table_column in table.columns
     )
 
 
@@ -114,21 +114,21 @@ def _read_force(
     if section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not has_other_loads:
         to_newton = conversion_factor(campaign.force_unit, schema.FORCE_UNIT)
         return table.numbers("force", f"the trial {section.name!r}") * to_newton
-    for recorded in inputs:
-        if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):
-            return recorded.values
+    for recorded_input in inputs:
+        if recorded_input.quantity in (Quantity.FORCE, Quantity.TORQUE):
+            return recorded_input.values
     return np.zeros(len(table))
 
 
 def numbers_in_si(
-    table: TextTable, recorded: InTables, user: str, *, empty_allowed: bool = False
+    table: TextTable, record: InTables, user: str, *, empty_allowed: bool = False
 ) -> FloatArray:
     """Return the column of a channel or an input (N,) in SI.
 
     Empty cells are nan where they are allowed.
     """
-    numbers = table.numbers(recorded.table_column, user, empty_allowed=empty_allowed)
-    return numbers * factor_to_si(recorded.quantity, recorded.unit)
+    numbers = table.numbers(record.table_column, user, empty_allowed=empty_allowed)
+    return numbers * factor_to_si(record.quantity, record.unit)
 
 
 def _read_times(
@@ -184,7 +184,11 @@ def _times_of_rows_at_rest(
     """
     start = section.start or 0.0
     names_of_loads = dict.fromkeys(
-        ("force", "load_factor", *(recorded.table_column for recorded in campaign.input))
+        (
+            "force",
+            "load_factor",
+            *(recorded_input.table_column for recorded_input in campaign.input),
+        )
     )
     loads = [name for name in names_of_loads if name in table.columns]
     branches = _load_branches(table, loads, user).tolist()
@@ -210,11 +214,11 @@ def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArra
     Parameters
     ----------
     table : TextTable
-        Table of a static or flight trial.
+        The table of a static or flight trial.
     loads : sequence of str
-        Its columns of loads; a branch ends if any of them changes direction.
+        The columns of loads in the table; a branch ends if one of them changes direction.
     user : str
-        Name of the trial, for messages.
+        The name of the trial, for messages.
     """
     begins_branch = np.zeros(len(table), dtype=np.int64)
     for column in loads:
@@ -254,7 +258,7 @@ def _channels_of_trial(
 def _read_channel(
     channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
-    """Read a channel's column of a trial.
+    """Read the readings of a channel from the table of a trial.
 
     An empty cell is replaced by interpolation and marked as not used, and a remark says so. Rows in
     the key `left_out` of the trial are marked as not used, too.
@@ -262,21 +266,21 @@ def _read_channel(
     Returns
     -------
     values : (N,) ndarray
-        Readings [SI].
-    used : (N,) ndarray of bool
+        The readings of a channel [SI].
+    is_used : (N,) ndarray of bool
         False for readings that are left out.
     """
     values = numbers_in_si(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
-    used = np.isfinite(values)
-    if not used.any():
+    is_used = np.isfinite(values)
+    if not is_used.any():
         raise CampaignDataError(
             f"{table.name} has no reading in the column {channel.table_column!r} of the trial "
             f"{section.name!r}."
         )
-    if not used.all():
+    if not is_used.all():
         rows = np.arange(len(values))
-        values[~used] = np.interp(rows[~used], rows[used], values[used])
-        count = int((~used).sum())
+        values[~is_used] = np.interp(rows[~is_used], rows[is_used], values[is_used])
+        count = int((~is_used).sum())
         remarks.append(
             f"{count} of {len(values)} readings of {channel.name!r} in the trial {section.name!r} "
             f"{is_or_are(count)} empty and left out."
@@ -287,8 +291,8 @@ def _read_channel(
                 f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, but "
                 f"{table.name} has {counted(len(values), 'row')}."
             )
-        used[row - 1] = False
-    return values, used
+        is_used[row - 1] = False
+    return values, is_used
 
 
 def _read_temperature(
@@ -324,7 +328,7 @@ class _StiffnessLosses(NamedTuple):
     Attributes
     ----------
     regions : tuple of str
-        Names of the regions.
+        The names of the damage regions.
     means, deviations : (N, K) ndarray
         Losses [fraction], and their prior standard deviations.
     """
@@ -346,22 +350,22 @@ def _stiffness_losses(
     CampaignFileError
         If a region has both a column and a key, or a value is out of its range.
     """
-    stated = dict(section.health)
-    stated_deviation = stated.pop("deviation", 0.0)
+    stated_losses = dict(section.health)
+    stated_deviation = stated_losses.pop("deviation", 0.0)
     prefix = schema.OF_REGION
     columns = [name.removeprefix(prefix) for name in table.columns if name.startswith(prefix)]
     regions_of_columns = [name.removesuffix("_deviation") for name in columns]
-    regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *regions_of_columns)))
+    regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated_losses, *regions_of_columns)))
     means = np.zeros((len(table), len(regions)))
     deviations = np.zeros((len(table), len(regions)))
     for index, region in enumerate(regions):
         column = region if region in USUAL_REGIONS else f"{prefix}{region}"
-        if column in table.columns and region in stated:
+        if column in table.columns and region in stated_losses:
             raise CampaignFileError(
                 f"The trial {section.name!r} gives {region} twice: remove it from `health` or from "
                 f"{table.name}."
             )
-        means[:, index] = stated.get(region, 0.0)
+        means[:, index] = stated_losses.get(region, 0.0)
         if column in table.columns:
             means[:, index] = table.numbers(column, user)
         _check_range(means[:, index], table, column, "a fraction from 0 to 1", largest=1.0)
@@ -375,13 +379,13 @@ def _stiffness_losses(
 
 
 def _check_range(
-    values: FloatArray, table: TextTable, column: str, expected: str, *, largest: float
+    values: FloatArray, table: TextTable, column: str, expected_range: str, *, largest: float
 ) -> None:
     """Refuse values (N,) of a column below zero or above the largest that is allowed."""
-    outside = np.flatnonzero((values < 0.0) | (values > largest))
-    if outside.size:
-        row = int(outside[0])
+    rows_outside = np.flatnonzero((values < 0.0) | (values > largest))
+    if rows_outside.size:
+        row = int(rows_outside[0])
         raise CampaignFileError(
-            f"{table.name}, line {table.lines[row]}: {column} is {expected}, but {values[row]:g} "
-            "was given."
+            f"{table.name}, line {table.lines[row]}: {column} is {expected_range}, but "
+            f"{values[row]:g} was given."
         )

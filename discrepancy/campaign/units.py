@@ -44,15 +44,15 @@ class Units(NamedTuple):
     Attributes
     ----------
     usual : tuple of str
-        Units that messages suggest; pint knows more.
+        The units that messages suggest; pint knows more.
     written : str
-        Unit in which a campaign is written to files.
+        The unit in which a campaign is written to files.
     si : str
-        Unit of values in memory; nominal for a signal.
+        The unit of values in memory; nominal for a signal.
     drawn : tuple of float and str
-        Factor from SI, and unit, in figures.
+        The factor from SI, and unit, in figures.
     foreign : mapping of str to float
-        Further units that instruments show, and what one of each is in SI.
+        The further units that instruments show, and what one of each is in SI.
     """
 
     usual: Sequence[str]
@@ -79,7 +79,7 @@ def conversion_factor(unit: str, si: str) -> float:
     unit : str
         The unit, as a file or a logger writes it.
     si : str
-        The unit of SI.
+        The SI unit of the quantity.
 
     Raises
     ------

@@ -39,9 +39,9 @@ class _FileUnits:
     Attributes
     ----------
     units : mapping of str to str
-        Units of channels, inputs and `force` by name.
+        The units of channels, inputs and `force` by name.
     digits : int
-        Significant digits of values in these units.
+        The significant digits of values in these units.
     left_out_as_empty : bool
         True if readings that are left out become empty cells.
     """
@@ -56,11 +56,11 @@ class _FileUnits:
         Parameters
         ----------
         values : (N,) ndarray
-            Values [SI].
+            The values to convert [SI].
         name : str
-            Name of the channel or input.
+            The name of the channel or input.
         to_si : float
-            Factor from its unit to SI.
+            The factor from its unit to SI.
         """
         in_unit = values / to_si
         if self.digits == _EXACT_DIGITS or name not in self.units:
@@ -95,12 +95,13 @@ def write_campaign(
     folder : path
         The folder, made if it is missing; files of the same names are replaced.
     si : bool
-        Write strain and displacement in SI, too.
+        Whether strain and displacement are written in SI, too.
     units : mapping of str to str, optional
         Other units of channels and inputs by name, and of the force of static and forced trials by
         "force"; their values have 15 significant digits then.
     left_out_as_empty : bool
-        Leave the cells of readings empty that are left out, instead of listing them in `left_out`.
+        Whether the cells of left-out readings are empty, instead of their being listed in
+        `left_out`.
 
     Returns
     -------
@@ -168,9 +169,11 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _
             raise CampaignFileError(no_reference_temperature_message(trial.name))
         columns["temperature"] = trial.temperature + campaign.reference_temperature
     columns |= _loss_columns(trial)
-    for recorded in trial.inputs:
-        to_si = factor_to_si(recorded.quantity, _input_unit(recorded, file_units))
-        columns[recorded.name] = file_units.in_unit(recorded.values, recorded.name, to_si)
+    for recorded_input in trial.inputs:
+        to_si = factor_to_si(recorded_input.quantity, _input_unit(recorded_input, file_units))
+        columns[recorded_input.name] = file_units.in_unit(
+            recorded_input.values, recorded_input.name, to_si
+        )
     for index, name in enumerate(trial.channels):
         to_si = factor_to_si(campaign.channels[name].quantity, file_units.units[name])
         values = trial.values[:, index]
@@ -192,17 +195,17 @@ def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
     return columns
 
 
-def _unit(recorded: records.InTables, si: bool) -> str:
+def _unit(record: records.InTables, in_si: bool) -> str:
     """Return the unit in which a channel or input is written if the user states none."""
-    if recorded.unit in NEVER_CONVERTED:
-        return recorded.unit
-    units = UNITS[recorded.quantity]
-    return units.si if si else units.written
+    if record.unit in NEVER_CONVERTED:
+        return record.unit
+    units = UNITS[record.quantity]
+    return units.si if in_si else units.written
 
 
-def _input_unit(recorded: records.RecordedInput, file_units: _FileUnits) -> str:
+def _input_unit(recorded_input: records.RecordedInput, file_units: _FileUnits) -> str:
     """Return the unit in which an input is written."""
-    return file_units.units.get(recorded.name) or _unit(recorded, si=True)
+    return file_units.units.get(recorded_input.name) or _unit(recorded_input, in_si=True)
 
 
 def _noise_interval(campaign: records.Campaign) -> float | None:
@@ -257,16 +260,20 @@ def _campaign_text(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     files : list of str
-        Names of the tables, one for each trial.
+        The names of the tables, one for each trial.
     noise_interval : float or None
-        Sampling interval of the samples at rest [s]; None if there are none.
+        The sampling interval of the samples at rest [s]; None if there are none.
     file_units : _FileUnits
-        Units of the files.
+        The units in which the files are written.
     """
     source = f"The campaign {campaign.name!r}"
-    inputs = {recorded.name: recorded for trial in campaign.trials for recorded in trial.inputs}
+    inputs = {
+        recorded_input.name: recorded_input
+        for trial in campaign.trials
+        for recorded_input in trial.inputs
+    }
     priors = {}
     for name, (mean, deviation) in campaign.parameters.items():
         priors[name] = schema.StatedPriorSection.model_construct(mean=mean, deviation=deviation)
@@ -289,7 +296,7 @@ def _campaign_text(
         channel=tuple(
             _channel_table(channel, file_units) for channel in campaign.channels.values()
         ),
-        input=tuple(_input_table(recorded, file_units) for recorded in inputs.values()),
+        input=tuple(_input_table(recorded_input, file_units) for recorded_input in inputs.values()),
         trial=tuple(trials),
         event=tuple(complete_events(campaign.events, campaign.trials, source)),
     )
@@ -311,13 +318,18 @@ def _channel_table(channel: records.Channel, file_units: _FileUnits) -> records.
     return replace(channel, unit=file_units.units[channel.name], column="", noise=noise)
 
 
-def _input_table(recorded: records.RecordedInput, file_units: _FileUnits) -> records.RecordedInput:
+def _input_table(
+    recorded_input: records.RecordedInput, file_units: _FileUnits
+) -> records.RecordedInput:
     """Return an input as `campaign.toml` states it, with its deviation in the unit of the file."""
-    is_reference = bool(recorded.quantity.motion_chain) and recorded.hold is not records.Hold.SMOOTH
-    unit = _input_unit(recorded, file_units)
-    deviation = recorded.offset_deviation / factor_to_si(recorded.quantity, unit)
+    is_reference = (
+        bool(recorded_input.quantity.motion_chain)
+        and recorded_input.hold is not records.Hold.SMOOTH
+    )
+    unit = _input_unit(recorded_input, file_units)
+    deviation = recorded_input.offset_deviation / factor_to_si(recorded_input.quantity, unit)
     return replace(
-        recorded, unit=unit, offset_deviation=deviation, column="", reference=is_reference
+        recorded_input, unit=unit, offset_deviation=deviation, column="", reference=is_reference
     )
 
 

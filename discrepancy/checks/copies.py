@@ -27,9 +27,9 @@ class _Copy(NamedTuple):
 
 
 def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
-    """Yield one fault for each pair of channels of which one is a copy of the other.
+    """Yield one fault for each pair of channels in which one channel is a copy of the other.
 
-    The fault names the first trial in which it shows, and counts the others.
+    The fault names the first trial in which the copy shows, and counts the other trials.
     """
     trials_of_pairs: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
     for trial in campaign.trials:
@@ -52,7 +52,7 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
 
 
 def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
-    """Yield the pairs of channels of a trial of which one is a copy of the other.
+    """Yield the pairs of channels of a trial in which one channel is a copy of the other.
 
     Different sensors have independent noise, copies have the same. Sixth differences separate the
     noise from the motion. The shift in time between two channels is the lag of the largest
@@ -115,11 +115,11 @@ def _describe_copy(
     Parameters
     ----------
     original, copy : (N,) ndarrays
-        The two records.
+        The record, and the one that may be its copy.
     original_used, copy_used : (N,) ndarrays of bool
         False for samples that are left out.
     shift : int
-        Number of samples by which the copy comes later than the original.
+        The delay of the copy behind the original, in samples.
 
     Returns
     -------
@@ -132,9 +132,9 @@ def _describe_copy(
     first_of_copy = max(shift, 0)
     in_original = slice(first_sample, first_sample + count)
     in_copy = slice(first_of_copy, first_of_copy + count)
-    used = original_used[in_original] & copy_used[in_copy]
-    x = original[in_original][used]
-    y = copy[in_copy][used]
+    both_used = original_used[in_original] & copy_used[in_copy]
+    x = original[in_original][both_used]
+    y = copy[in_copy][both_used]
     if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
         return ""
     # the robust estimate is zero if most readings repeat; 924 is explained in `estimate_roughness`
@@ -147,7 +147,7 @@ def _describe_copy(
     if np.array_equal(x, y):
         return f"digit for digit{delay}"
     # scale by least squares
-    centred = x - x.mean()
-    scale = float(centred @ (y - y.mean()) / (centred @ centred))
-    unexplained = float(np.std(y - scale * x))
-    return f"times {scale:.6g}{delay}" if unexplained < COPIED_SHARE * noise else ""
+    centred_original = x - x.mean()
+    scale = float(centred_original @ (y - y.mean()) / (centred_original @ centred_original))
+    unexplained_deviation = float(np.std(y - scale * x))
+    return f"times {scale:.6g}{delay}" if unexplained_deviation < COPIED_SHARE * noise else ""

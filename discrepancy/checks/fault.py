@@ -52,11 +52,11 @@ class DataFault:
     Attributes
     ----------
     kind : FaultKind
-        What is wrong.
+        The kind of fault.
     sentence : str
-        Message to the user: what was found, where, and what to do.
+        The message to the user: what was found, where, and what to do.
     channel, trial : str
-        Names of the channel and the trial; empty if it concerns all.
+        The names of the channel and the trial; empty if it concerns all.
     accepted : bool
         True if the campaign accepts it by its key `accept`.
     """
@@ -94,7 +94,7 @@ def mark_accepted(faults: Iterable[DataFault], campaign: Campaign) -> tuple[Data
 
 
 def _acceptance_clause(fault: DataFault) -> str:
-    """Return the clause that names the key by which a campaign accepts a fault."""
+    """Return the clause that tells which key of the campaign accepts a fault."""
     tables = []
     if fault.trial:
         tables.append(f"the [[trial]] {fault.trial!r}")

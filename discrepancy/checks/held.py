@@ -54,7 +54,7 @@ def estimate_roughness(values: FloatArray) -> float:
     Parameters
     ----------
     values : (N,) ndarray
-        A record in time.
+        The samples of a record in time.
     """
     differences = np.diff(values, 6)
     # 924 = sum_k binomial(6, k)^2
@@ -67,10 +67,10 @@ def runs_of_true(flags: BoolArray) -> IntArray:
     Returns
     -------
     (R, 2) ndarray of int
-        Index of the first entry of each run, and the index after its last entry.
+        The index of the first entry of each run, and the index after its last entry.
     """
-    padded = np.concatenate(([False], flags, [False])).astype(np.int8)
-    edges = np.flatnonzero(np.diff(padded))
+    padded_flags = np.concatenate(([False], flags, [False])).astype(np.int8)
+    edges = np.flatnonzero(np.diff(padded_flags))
     return np.stack((edges[::2], edges[1::2]), axis=1)
 
 
@@ -81,7 +81,7 @@ def stuck_sensor_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]
     structure and from a coarse digital converter.
     """
     series = [trial.values]
-    series += [recorded.values[:, np.newaxis] for recorded in trial.inputs]
+    series += [recorded_input.values[:, np.newaxis] for recorded_input in trial.inputs]
     if trial.kind is TrialKind.FORCED:
         series.append(trial.force[:, np.newaxis])
     recorded_values = np.concatenate(series, axis=1)
@@ -108,15 +108,15 @@ class _RunsOfRecord(NamedTuple):
     Attributes
     ----------
     values : (N,) ndarray
-        The record.
+        The samples of the record.
     changes : (N + 1,) ndarray
         Absolute change into each sample; the last entry is zero.
     quantum : float
-        Quantum of the record.
+        The least difference between two values of the record, which is its last digit.
     bounds : (R, 2) ndarray of int
-        First sample of each run, and the one after its last.
+        The first sample of each run, and the one after its last.
     lengths : (R,) ndarray of int
-        Lengths of the runs in samples.
+        The lengths of the runs in samples.
     """
 
     values: FloatArray
@@ -127,7 +127,7 @@ class _RunsOfRecord(NamedTuple):
 
 
 def stuck_spans(
-    values: FloatArray, used: BoolArray, other_records: FloatArray, noise: float = 0.0
+    values: FloatArray, is_used: BoolArray, other_records: FloatArray, noise: float = 0.0
 ) -> list[tuple[int, int]]:
     """Return the runs of equal readings that show a failure of a sensor or logger.
 
@@ -146,28 +146,28 @@ def stuck_spans(
     Parameters
     ----------
     values : (N,) ndarray
-        A record in time.
-    used : (N,) ndarray of bool
+        The samples of a record in time.
+    is_used : (N,) ndarray of bool
         False for samples that are left out.
     other_records : (N, K) ndarray
         The records of the K other channels and inputs of the trial.
     noise : float
-        Standard deviation of the channel's noise; 0 if it is not known.
+        The standard deviation of the channel's noise; 0 if it is not known.
 
     Returns
     -------
     list of (int, int)
-        First sample of each run, and the one after its last.
+        The first sample of each run, and the one after its last.
     """
-    is_equal_to_next = (np.diff(values) == 0.0) & used[1:] & used[:-1]
+    is_equal_to_next = (np.diff(values) == 0.0) & is_used[1:] & is_used[:-1]
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
     long_runs = bounds_of_runs[lengths >= LEAST_RUN_LENGTH].tolist()
-    distinct = np.unique(values)
-    if len(distinct) < 3 or not long_runs:
+    distinct_values = np.unique(values)
+    if len(distinct_values) < 3 or not long_runs:
         return []
     # runs at an extreme value are clipped, which is another fault
-    extremes = (distinct[0], distinct[-1])
+    extremes = (distinct_values[0], distinct_values[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
     quantum = _quantum_in_time(values)
     if min(noise, estimate_roughness(values)) > _NOISE_IN_QUANTA * quantum:
@@ -192,11 +192,11 @@ def _is_sensor_failure(
     Parameters
     ----------
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     runs : _RunsOfRecord
         The record and all its runs.
     other_records : (N, K) ndarray
-        The other records.
+        The K other records of the same trial, for comparison.
     """
     length = stop - start
     least_jump = _LEAST_JUMP * runs.quantum
@@ -257,20 +257,23 @@ def _other_movement(
     Parameters
     ----------
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     window_starts : sequence of int
-        First samples of the windows, which are as long as the run.
+        The first samples of the windows, which are as long as the run.
     other_records : (N, K) ndarray
-        The other records.
+        The K other records of the same trial, for comparison.
     """
     length = stop - start
-    ranges = [np.ptp(other_records[first : first + length], axis=0) for first in window_starts]
+    ranges = [
+        np.ptp(other_records[first_sample : first_sample + length], axis=0)
+        for first_sample in window_starts
+    ]
     usual_range = np.median(ranges, axis=0)
     range_in_run = np.ptp(other_records[start:stop], axis=0)
-    moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
-    another_moves = bool(np.any(moves))
-    rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
-    return _OtherMovement(another_moves, not another_moves and bool(np.any(rests)))
+    record_moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
+    another_moves = bool(np.any(record_moves))
+    record_rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
+    return _OtherMovement(another_moves, not another_moves and bool(np.any(record_rests)))
 
 
 def _quantum_in_time(values: FloatArray) -> float:
@@ -298,7 +301,7 @@ def update_length(values: FloatArray) -> float:
     Parameters
     ----------
     values : (N,) ndarray
-        A record in time.
+        The samples of a record in time.
     """
     if lattice_step(values) is not None:
         return 1.0

@@ -26,7 +26,7 @@ def event_patterns(width: int, degree: int) -> FloatArray:
     Parameters
     ----------
     width, degree : int
-        Half width of the neighbourhood in samples, and degree of the polynomial.
+        The half width of the neighbourhood in samples, and degree of the polynomial.
 
     Returns
     -------
@@ -54,11 +54,11 @@ class LocalPolynomial:
     Parameters
     ----------
     weights : callable
-        Weights of residuals; see `Weights`.
+        The weights of residuals; see `Weights`.
     width : int
-        Half width of the neighbourhood in samples.
+        The half width of the neighbourhood in samples.
     degree : int
-        Degree of the polynomial.
+        The degree of the polynomial.
     """
 
     def __init__(self, weights: Weights, width: int, degree: int) -> None:
@@ -79,11 +79,11 @@ class LocalPolynomial:
         residual = np.zeros(len(values))
         for width, weights in self._weights.items():
             if weights.ndim == 1:
-                inner = np.convolve(values, weights, mode="valid")
+                inner_residuals = np.convolve(values, weights, mode="valid")
             else:
                 windows = sliding_window_view(values, 2 * width + 1)
-                inner = np.einsum("nw,nw->n", windows, weights)
-            residual[width : len(values) - width] = inner
+                inner_residuals = np.einsum("nw,nw->n", windows, weights)
+            residual[width : len(values) - width] = inner_residuals
         return residual
 
     def weight_of_sample(self, count: int) -> FloatArray:
@@ -121,14 +121,14 @@ def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
     Parameters
     ----------
     time : (N,) ndarray
-        Times [s].
+        The times of the samples [s].
     width, degree : int
-        Half width of the neighbourhood in samples, and degree of the polynomial.
+        The half width of the neighbourhood in samples, and degree of the polynomial.
 
     Returns
     -------
     (N - 2 width, 2 width + 1) ndarray
-        Weights of each sample that has all its neighbours.
+        The weights of each sample that has all its neighbours.
     """
     inner_times = time[width : len(time) - width, np.newaxis]
     relative_times = sliding_window_view(time, 2 * width + 1) - inner_times

@@ -47,7 +47,8 @@ def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, flo
     Returns
     -------
     dict of str to float
-        Ratio by the name of the parameter, for parameters with a prior standard deviation above 0.
+        The ratio by the name of the parameter, for parameters with a prior standard deviation above
+        0.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     channel_weights = np.ones(len(problem.channel_names))
@@ -114,7 +115,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     model : Model
         The model without a patch.
     """
@@ -181,14 +182,18 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or len(trial.time) < 4:
         return
     force_is_open = trial.kind is TrialKind.FORCED and trial.hold is None
-    open_inputs = [recorded.name for recorded in trial.inputs if recorded.hold is None]
+    open_inputs = [
+        recorded_input.name for recorded_input in trial.inputs if recorded_input.hold is None
+    ]
     if force_is_open:
         open_inputs = ["force"]
     if not open_inputs:
         return
     smooth_inputs = tuple(
-        replace(recorded, hold=Hold.SMOOTH) if recorded.name in open_inputs else recorded
-        for recorded in trial.inputs
+        replace(recorded_input, hold=Hold.SMOOTH)
+        if recorded_input.name in open_inputs
+        else recorded_input
+        for recorded_input in trial.inputs
     )
     smooth_trial = replace(
         trial, inputs=smooth_inputs, hold=Hold.SMOOTH if force_is_open else trial.hold
@@ -244,9 +249,9 @@ def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     frequency : float
-        Frequency of the first mode [Hz].
+        The frequency of the first mode [Hz].
     """
     for trial in campaign.trials:
         if not trial.is_dynamic or trial.kind is TrialKind.DRIVEN:
@@ -270,11 +275,11 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
     Parameters
     ----------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     frequency : float
-        Frequency of the first mode [Hz].
+        The frequency of the first mode [Hz].
     samples : float
-        Number of samples in a period.
+        The number of samples in a period.
     """
     in_milliseconds = 1e3 * samples
     if samples < LEAST_SAMPLES / 10.0 and in_milliseconds >= LEAST_SAMPLES:
@@ -300,9 +305,9 @@ def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> I
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
     """
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
@@ -326,9 +331,9 @@ def _sign_faults(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     scales : mapping of (str, str) to float
-        Signed ratio of data to prediction by channel and trial; see `data_scales`.
+        The signed ratio of data to prediction by channel and trial; see `data_scales`.
     """
     dynamic_trials = {trial.name for trial in campaign.trials if trial.is_dynamic}
     channels_at_rest = {name for name, trial in scales if trial not in dynamic_trials}

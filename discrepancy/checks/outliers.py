@@ -18,6 +18,7 @@ from discrepancy.checks.local_polynomial import (
     weights_for_times,
 )
 from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, row_outlier
+from reporting.arrays import LEAST_DIVISOR
 
 LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
@@ -68,21 +69,21 @@ def mark_outliers(campaign: Campaign) -> Campaign:
     if a parabola through the others scatters by less than twice the noise and misses this row by
     more than eight standard deviations. Both rules need a noise record.
     """
-    used = {trial.name: trial.used.copy() for trial in campaign.trials}
+    is_used = {trial.name: trial.used.copy() for trial in campaign.trials}
     remarks = list(campaign.remarks)
     for trial, channel, is_outlier in find_outliers(campaign):
         count = int(is_outlier.sum())
-        total = len(is_outlier)
-        too_many = trial.is_dynamic and count > LARGEST_SHARE * total
+        reading_count = len(is_outlier)
+        too_many = trial.is_dynamic and count > LARGEST_SHARE * reading_count
         if too_many or "outliers" in campaign.accepted_faults(channel, trial.name):
             continue
-        used[trial.name][is_outlier, trial.channels.index(channel)] = False
+        is_used[trial.name][is_outlier, trial.channels.index(channel)] = False
         outliers = "is an outlier" if count == 1 else "are outliers"
         remarks.append(
-            f"{count} of {total} readings of {channel!r} in the trial {trial.name!r} {outliers} "
-            "and left out."
+            f"{count} of {reading_count} readings of {channel!r} in the trial {trial.name!r} "
+            f"{outliers} and left out."
         )
-    trials = tuple(replace(trial, used=used[trial.name]) for trial in campaign.trials)
+    trials = tuple(replace(trial, used=is_used[trial.name]) for trial in campaign.trials)
     return replace(campaign, trials=trials, remarks=tuple(remarks))
 
 
@@ -92,11 +93,11 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     Yields
     ------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     channel : str
-        Name of the channel.
+        The name of the channel.
     is_outlier : (N,) ndarray of bool
-        Which of its readings are outliers.
+        Whether each reading of the channel is an outlier.
     """
     # all channels of a trial have its times
     weights = {
@@ -104,21 +105,21 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     }
     for name, channel in campaign.channels.items():
         outliers_of_repeats = repeat_outliers(campaign, channel)
-        for trial, values, used in campaign.records(name):
+        for trial, values, is_used in campaign.records(name):
             if trial.is_dynamic:
                 noise = trial.noise_deviation(channel)
-                outliers = sample_outliers(values, used, weights[trial.name], noise=noise)
+                outliers = sample_outliers(values, is_used, weights[trial.name], noise=noise)
             elif trial.name in outliers_of_repeats:
-                outliers = outliers_of_repeats[trial.name] & used
+                outliers = outliers_of_repeats[trial.name] & is_used
             else:
-                outliers = row_outlier(trial, values, used, channel)
+                outliers = row_outlier(trial, values, is_used, channel)
             if outliers.any():
                 yield trial, name, outliers
 
 
 def sample_outliers(
     values: FloatArray,
-    used: BoolArray | None = None,
+    is_used: BoolArray | None = None,
     weights: Weights | None = None,
     *,
     noise: float = 0.0,
@@ -130,48 +131,49 @@ def sample_outliers(
     Parameters
     ----------
     values : (N,) ndarray
-        The record.
-    used : (N,) ndarray of bool, optional
+        The samples of the record.
+    is_used : (N,) ndarray of bool, optional
         False for samples that are left out: they are interpolated and never outliers.
     weights : callable, optional
-        Weights of the local polynomials at the record's times; those of even samples by default.
+        The weights of the local polynomials at the record's times; those of even samples by
+        default.
     noise : float
-        Standard deviation of the channel's noise; 0 if it is not known.
+        The standard deviation of the channel's noise; 0 if it is not known.
     """
     count = len(values)
     largest_reading = float(np.max(np.abs(values), initial=0.0))
-    if used is None:
-        used = np.ones(count, dtype=bool)
-    if count < 4 * _EDGE_SAMPLES + 4 or used.sum() < 0.5 * count or largest_reading == 0.0:
+    if is_used is None:
+        is_used = np.ones(count, dtype=bool)
+    if count < 4 * _EDGE_SAMPLES + 4 or is_used.sum() < 0.5 * count or largest_reading == 0.0:
         return np.zeros(count, dtype=bool)
     # scaled, so that squares of readings of any size stay in range
     indices = np.arange(count)
     record = np.where(
-        used,
+        is_used,
         values / largest_reading,
-        np.interp(indices, indices[used], values[used] / largest_reading),
+        np.interp(indices, indices[is_used], values[is_used] / largest_reading),
     )
     polynomial = _best_polynomial(record, weights or even_weights)
     # Rounding to a quantum q has the standard deviation q / sqrt(12). A record at rest may show no
     # rounding at all, so that this is the least scatter that residuals are compared with.
     weight_norm = float(np.linalg.norm(even_weights(polynomial.width, polynomial.degree)))
-    rounding = quantum_of(values[used] / largest_reading) * 12.0**-0.5 * weight_norm
+    rounding = quantum_of(values[is_used] / largest_reading) * 12.0**-0.5 * weight_norm
 
     # readings within the noise are not outliers
     noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
-    suspects, cleaned = _find_suspects(record, polynomial, rounding, noise_limit)
+    is_suspect, cleaned_record = _find_suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours
-    residual = polynomial.residual(cleaned)
+    residual = polynomial.residual(cleaned_record)
     weight_of_sample = polynomial.weight_of_sample(count)
-    deviation = np.abs((record - cleaned) * weight_of_sample + residual)
+    deviation = np.abs((record - cleaned_record) * weight_of_sample + residual)
     is_beyond_noise = deviation > noise_limit
     is_beyond_scatter = deviation > OUTLIER_DEVIATIONS * _comparison_deviation(residual, rounding)
-    outliers = used & suspects & is_beyond_noise & is_beyond_scatter
+    outliers = is_used & is_suspect & is_beyond_noise & is_beyond_scatter
     # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
     is_event = np.convolve(is_crowded, np.ones(5), mode="same") > 0
-    isolated: BoolArray = outliers & ~is_event
-    return isolated
+    isolated_outliers: BoolArray = outliers & ~is_event
+    return isolated_outliers
 
 
 def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
@@ -195,28 +197,28 @@ def _find_suspects(
     Parameters
     ----------
     record : (N,) ndarray
-        The record.
+        The samples of the record.
     polynomial : LocalPolynomial
         The polynomial that predicts each sample.
     rounding : float
-        Standard deviation of its residuals that rounding of the readings causes.
+        The standard deviation of its residuals that rounding of the readings causes.
     noise_limit : float
-        Largest residual that the noise of the channel explains.
+        The largest residual that the noise of the channel explains.
 
     Returns
     -------
-    suspects : (N,) ndarray of bool
-        Samples with a significant residual that are not at an event such as a kink.
-    cleaned : (N,) ndarray
+    is_suspect : (N,) ndarray of bool
+        The samples with a significant residual that are not at an event such as a kink.
+    cleaned_record : (N,) ndarray
         The record with the predictions in place of these samples.
     """
     count = len(record)
-    suspects = np.zeros(count, dtype=bool)
-    events = np.zeros(count, dtype=bool)
-    cleaned = record.copy()
+    is_suspect = np.zeros(count, dtype=bool)
+    is_at_event = np.zeros(count, dtype=bool)
+    cleaned_record = record.copy()
     edge = _EDGE_SAMPLES if polynomial.degree == LOW_DEGREE else polynomial.width
     for _ in range(_MOST_PASSES):
-        residual = polynomial.residual(cleaned)
+        residual = polynomial.residual(cleaned_record)
         ratio = np.abs(residual) / _comparison_deviation(residual, rounding)
         ratio[:edge] = 0.0
         ratio[-edge:] = 0.0
@@ -224,21 +226,21 @@ def _find_suspects(
         is_worst = ratio == maximum_filter1d(ratio, neighbourhood, mode="constant")
         is_beyond_noise = np.abs(residual) > noise_limit
         is_significant = (ratio > OUTLIER_DEVIATIONS) & is_beyond_noise & is_worst
-        new_indices = np.flatnonzero(is_significant & ~suspects & ~events)
+        new_indices = np.flatnonzero(is_significant & ~is_suspect & ~is_at_event)
         if not new_indices.size:
             break
         at_event = np.array([_is_event(residual, int(index), polynomial) for index in new_indices])
-        events[new_indices[at_event]] = True
+        is_at_event[new_indices[at_event]] = True
         new_suspects = new_indices[~at_event]
-        suspects[new_suspects] = True
+        is_suspect[new_suspects] = True
         # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
-        cleaned[new_suspects] -= correction[new_suspects]
-    return suspects, cleaned
+        cleaned_record[new_suspects] -= correction[new_suspects]
+    return is_suspect, cleaned_record
 
 
 def wrong_end_readings(
-    residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0
+    residual: FloatArray, is_used: BoolArray, noise: FloatArray | float = 0.0
 ) -> BoolArray:
     """Return which of the first and last three samples of records are single wrong readings.
 
@@ -251,10 +253,10 @@ def wrong_end_readings(
     ----------
     residual : (N, C) ndarray
         Readings minus prediction; the model need not fit.
-    used : (N, C) ndarray of bool
+    is_used : (N, C) ndarray of bool
         False for samples that are left out.
     noise : (C,) ndarray or float
-        Standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
+        The standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
         known.
 
     Returns
@@ -262,18 +264,20 @@ def wrong_end_readings(
     (N, C) ndarray of bool
         True for a wrong reading.
     """
-    wrong = np.zeros(residual.shape, dtype=bool)
+    is_wrong = np.zeros(residual.shape, dtype=bool)
     noise = np.broadcast_to(noise, residual.shape[1:])
     for column in range(residual.shape[1]):
-        rows = np.flatnonzero(used[:, column])
+        rows = np.flatnonzero(is_used[:, column])
         if len(rows) >= 8 * _EDGE_SAMPLES:
-            is_wrong = _wrong_ends_of_channel(residual[rows, column], float(noise[column]))
-            wrong[rows, column] = is_wrong
+            is_wrong_in_channel = _wrong_ends_of_channel(
+                residual[rows, column], float(noise[column])
+            )
+            is_wrong[rows, column] = is_wrong_in_channel
     for end in _ENDS:
-        channels_at_end = np.count_nonzero(wrong[end].any(axis=0))
+        channels_at_end = np.count_nonzero(is_wrong[end].any(axis=0))
         if channels_at_end > 1:
-            wrong[end] = False
-    return wrong
+            is_wrong[end] = False
+    return is_wrong
 
 
 def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
@@ -286,24 +290,26 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     Parameters
     ----------
     residual : (N,) ndarray
-        Readings minus prediction.
+        The readings minus their prediction.
     noise : float
-        Standard deviation of the noise; 0 if it is not known.
+        The standard deviation of the noise; 0 if it is not known.
     """
-    padded = np.pad(residual, 2, constant_values=np.nan)
-    neighbours = sliding_window_view(padded, 5)[:, _NEIGHBOURS]
+    padded_residual = np.pad(residual, 2, constant_values=np.nan)
+    neighbours = sliding_window_view(padded_residual, 5)[:, _NEIGHBOURS]
     deviation = residual - np.nanmedian(neighbours, axis=1)
     exceeds_neighbours = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
     # the scatter near each end, where the motion may be fastest
     deviations_near_ends = (deviation[: 4 * _HALF_WINDOW], deviation[-4 * _HALF_WINDOW :])
-    wrong = np.zeros(len(residual), dtype=bool)
+    is_wrong = np.zeros(len(residual), dtype=bool)
     for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
         scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
-        scale = max(scatter, noise, 1e-300)
-        is_wrong = exceeds_neighbours[end] & (np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale)
-        if is_wrong.sum() == 1:
-            wrong[end] = is_wrong
-    return wrong
+        scale = max(scatter, noise, LEAST_DIVISOR)
+        is_wrong_at_end = exceeds_neighbours[end] & (
+            np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale
+        )
+        if is_wrong_at_end.sum() == 1:
+            is_wrong[end] = is_wrong_at_end
+    return is_wrong
 
 
 def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> bool:
@@ -317,9 +323,9 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
     residual : (N,) ndarray
         Residuals of the local polynomial.
     index : int
-        Index of the sample.
+        The index of the sample.
     polynomial : LocalPolynomial
-        The polynomial.
+        The local polynomial that smooths a record.
     """
     width = polynomial.width
     low = max(index - width, 0)
@@ -329,9 +335,9 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
         :, first_of_pattern : first_of_pattern + high - low
     ]
     # sum of squares that a pattern p explains by least squares: (p . r)^2 / p . p
-    explained = (patterns @ residual[low:high]) ** 2 / np.sum(patterns**2, axis=1)
+    explained_squares = (patterns @ residual[low:high]) ** 2 / np.sum(patterns**2, axis=1)
     # the first pattern is the single wrong reading
-    return int(np.argmax(explained)) > 0
+    return int(np.argmax(explained_squares)) > 0
 
 
 def _robust_scatter(residual: FloatArray) -> float:
@@ -339,13 +345,13 @@ def _robust_scatter(residual: FloatArray) -> float:
     return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])))
 
 
-def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
-    """Return the robust standard deviation (N,) with which each residual (N,) is compared.
+def _comparison_deviation(residual: FloatArray, least_deviation: float) -> FloatArray:
+    """Return the robust standard deviation (N,) that each residual (N,) is compared with.
 
     It is that of the whole record or that of the samples around it, whichever is larger, and at
-    least `least`.
+    least `least_deviation`.
     """
-    scatter_of_record = max(_robust_scatter(residual), least, 1e-300)
+    scatter_of_record = max(_robust_scatter(residual), least_deviation, LEAST_DIVISOR)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])
     if len(inner_magnitudes) <= 2 * _HALF_WINDOW:
         return np.full(len(residual), scatter_of_record)

@@ -86,12 +86,12 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         return
     if record.source == "repeats":
         return
-    stated = record.standard_deviation
+    stated_deviation = record.standard_deviation
     contradiction = ""
     # One-sided: a fast motion may make a record rougher than its noise, but no record is smoother
     # than its noise.
     least_roughness = _least_roughness(campaign, channel.name)
-    recorded_roughness = stated
+    recorded_roughness = stated_deviation
     if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
         recorded_roughness = estimate_roughness(record.samples)
     if 0.0 < least_roughness < recorded_roughness / _NOISE_FACTOR:
@@ -99,7 +99,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 
     repeats = repeat_record(channel, campaign.trials)
     if repeats is not None:
-        variance_ratio = (repeats.standard_deviation / stated) ** 2
+        variance_ratio = (repeats.standard_deviation / stated_deviation) ** 2
         freedom = repeats.degrees_of_freedom
         record_freedom = min(record.degrees_of_freedom, 1e9)
         larger = f_distribution.sf(variance_ratio, freedom, record_freedom)
@@ -110,8 +110,9 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
             contradiction = f"repeated trials scatter by {repeats.standard_deviation:.3g}"
     if contradiction:
         sentence = (
-            f"The noise record of the channel {channel.name!r} says {stated:.3g} (SI), but its "
-            f"{contradiction}: check the record and its unit, and whether the noise is coloured."
+            f"The noise record of the channel {channel.name!r} says {stated_deviation:.3g} (SI), "
+            f"but its {contradiction}: check the record and its unit, and whether the noise is "
+            "coloured."
         )
         yield DataFault(FaultKind.NOISE_LABEL, sentence, channel.name)
 
@@ -121,11 +122,11 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
 
     It is infinite if no record is long enough.
     """
-    least = np.inf
+    least_roughness = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
-            least = min(least, estimate_roughness(values) / trial.noise_factor)
-    return least
+            least_roughness = min(least_roughness, estimate_roughness(values) / trial.noise_factor)
+    return least_roughness
 
 
 # ---------------------------------------------------------------- records
@@ -153,22 +154,22 @@ def dead_fault(trial: Trial, name: str) -> DataFault:
 def is_still(trial: Trial, name: str) -> bool:
     """Return whether a channel shows one value throughout a trial that excites the structure."""
     column = trial.channels.index(name)
-    used = trial.used[:, column]
-    if used.sum() < LEAST_CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
+    is_used = trial.used[:, column]
+    if is_used.sum() < LEAST_CLIPPED_RUN or np.ptp(trial.values[is_used, column]) > 0.0:
         return False
-    return trial.is_dynamic or bool(np.ptp(trial.load[used]) > 0.0)
+    return trial.is_dynamic or bool(np.ptp(trial.load[is_used]) > 0.0)
 
 
 def _clipped_faults(
-    trial: Trial, name: str, values: FloatArray, used: BoolArray
+    trial: Trial, name: str, values: FloatArray, is_used: BoolArray
 ) -> Iterator[DataFault]:
     """Yield a fault for each side at which a channel's readings (N,) in a trial are clipped."""
-    readings = values[used]
+    readings = values[is_used]
     if len(readings) < LEAST_CLIPPED_RUN:
         return
     load = None
     if not trial.is_dynamic:
-        load = trial.load[used]
+        load = trial.load[is_used]
         order = np.argsort(load, kind="stable")
         readings = readings[order]
         load = load[order]
@@ -199,7 +200,7 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     extreme : float
         The largest or smallest of them.
     load : (N,) ndarray, optional
-        Loads of readings at rest; without them the readings are samples in time.
+        The loads of readings at rest; without them the readings are samples in time.
     """
     digit = quantum_of(values)
     least_length = LEAST_CLIPPED_RUN * (update_length(values) if load is None else 1.0)
@@ -228,9 +229,9 @@ def _is_clipped_over_load(
     values, load : (N,) ndarrays
         Readings and loads, in the order of load.
     start, stop : int
-        First reading of the run, and the one after its last.
+        The first reading of the run, and the one after its last.
     digit : float
-        Quantum of the readings.
+        The least difference between two readings, which is their last digit.
     """
     other_rows = np.delete(np.arange(len(values)), np.s_[start:stop])
     loads_of_run = np.unique(load[start:stop])
@@ -253,9 +254,9 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     values : (N,) ndarray
         Readings in the order of time.
     start, stop : int
-        First sample of the run, and the one after its last.
+        The first sample of the run, and the one after its last.
     digit : float
-        Quantum of the readings.
+        The least difference between two readings, which is their last digit.
     """
     neighbours = np.r_[start - 3 : start, stop : stop + 3]
     if neighbours[0] < 0 or neighbours[-1] >= len(values):

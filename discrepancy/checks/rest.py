@@ -35,9 +35,9 @@ def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> I
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     frequency : float, optional
-        Frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
+        The frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
     """
     for name, channel in campaign.channels.items():
         if channel.noise is None:
@@ -67,13 +67,13 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     record : NoiseRecord
         The noise record, taken while nothing should move.
     frequency : float, optional
-        Frequency of a mode of the structure [Hz].
+        The frequency of a mode of the structure [Hz].
 
     Returns
     -------
     str or None
-        Verb phrase for a message, such as "drifts by ...". None if nothing else was found, or if
-        the record has too few samples for the tests.
+        The verb phrase for a message, such as "drifts by ...". None if nothing else was found, or
+        if the record has too few samples for the tests.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
@@ -99,9 +99,9 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
     residual : (n,) ndarray
         The noise record without mains lines, mean removed.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     frequency : float
-        Frequency of the mode [Hz].
+        The frequency of the mode [Hz].
     """
     is_short = frequency * interval * len(residual) < LEAST_PERIODS
     if is_short or any(abs(frequency / mains - 1.0) < RELATIVE_HALF_BAND for mains in MAINS):
@@ -126,7 +126,7 @@ def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | Non
     residual : (n,) ndarray
         The noise record without mains lines and drift.
     interval : float
-        Its sampling interval [s].
+        The interval between successive samples [s].
     """
     quarters = np.array_split(residual, 4)
     # mean absolute values, which single spikes change less than the standard deviation

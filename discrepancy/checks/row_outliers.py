@@ -28,7 +28,7 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     channel : Channel
         The channel; without a noise record there is no outlier.
 
@@ -61,7 +61,7 @@ def _outliers_among_repeats(
     readings : (R, N) ndarray
         Readings of the N rows of each trial.
     noise : float
-        Standard deviation of the channel's noise.
+        The standard deviation of the channel's noise.
     has_free_zero : bool
         Whether each trial may have a zero of its own, which is removed first: the median over the
         rows of what the readings differ from the median over the trials.
@@ -85,21 +85,23 @@ def _outliers_among_repeats(
     return is_significant & is_single
 
 
-def row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Channel) -> BoolArray:
+def row_outlier(
+    trial: Trial, values: FloatArray, is_used: BoolArray, channel: Channel
+) -> BoolArray:
     """Find the single outlier among the rows of a trial by a parabola over the load.
 
     A row is an outlier if the parabola through all other rows misses it by more than
     `OUTLYING_ROW_DEVIATIONS` standard deviations of the noise, while the other rows scatter about
-    that parabola by less than twice the noise. Of several such rows the one that leaves the least
-    scatter is taken.
+    that parabola by less than twice the noise. If there are several such rows, the row without
+    which the others scatter least is the outlier.
 
     Parameters
     ----------
     trial : Trial
         A static or flight trial.
     values : (N,) ndarray
-        Readings of the channel.
-    used : (N,) ndarray of bool
+        The readings of the channel [SI].
+    is_used : (N,) ndarray of bool
         False for readings that are left out.
     channel : Channel
         The channel; without a noise record there is no outlier.
@@ -110,7 +112,7 @@ def row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Chan
         True for the outlier; False everywhere if there is none.
     """
     outlier = np.zeros(len(values), dtype=bool)
-    rows = np.flatnonzero(used)
+    rows = np.flatnonzero(is_used)
     load = trial.load[rows]
     if channel.noise is None or len(rows) < LEAST_ROWS or np.ptp(load) == 0.0:
         return outlier

@@ -9,6 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from discrepancy.campaign.records import Campaign, Channel, FloatArray, Quantity, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.held import estimate_roughness
+from reporting.arrays import LEAST_DIVISOR
 
 CLEAR_NOISE_DEVIATIONS = 5.0
 """Least size of a clear reading, in standard deviations of the noise."""
@@ -27,46 +28,45 @@ _LEAST_RELATIVE_ERROR = 0.02
 def data_scales(
     campaign: Campaign, predictions: Mapping[str, FloatArray]
 ) -> dict[tuple[str, str], float]:
-    """Return the signed ratio of data to prediction for each channel and trial that determine it.
+    """Return the ratios of readings to predicted readings, by channel and trial.
 
-    For readings at rest (static and flight trials) it is the robust slope of the data over the
-    prediction. For records in time it is the ratio of their amplitudes, because the model need not
-    predict their phase.
+    A ratio has a sign. For readings at rest (static and flight trials) it is the robust slope of
+    the readings over the prediction. For records in time it is the ratio of their amplitudes,
+    because the model need not predict their phase. A channel is left out in a trial in which its
+    predicted amplitude is too small to determine the ratio.
 
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
 
     Returns
     -------
     dict of (str, str) to float
-        Ratio by the names of channel and trial.
+        The ratio by the names of channel and trial.
     """
     scales = {}
     for trial in campaign.trials:
         prediction = predictions[trial.name]
-        largest = _largest_amplitudes(campaign, trial, prediction)
+        largest_amplitudes = _largest_amplitudes(campaign, trial, prediction)
         for column, name in enumerate(trial.channels):
             channel = campaign.channels[name]
             if np.isinf(channel.gain_deviation) or channel.quantity is Quantity.SIGNAL:
                 continue
-            used = trial.used[:, column]
-            data = trial.values[used, column]
-            model = prediction[used, column]
-            amplitude = _amplitude(model, trial)
-            if (
-                amplitude <= _LEAST_RELATIVE_AMPLITUDE * largest[channel.quantity]
-                or amplitude == 0.0
-            ):
+            is_used = trial.used[:, column]
+            readings = trial.values[is_used, column]
+            predicted_readings = prediction[is_used, column]
+            amplitude = _amplitude(predicted_readings, trial)
+            least_amplitude = _LEAST_RELATIVE_AMPLITUDE * largest_amplitudes[channel.quantity]
+            if amplitude == 0.0 or amplitude <= least_amplitude:
                 continue
             if trial.is_dynamic:
-                scale = _dynamic_scale(data, model, trial, channel)
+                scale = _dynamic_scale(readings, predicted_readings, trial, channel)
             else:
                 noise = trial.noise_deviation(channel)
-                scale = _static_scale(data, model, noise, channel.offset_deviation)
+                scale = _static_scale(readings, predicted_readings, noise, channel.offset_deviation)
             if 0.0 < abs(scale) < _LARGEST_RATIO:
                 scales[name, trial.name] = scale
     return scales
@@ -96,7 +96,7 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
 
 
 def _static_scale(
-    data: FloatArray, model: FloatArray, noise: float, zero_deviation: float
+    readings: FloatArray, predicted_readings: FloatArray, noise: float, zero_deviation: float
 ) -> float:
     """Return the ratio of readings at rest to their prediction; 0 if it is not determined.
 
@@ -108,21 +108,21 @@ def _static_scale(
 
     Parameters
     ----------
-    data, model : (N,) ndarrays
+    readings, predicted_readings : (N,) ndarrays
         Readings, and their prediction by the model [channel's unit].
     noise, zero_deviation : float
-        Standard deviations of the noise and of the channel's zero [channel's unit].
+        The standard deviations of the noise and of the channel's zero [channel's unit].
     """
     # all pairs of at most 400 rows
-    rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
+    rows = np.linspace(0, len(readings) - 1, min(len(readings), 400)).round().astype(int)
     first_rows, second_rows = np.triu_indices(len(rows), 1)
-    data_steps = data[rows][first_rows] - data[rows][second_rows]
-    model_steps = model[rows][first_rows] - model[rows][second_rows]
+    data_steps = readings[rows][first_rows] - readings[rows][second_rows]
+    model_steps = predicted_readings[rows][first_rows] - predicted_readings[rows][second_rows]
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
-    is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(model))
-    median_reading = float(np.median(data))
-    median_prediction = float(np.median(model))
+    is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(predicted_readings))
+    median_reading = float(np.median(readings))
+    median_prediction = float(np.median(predicted_readings))
     if not is_clear_step.any():
         is_visible = abs(median_reading) > CLEAR_NOISE_DEVIATIONS * max(noise, zero_deviation)
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
@@ -136,57 +136,61 @@ def _static_scale(
     return slope if is_above_noise and pairs_agree and not has_another_cause else 0.0
 
 
-def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, channel: Channel) -> float:
+def _dynamic_scale(
+    readings: FloatArray, predicted_readings: FloatArray, trial: Trial, channel: Channel
+) -> float:
     """Return the ratio of the amplitudes of a record in time and its prediction.
 
     The sign is that of `sign_of_release`. The result is 0 if the record is within its noise.
 
     Parameters
     ----------
-    data, model : (N,) ndarrays
+    readings, predicted_readings : (N,) ndarrays
         Readings, and their prediction by the model [channel's unit].
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     channel : Channel
-        The channel.
+        The channel with its quantity and noise record.
     """
     # The 95 % quantile ignores outliers. Unlike the median it shows the motion of a record that
     # decays and is quiet for most of its length.
-    data_amplitude = np.quantile(np.abs(data - np.median(data)), 0.95)
-    model_amplitude = np.quantile(np.abs(model - np.median(model)), 0.95)
-    scale = float(data_amplitude / model_amplitude) * sign_of_release(data, model, trial)
+    data_amplitude = np.quantile(np.abs(readings - np.median(readings)), 0.95)
+    model_amplitude = np.quantile(np.abs(predicted_readings - np.median(predicted_readings)), 0.95)
+    sign = sign_of_release(readings, predicted_readings, trial)
+    scale = float(data_amplitude / model_amplitude) * sign
     # A record within the noise has no scale. If its noise was stated in a wrong unit, however, the
     # record stands out of its own scatter, and the prediction out of the stated noise.
-    predicted = _amplitude(model, trial)
-    measured = abs(scale) * predicted
-    scatter = estimate_roughness(data) if len(data) > 6 else 0.0
+    predicted_amplitude = _amplitude(predicted_readings, trial)
+    measured_amplitude = abs(scale) * predicted_amplitude
+    scatter = estimate_roughness(readings) if len(readings) > 6 else 0.0
     noise = trial.noise_deviation(channel) or scatter
-    is_above_noise = measured > CLEAR_NOISE_DEVIATIONS * noise
+    is_above_noise = measured_amplitude > CLEAR_NOISE_DEVIATIONS * noise
     noise_may_be_in_another_unit = (
-        measured > CLEAR_NOISE_DEVIATIONS * scatter and predicted > CLEAR_NOISE_DEVIATIONS * noise
+        measured_amplitude > CLEAR_NOISE_DEVIATIONS * scatter
+        and predicted_amplitude > CLEAR_NOISE_DEVIATIONS * noise
     )
     return scale if is_above_noise or noise_may_be_in_another_unit else 0.0
 
 
-def sign_of_release(data: FloatArray, model: FloatArray, trial: Trial) -> float:
+def sign_of_release(readings: FloatArray, predicted_readings: FloatArray, trial: Trial) -> float:
     """Return -1 if a ring-down starts on the opposite side of its prediction, else 1.
 
     Parameters
     ----------
-    data, model : (N,) ndarrays
+    readings, predicted_readings : (N,) ndarrays
         Readings and prediction of a channel.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     """
     if trial.release is None or not trial.release.at_rest:
         return 1.0
     # until the prediction first crosses zero, an error of its frequency does not matter
-    crossings = np.flatnonzero(np.sign(model) != np.sign(model[0]))
-    first_crossing = int(crossings[0]) if crossings.size else len(model)
+    crossings = np.flatnonzero(np.sign(predicted_readings) != np.sign(predicted_readings[0]))
+    first_crossing = int(crossings[0]) if crossings.size else len(predicted_readings)
     count = max(first_crossing, 3)
     # each sample votes with the weight of its prediction, so that a wrong reading does not decide
-    votes = np.sign(data - np.median(data))[:count]
-    return float(np.sign(votes @ model[:count])) or 1.0
+    votes = np.sign(readings - np.median(readings))[:count]
+    return float(np.sign(votes @ predicted_readings[:count])) or 1.0
 
 
 def swapped_channels(
@@ -200,9 +204,9 @@ def swapped_channels(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     predictions : mapping of str to (N, C) ndarray
-        Predicted readings by the name of the trial.
+        The predicted readings by the name of the trial.
     """
     groups: dict[tuple[Quantity, tuple[str, ...]], list[Channel]] = defaultdict(list)
     for name, channel in campaign.channels.items():
@@ -217,9 +221,11 @@ def swapped_channels(
         for trial in campaign.trials:
             if trial.name in trial_names:
                 misfits = misfits + _misfits(trial, predictions[trial.name], channels)
-        _, assigned = linear_sum_assignment(misfits)
-        for first_index, second_index in enumerate(assigned):
-            is_exchange = first_index < second_index and assigned[second_index] == first_index
+        _, assigned_columns = linear_sum_assignment(misfits)
+        for first_index, second_index in enumerate(assigned_columns):
+            is_exchange = (
+                first_index < second_index and assigned_columns[second_index] == first_index
+            )
             if is_exchange and _exchange_is_better(misfits, first_index, int(second_index)):
                 swaps.append((channels[first_index].name, channels[second_index].name))
     return swaps
@@ -244,24 +250,27 @@ def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int
     misfits : (C, C) ndarray
         Chi-squared of each channel (row) to the prediction of each channel (column).
     first_index, second_index : int
-        Indices of the two channels.
+        The indices of the two channels.
     """
     pair = [first_index, second_index]
     exchanged = [second_index, first_index]
-    before = misfits[pair, pair]
-    after = misfits[pair, exchanged]
-    return bool(np.all(after < 0.5 * before) and np.sum(before - after) > 30.0)
+    misfits_before = misfits[pair, pair]
+    misfits_after = misfits[pair, exchanged]
+    return bool(
+        np.all(misfits_after < 0.5 * misfits_before)
+        and np.sum(misfits_before - misfits_after) > 30.0
+    )
 
 
 def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel]) -> FloatArray:
-    """Return the misfit of each of C channels to the prediction of each of them.
+    """Return how well the readings of each channel fit the prediction of each other channel.
 
     Parameters
     ----------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     predictions : (N, M) ndarray
-        Predicted readings of all channels of the trial.
+        The predicted readings of all channels of the trial.
     channels : sequence of Channel
         The C channels.
 
@@ -273,16 +282,18 @@ def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel])
     columns = [trial.channels.index(channel.name) for channel in channels]
     misfits = np.zeros((len(channels), len(channels)))
     for row, channel in enumerate(channels):
-        used = trial.used[:, columns[row]]
-        data = trial.values[used, columns[row]]
+        is_used = trial.used[:, columns[row]]
+        readings = trial.values[is_used, columns[row]]
         for column_of_misfit, column_of_prediction in enumerate(columns):
             misfits[row, column_of_misfit] = _misfit(
-                data, predictions[used, column_of_prediction], channel, trial
+                readings, predictions[is_used, column_of_prediction], channel, trial
             )
     return misfits
 
 
-def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial) -> float:
+def _misfit(
+    readings: FloatArray, predicted_readings: FloatArray, channel: Channel, trial: Trial
+) -> float:
     """Return chi-squared of a channel's readings to a prediction.
 
     The standard deviation of a reading combines the noise with 2 % of the prediction, because any
@@ -290,26 +301,32 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
 
     Parameters
     ----------
-    data, model : (N,) ndarrays
+    readings, predicted_readings : (N,) ndarrays
         Readings and prediction.
     channel : Channel
-        The channel.
+        The channel with its quantity and noise record.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     """
     noise = trial.noise_deviation(channel)
     if trial.is_dynamic:
         # Only the amplitudes are compared: over many periods a small error of the frequency would
         # outweigh the difference between two gauges.
-        sign = sign_of_release(data, model, trial)
-        residual = np.asarray(sign * np.std(data) - np.std(model))
-        deviation = np.hypot(noise / np.sqrt(len(data)), _LEAST_RELATIVE_ERROR * np.std(model))
+        sign = sign_of_release(readings, predicted_readings, trial)
+        residual = np.asarray(sign * np.std(readings) - np.std(predicted_readings))
+        deviation = np.hypot(
+            noise / np.sqrt(len(readings)), _LEAST_RELATIVE_ERROR * np.std(predicted_readings)
+        )
     else:
-        residual = data - model
+        residual = readings - predicted_readings
         if channel.offset_deviation > 0.0:
             residual = residual - np.median(residual)
-        least = 0.2 * _LEAST_RELATIVE_ERROR * float(np.max(np.abs(model), initial=0.0))
-        deviation = np.maximum(np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(model)), least)
+        least_deviation = (
+            0.2 * _LEAST_RELATIVE_ERROR * float(np.max(np.abs(predicted_readings), initial=0.0))
+        )
+        deviation = np.maximum(
+            np.hypot(noise, _LEAST_RELATIVE_ERROR * np.abs(predicted_readings)), least_deviation
+        )
     # bounded, so that readings of any size stay comparable
-    standardised = np.minimum(np.abs(residual / np.maximum(deviation, 1e-300)), 1e9)
+    standardised = np.minimum(np.abs(residual / np.maximum(deviation, LEAST_DIVISOR)), 1e9)
     return float(np.sum(standardised**2))

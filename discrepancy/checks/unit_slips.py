@@ -35,7 +35,7 @@ class Slip(NamedTuple):
     Attributes
     ----------
     factor : float
-        Factor of data over model if one unit was given as the other.
+        The factor of data over model if one unit was given as the other.
     meant : str
         The unit that the data have.
     stated : str
@@ -53,7 +53,7 @@ class Slip(NamedTuple):
 
     @property
     def tolerance_factor(self) -> float:
-        """Factor by which the ratio may differ from the slip because of physical effects.
+        """The factor up to which physical effects may make the ratio differ from the slip.
 
         A larger slip is distinct from other slips, and allows for a larger factor.
         """
@@ -69,22 +69,22 @@ class Slip(NamedTuple):
     def __str__(self) -> str:
         """Return the pair of units, in brackets."""
         meant = "strain" if self.meant == "1" else self.meant
-        stated = "strain" if self.stated == "1" else self.stated
-        return f"({meant} given as {stated}?)"
+        stated_unit = "strain" if self.stated == "1" else self.stated
+        return f"({meant} given as {stated_unit}?)"
 
 
 def find_slip(
-    scale: float, quantity: Quantity, stated: str = "", *, is_input: bool = False
+    scale: float, quantity: Quantity, stated_unit: str = "", *, is_input: bool = False
 ) -> Slip | None:
     """Return the two units of a quantity whose confusion best explains a ratio of data to model.
 
     Parameters
     ----------
     scale : float
-        Ratio of data to model, of any sign.
+        The ratio of data to model, of any sign.
     quantity : Quantity
         The quantity whose units may have been mixed up.
-    stated : str
+    stated_unit : str
         The unit that the file states. If it is empty, all pairs with one SI unit are tried.
     is_input : bool
         True if the quantity is an input of the model. An input that is too small makes the data
@@ -98,8 +98,8 @@ def find_slip(
     if abs(log(abs(scale))) < log(LEAST_FACTOR / 1.1):
         return None
     names = {*UNITS[quantity].usual}
-    if stated:
-        names.add(stated)
+    if stated_unit:
+        names.add(stated_unit)
     units_in_si = {unit: factor_to_si(quantity, unit) for unit in sorted(names)}
     units_in_si |= UNITS[quantity].foreign
     distances: dict[Slip, float] = {}
@@ -107,7 +107,7 @@ def find_slip(
         for meant, meant_in_si in units_in_si.items():
             # the assumed unit is the stated one; if none is stated, one of the two must be SI
             has_si = 1.0 in (assumed_in_si, meant_in_si)
-            if assumed != stated and (stated or not has_si):
+            if assumed != stated_unit and (stated_unit or not has_si):
                 continue
             factor = meant_in_si / assumed_in_si if is_input else assumed_in_si / meant_in_si
             slip = Slip(factor, meant, assumed)
@@ -129,24 +129,24 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     scales : mapping of (str, str) to float
-        Data over model by channel and trial.
+        The ratio of data to model, by channel and trial.
     """
     trials = {trial.name: trial for trial in campaign.trials}
     input_slips = {key: _slip_of_input(trials[key[1]], scale) for key, scale in scales.items()}
     trials_of_channels: dict[str, list[str]] = defaultdict(list)
     for channel, trial_name in scales:
         trials_of_channels[channel].append(trial_name)
-    common = _common_slip([*input_slips.values()])
-    if len(trials_of_channels) > 1 and common is not None:
+    common_slip = _common_slip([*input_slips.values()])
+    if len(trials_of_channels) > 1 and common_slip is not None:
         sentence = (
-            f"All channels of all trials are about {common.factor:.6g} times what the model "
-            f"predicts {common}: check the units of forces (N), load factors (1) and release "
+            f"All channels of all trials are about {common_slip.factor:.6g} times what the model "
+            f"predicts {common_slip}: check the units of forces (N), load factors (1) and release "
             "displacements, or of the channels"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence)
-        yield from _grade_slip(fault, common, agreeing=len(input_slips))
+        yield from _grade_slip(fault, common_slip, agreeing=len(input_slips))
         return
     wrong_channels = set()
     for channel, trial_names in trials_of_channels.items():
@@ -174,25 +174,25 @@ def _slips_in_trial(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     keys : sequence of (str, str)
-        Channel and trial for its channels whose own unit is right.
+        The channel and trial for its channels whose own unit is right.
     scales : mapping of (str, str) to float
-        Data over model by channel and trial.
+        The ratio of data to model, by channel and trial.
     input_slips : mapping of (str, str) to Slip or None
-        Slip of the trial's input that would explain each scale.
+        The slip of the trial's input that would explain each scale.
     """
-    common = _common_slip([input_slips[key] for key in keys])
-    if common is not None:
+    common_slip = _common_slip([input_slips[key] for key in keys])
+    if common_slip is not None:
         sentence = (
-            f"All channels of the trial {trial.name!r} are about {common.factor:.6g} times what "
-            f"the model predicts {common}, and those of other trials are not: check the unit of "
-            "its force, load factor, release displacement or inputs"
+            f"All channels of the trial {trial.name!r} are about {common_slip.factor:.6g} times "
+            f"what the model predicts {common_slip}, and those of other trials are not: check the "
+            "unit of its force, load factor, release displacement or inputs"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
-        yield from _grade_slip(fault, common, agreeing=len(keys))
+        yield from _grade_slip(fault, common_slip, agreeing=len(keys))
         return
     for key in keys:
         channel, _ = key
@@ -229,7 +229,7 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
     drives = []
     if trial.kind in _DRIVES:
         drives.append(_DRIVES[trial.kind])
-    drives += [(recorded.quantity, recorded.unit) for recorded in trial.inputs]
+    drives += [(recorded_input.quantity, recorded_input.unit) for recorded_input in trial.inputs]
     for quantity, unit in drives:
         slip = find_slip(scale, quantity, unit, is_input=True)
         if slip is not None:
@@ -245,11 +245,11 @@ def _channel_faults(
     Parameters
     ----------
     campaign : Campaign
-        The campaign.
+        The campaign: its trials, channels and noise records.
     name : str
-        Name of the channel.
+        The name of the channel.
     slip : Slip
-        The two units.
+        The unit that was stated, and the unit that was probably meant.
     trials : sequence of Trial
         The trials that show it.
     """
@@ -283,9 +283,9 @@ def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[Data
     fault : DataFault
         The fault, whose sentence has no full stop yet.
     slip : Slip
-        The slip.
+        The slip of a unit that explains the scale.
     agreeing : int
-        Number of records that show the same slip.
+        The number of records that show the same slip.
     """
     sentence = fault.sentence
     if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):

@@ -31,7 +31,7 @@ class EffectLaws:
     column_builder : ColumnBuilder
         The object that computes the changes of readings by errors of sensors.
     trials : tuple of PortedTrial
-        The dynamic trials.
+        The dynamic trials as linear systems with ports.
     candidate : Candidate
         The effects at their places.
     evaluate_model_laws : callable
@@ -90,20 +90,28 @@ class EffectLaws:
         forces = self._checked_forces(arguments)
         derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
 
-        effect, shared = arguments.effect, arguments.shared
+        effect_values, shared_values = arguments.effect, arguments.shared
         for k in range(self.effect_unknown_count):
             self._add_derivatives(
                 derivatives,
-                len(shared) + k,
-                above=replace(arguments, effect=with_step(effect, k, HALF_DIFFERENCE)),
-                below=replace(arguments, effect=with_step(effect, k, -HALF_DIFFERENCE)),
+                len(shared_values) + k,
+                arguments_above=replace(
+                    arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE)
+                ),
+                arguments_below=replace(
+                    arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE)
+                ),
             )
         for k in self.unknowns_of_model_laws:
             self._add_derivatives(
                 derivatives,
                 k,
-                above=replace(arguments, shared=with_step(shared, k, HALF_DIFFERENCE)),
-                below=replace(arguments, shared=with_step(shared, k, -HALF_DIFFERENCE)),
+                arguments_above=replace(
+                    arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE)
+                ),
+                arguments_below=replace(
+                    arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE)
+                ),
             )
         return {
             port: LinearisedForce(force_at_port, derivatives[port])
@@ -113,9 +121,9 @@ class EffectLaws:
     def _add_derivatives(
         self,
         derivatives: Mapping[int, dict[int, FloatArray]],
-        unknown: int,
-        above: LawArguments,
-        below: LawArguments,
+        unknown_index: int,
+        arguments_above: LawArguments,
+        arguments_below: LawArguments,
     ) -> None:
         """Add the derivatives of the forces at ports by one unknown, unless they are zero.
 
@@ -123,18 +131,18 @@ class EffectLaws:
         ----------
         derivatives : mapping of int to dict of int to (F,) array
             The derivatives by port and unknown, to which those by the unknown are added.
-        unknown : int
+        unknown_index : int
             The number of the unknown.
-        above, below : LawArguments
+        arguments_above, arguments_below : LawArguments
             The arguments with the unknown `HALF_DIFFERENCE` above and below its value.
         """
-        forces_above = self._checked_forces(above)
-        forces_below = self._checked_forces(below)
+        forces_above = self._checked_forces(arguments_above)
+        forces_below = self._checked_forces(arguments_below)
         for port, derivatives_at_port in derivatives.items():
             if port in forces_above and port in forces_below:
                 rise = forces_above[port].force - forces_below[port].force
                 if np.any(rise):
-                    derivatives_at_port[unknown] = rise / (2.0 * HALF_DIFFERENCE)
+                    derivatives_at_port[unknown_index] = rise / (2.0 * HALF_DIFFERENCE)
 
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
@@ -194,9 +202,11 @@ class EffectLaws:
             if not has_law:
                 change = change + change_by_effect(term, values)
                 for k in range(len(values)):
-                    above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
-                    below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
-                    derivatives[first_unknown + k] = (above - below) / (2.0 * HALF_DIFFERENCE)
+                    change_above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
+                    change_below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
+                    derivatives[first_unknown + k] = (change_above - change_below) / (
+                        2.0 * HALF_DIFFERENCE
+                    )
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
 
@@ -212,7 +222,7 @@ class EffectLaws:
         motion : TrialMotion
             The motion that the sensors measure.
         term : EffectTerm
-            The effect.
+            The effect at its place.
         values : array
             The values of its unknowns.
         """

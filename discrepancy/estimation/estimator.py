@@ -76,7 +76,7 @@ class MotionEstimator(GaussNewton):
     def follow_to_small_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
     ) -> MotionEstimate | None:
-        """Return an estimate that is followed from large missing forces to small ones.
+        """Follow an estimate from large missing forces to small missing forces, and return it.
 
         The windows of speeds are narrowed first, then the missing forces are lowered.
 
@@ -92,14 +92,14 @@ class MotionEstimator(GaussNewton):
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        current = start
+        current_start = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            smoothed = self.iterate(laws, current, speed_window, MOST_PASSING_ITERATIONS)
-            if smoothed is None:
+            estimate = self.iterate(laws, current_start, speed_window, MOST_PASSING_ITERATIONS)
+            if estimate is None:
                 return None
-            current = start_from_estimate(smoothed)
-        return self._lower_missing_forces(laws, current, SPEED_WINDOWS[-1])
+            current_start = start_from_estimate(estimate)
+        return self._lower_missing_forces(laws, current_start, SPEED_WINDOWS[-1])
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
@@ -167,10 +167,15 @@ class MotionEstimator(GaussNewton):
             The estimate with a wider window.
         """
         for speed_window in NARROWEST_WINDOWS:
-            narrower = self._lower_missing_forces(laws, start_from_estimate(estimate), speed_window)
-            if narrower is None or narrower.log_evidence < estimate.log_evidence + LEAST_RISE:
+            narrower_estimate = self._lower_missing_forces(
+                laws, start_from_estimate(estimate), speed_window
+            )
+            if (
+                narrower_estimate is None
+                or narrower_estimate.log_evidence < estimate.log_evidence + LEAST_RISE
+            ):
                 break
-            estimate = narrower
+            estimate = narrower_estimate
         return estimate
 
     def _lower_missing_forces(
@@ -246,48 +251,48 @@ class MotionEstimator(GaussNewton):
             The largest number of linearisations of the last estimate.
         """
         start = start_from_estimate(estimate)
-        linear = self.linearise(laws, start, estimate.speed_window)
-        if linear is None:
+        linearisation = self.linearise(laws, start, estimate.speed_window)
+        if linearisation is None:
             return estimate
         processes = dict(start.processes)
-        first_evidence = self.evidence_with_processes(linear, processes)
+        first_evidence = self.evidence_with_processes(linearisation, processes)
         largest_evidence = first_evidence
         for factor in factors:
             for _ in range(repetitions):
                 last_evidence = largest_evidence
                 processes, largest_evidence = self._try_factor(
-                    linear, processes, largest_evidence, factor
+                    linearisation, processes, largest_evidence, factor
                 )
                 if largest_evidence < last_evidence + LEAST_RISE:
                     break
         if largest_evidence < first_evidence + LEAST_RISE:
             return estimate
-        tuned = self.iterate(
+        tuned_estimate = self.iterate(
             laws, replace(start, processes=processes), estimate.speed_window, most_iterations
         )
-        if tuned is None or tuned.log_evidence <= estimate.log_evidence:
+        if tuned_estimate is None or tuned_estimate.log_evidence <= estimate.log_evidence:
             return estimate
-        return tuned
+        return tuned_estimate
 
     def _try_factor(
         self,
-        linear: Linearisation,
+        linearisation: Linearisation,
         processes: dict[int, Process],
         largest_evidence: float,
         factor: float,
     ) -> tuple[dict[int, Process], float]:
-        """Return missing forces, each size and time changed by a factor if that is more probable.
+        """Multiply each size and time of missing forces by a factor if that is more probable.
 
         Parameters
         ----------
-        linear : Linearisation
-            The trials.
+        linearisation : Linearisation
+            All trials, linear about the present estimate.
         processes : dict of int to Process
             The missing forces, by the number of the port.
         largest_evidence : float
             Their log evidence [nat].
         factor : float
-            The factor by which, or by whose inverse, each size and time is multiplied.
+            The factor; each size and time is multiplied by the factor, or else by its inverse.
 
         Returns
         -------
@@ -303,7 +308,7 @@ class MotionEstimator(GaussNewton):
                 changed_processes = processes | {
                     port: replace(processes[port], **{quantity: value})
                 }
-                evidence = self.evidence_with_processes(linear, changed_processes)
+                evidence = self.evidence_with_processes(linearisation, changed_processes)
                 if evidence > largest_evidence:
                     processes, largest_evidence = changed_processes, evidence
                     break

@@ -48,7 +48,7 @@ class HypothesisLaws(Protocol):
 
     @property
     def effect_unknown_count(self) -> int:
-        """The number E of unknowns of its effects, each with a standard normal prior."""
+        """The number E of effect parameters, which all have a standard normal prior."""
 
     def linearise_along_trajectory(
         self, arguments: LawArguments
@@ -126,7 +126,7 @@ class Linearisation:
     Attributes
     ----------
     trials : tuple of LinearisedTrial
-        The trials.
+        The trials, each linear about the same estimate.
     prior_precision : (K + E,) ndarray
         The prior precisions of the shared unknowns, and of those of the effects.
     """
@@ -141,7 +141,7 @@ class Linearisation:
         -------
         solution : Solution
             The K unknowns that all trials share, then the E unknowns of the effects.
-        local : list of (L,) array
+        local_of_trials : list of (L,) array
             The local unknowns of each trial: those that occur in this trial only.
         """
         # normal equations of the shared and effect unknowns, summed over the trials
@@ -157,11 +157,11 @@ class Linearisation:
         regression = Regression(sum_of_products, half_log_determinant)
         all_unknowns = range(len(self.prior_precision))
         solution = regression.solve(all_unknowns, self.prior_precision)
-        local = [
+        local_of_trials = [
             self._most_probable_local_unknowns(linear_trial, solution.mean)
             for linear_trial in self.trials
         ]
-        return solution, local
+        return solution, local_of_trials
 
     def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
         """Return the same linear trials with other missing forces."""
@@ -179,19 +179,19 @@ class Linearisation:
         Parameters
         ----------
         linear_trial : LinearisedTrial
-            The trial.
+            The trial, linear about an estimate of its motion.
         shared_and_effect : (K + E,) array
             The values of the K unknowns that all trials share, then of the E unknowns of effects.
         """
         # Inner products of the whitened residual (index 0) and its derivatives by the shared and
         # effect unknowns, then by the local unknowns.
         products, _ = linear_trial.whitened_products
-        local = slice(1 + len(shared_and_effect), None)
+        local_slice = slice(1 + len(shared_and_effect), None)
         fixed = slice(1, 1 + len(shared_and_effect))
         # normal equations of the local unknowns, with the fixed unknowns on the right side
         prior_precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
-        normal_matrix = products[local, local] + np.diag(prior_precision)
-        right_side = products[local, 0] - products[local, fixed] @ shared_and_effect
+        normal_matrix = products[local_slice, local_slice] + np.diag(prior_precision)
+        right_side = products[local_slice, 0] - products[local_slice, fixed] @ shared_and_effect
         return np.linalg.solve(normal_matrix, right_side)
 
 
@@ -227,7 +227,7 @@ def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
     return EstimatorStart(
         estimate.effect,
         estimate.shared,
-        tuple(smoothed.trajectory for smoothed in estimate.trials),
+        tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials),
         estimate.processes,
     )
 
@@ -239,7 +239,7 @@ class GaussNewton:
     Attributes
     ----------
     trials : tuple of PortedTrial
-        The dynamic trials.
+        The dynamic trials as linear systems with ports.
     shared_precision : (K,) ndarray
         The prior precisions of the shared unknowns.
     prior_medians : mapping of int to Process
@@ -277,17 +277,17 @@ class GaussNewton:
             The last estimate; None if the laws are not possible along the first trajectories, or if
             the first evidence is not finite.
         """
-        current = start
+        current_start = start
         last_evidence = -inf
         estimate: MotionEstimate | None = None
         stagnant_iterations = 0
         largest_evidence = -inf
         for _ in range(most_iterations):
-            linear = self.linearise(laws, current, speed_window)
-            if linear is None:
+            linearisation = self.linearise(laws, current_start, speed_window)
+            if linearisation is None:
                 return estimate
             new_estimate = self._estimate_of_linearisation(
-                linear, current, last_evidence, speed_window
+                linearisation, current_start, last_evidence, speed_window
             )
             if new_estimate is None:
                 return estimate
@@ -300,15 +300,15 @@ class GaussNewton:
             if estimate.converged or stagnant_iterations == MOST_STAGNANT_ITERATIONS:
                 return estimate
             last_evidence = estimate.log_evidence
-            next_start = self._take_step(laws, current, estimate, linear, speed_window)
+            next_start = self._take_step(laws, current_start, estimate, linearisation, speed_window)
             if next_start is None:
                 return estimate
-            current = next_start
+            current_start = next_start
         return estimate
 
     def _estimate_of_linearisation(
         self,
-        linear: Linearisation,
+        linearisation: Linearisation,
         start: EstimatorStart,
         last_evidence: float,
         speed_window: float,
@@ -317,7 +317,7 @@ class GaussNewton:
 
         Parameters
         ----------
-        linear : Linearisation
+        linearisation : Linearisation
             The trials, linear about the start.
         start : EstimatorStart
             The values and trajectories about which they are linear.
@@ -332,13 +332,13 @@ class GaussNewton:
         MotionEstimate or None
             The estimate; None if its evidence is not finite.
         """
-        solution, local = linear.solve()
+        solution, local_of_trials = linearisation.solve()
         if not np.isfinite(solution.log_evidence):
             return None
         unknowns = solution.mean
-        smoothed = tuple(
+        smoothed_trials = tuple(
             trial.smooth(np.concatenate((unknowns, local_unknowns)))
-            for trial, local_unknowns in zip(linear.trials, local, strict=True)
+            for trial, local_unknowns in zip(linearisation.trials, local_of_trials, strict=True)
         )
         evidence = solution.log_evidence + self._log_prior(start.processes)
         # the change of each unknown in posterior standard deviations
@@ -350,28 +350,28 @@ class GaussNewton:
         return MotionEstimate(
             effect=unknowns[shared_count:],
             shared=unknowns[:shared_count],
-            local=tuple(local),
+            local=tuple(local_of_trials),
             covariance=solution.covariance,
             processes=start.processes,
             log_evidence=evidence,
-            trials=smoothed,
+            trials=smoothed_trials,
             converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
             speed_window=speed_window,
         )
 
     def evidence_with_processes(
-        self, linear: Linearisation, processes: Mapping[int, Process]
+        self, linearisation: Linearisation, processes: Mapping[int, Process]
     ) -> float:
         """Return log evidence plus log prior of missing forces, with the linearisation kept [nat].
 
         Parameters
         ----------
-        linear : Linearisation
-            The trials.
+        linearisation : Linearisation
+            All trials, linear about the present estimate.
         processes : mapping of int to Process
             The missing forces, by the number of the port.
         """
-        solution, _ = linear.with_processes(processes).solve()
+        solution, _ = linearisation.with_processes(processes).solve()
         return solution.log_evidence + self._log_prior(processes)
 
     def linearise(
@@ -420,9 +420,9 @@ class GaussNewton:
     def _take_step(
         self,
         laws: HypothesisLaws,
-        current: EstimatorStart,
+        current_start: EstimatorStart,
         estimate: MotionEstimate,
-        linear: Linearisation,
+        linearisation: Linearisation,
         speed_window: float,
     ) -> EstimatorStart | None:
         """Return the start of the next iteration, after the longest admissible fraction of a step.
@@ -436,12 +436,12 @@ class GaussNewton:
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
-        current : EstimatorStart
+        current_start : EstimatorStart
             The values and trajectories before the step.
         estimate : MotionEstimate
             The values and trajectories at the end of the whole step.
-        linear : Linearisation
-            The trials, linear about `current`.
+        linearisation : Linearisation
+            The trials, linear about `current_start`.
         speed_window : float
             The half width of the window of speeds over which laws of the speed are averaged,
             divided by the rms speed.
@@ -452,27 +452,32 @@ class GaussNewton:
             The next start; None if the laws are not possible after any of the fractions.
         """
         # no unknown of an effect moves by more than `LONGEST_STEP`
-        change = estimate.effect - current.effect
+        change = estimate.effect - current_start.effect
         longest_change = float(np.max(np.abs(change), initial=0.0))
         largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
         next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
             fraction_taken = min(fraction, largest_fraction)
             trajectories = tuple(
-                trajectory.interpolate(smoothed.trajectory, fraction_taken)
-                for trajectory, smoothed in zip(current.trajectories, estimate.trials, strict=True)
+                trajectory.interpolate(smoothed_trial.trajectory, fraction_taken)
+                for trajectory, smoothed_trial in zip(
+                    current_start.trajectories, estimate.trials, strict=True
+                )
             )
-            stepped = EstimatorStart(
-                effect=current.effect + fraction_taken * change,
-                shared=current.shared + fraction_taken * (estimate.shared - current.shared),
+            stepped_start = EstimatorStart(
+                effect=current_start.effect + fraction_taken * change,
+                shared=current_start.shared
+                + fraction_taken * (estimate.shared - current_start.shared),
                 trajectories=trajectories,
-                processes=current.processes,
+                processes=current_start.processes,
             )
             # admissible if the error is at most one; None if the laws are not possible there
-            error = self._linearisation_error(laws, current, stepped, linear, speed_window)
+            error = self._linearisation_error(
+                laws, current_start, stepped_start, linearisation, speed_window
+            )
             if error is None:
                 continue
-            next_start = stepped
+            next_start = stepped_start
             if error <= 1.0:
                 break
         return next_start
@@ -480,9 +485,9 @@ class GaussNewton:
     def _linearisation_error(
         self,
         laws: HypothesisLaws,
-        current: EstimatorStart,
-        stepped: EstimatorStart,
-        linear: Linearisation,
+        current_start: EstimatorStart,
+        stepped_start: EstimatorStart,
+        linearisation: Linearisation,
         speed_window: float,
     ) -> float | None:
         """Return the rms error of the linear laws after a step, over the missing force's deviation.
@@ -491,10 +496,10 @@ class GaussNewton:
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
-        current, stepped : EstimatorStart
+        current_start, stepped_start : EstimatorStart
             The values and trajectories before and after a step.
-        linear : Linearisation
-            The trials, linear about `current`.
+        linearisation : Linearisation
+            The trials, linear about `current_start`.
         speed_window : float
             The half width of the window of speeds over which laws of the speed are averaged,
             divided by the rms speed.
@@ -506,16 +511,19 @@ class GaussNewton:
             step.
         """
         unknowns_change = np.concatenate(
-            (stepped.shared - current.shared, stepped.effect - current.effect)
+            (
+                stepped_start.shared - current_start.shared,
+                stepped_start.effect - current_start.effect,
+            )
         )
         largest_deviation = max(
-            process.standard_deviation for process in stepped.processes.values()
+            process.standard_deviation for process in stepped_start.processes.values()
         )
         largest_ratio = 0.0
-        for trial_index, trial in enumerate(linear.trials):
-            trajectory = stepped.trajectories[trial_index]
+        for trial_index, trial in enumerate(linearisation.trials):
+            trajectory = stepped_start.trajectories[trial_index]
             true_forces = laws.forces_along_trajectory(
-                stepped.law_arguments(trial_index, speed_window)
+                stepped_start.law_arguments(trial_index, speed_window)
             )
             if true_forces is None:
                 return None

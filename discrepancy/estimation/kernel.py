@@ -20,16 +20,16 @@ from fe.compilation import callable_when_compiled, compiled
 
 
 @callable_when_compiled
-def multiply(left: FloatArray, right: FloatArray, product: FloatArray) -> None:
+def multiply(left_matrix: FloatArray, right_matrix: FloatArray, product: FloatArray) -> None:
     """Fill `product` with the product of two small matrices.
 
     For these, a loop is several times faster than a call of BLAS.
     """
-    for i in range(left.shape[0]):
-        for k in range(right.shape[1]):
+    for i in range(left_matrix.shape[0]):
+        for k in range(right_matrix.shape[1]):
             element = 0.0
-            for j in range(left.shape[1]):
-                element += left[i, j] * right[j, k]
+            for j in range(left_matrix.shape[1]):
+                element += left_matrix[i, j] * right_matrix[j, k]
             product[i, k] = element
 
 
@@ -236,7 +236,7 @@ def filter_record(
     drifts: FloatArray,
     output_rows: FloatArray,
     columns: FloatArray,
-    used: BoolArray,
+    is_used: BoolArray,
     covariance: FloatArray,
     mean: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -251,8 +251,8 @@ def filter_record(
     output_rows, columns : (N, C, n), (N, C, W) ndarray
         The readings for a unit of each state, and the residuals for a unit of each weight, divided
         by the deviation of the noise.
-    used : (N, C) ndarray of bool
-        Whether each reading counts.
+    is_used : (N, C) ndarray of bool
+        Whether each reading is compared with the model.
     covariance, mean : (n, n), (n, W) ndarray
         The state before the first reading.
 
@@ -282,7 +282,7 @@ def filter_record(
         if j % substeps == 0:
             k = j // substeps
             for c in range(channel_count):
-                if used[k, c]:
+                if is_used[k, c]:
                     for w in range(weight_count):
                         innovations[k, c, w] = columns[k, c, w]
                         for i in range(state_count):
@@ -306,7 +306,7 @@ def smooth_record(
     substeps: int,
     transitions: FloatArray,
     output_rows: FloatArray,
-    used: BoolArray,
+    is_used: BoolArray,
     states: FloatArray,
     covariances: FloatArray,
     innovations: FloatArray,
@@ -331,12 +331,12 @@ def smooth_record(
 
     Returns
     -------
-    smoothed, variance : (F, n), (F, n) ndarray
+    smoothed_states, variance : (F, n), (F, n) ndarray
         The state given all readings, and the variance of each of its entries.
     """
     stamp_count, state_count = states.shape
     channel_count = output_rows.shape[1]
-    smoothed = np.empty((stamp_count, state_count))
+    smoothed_states = np.empty((stamp_count, state_count))
     variance = np.empty((stamp_count, state_count))
     adjoint = np.zeros(state_count)
     information = np.zeros((state_count, state_count))
@@ -353,7 +353,7 @@ def smooth_record(
         if j % substeps == 0:
             k = j // substeps
             for c in range(channel_count - 1, -1, -1):
-                if not used[k, c]:
+                if not is_used[k, c]:
                     continue
                 row, gain = output_rows[k, c], gains[k, c]
                 row_information, later_correction = 1.0 / variances[k, c], 0.0
@@ -376,9 +376,9 @@ def smooth_record(
         multiply(covariances[j], information, work)
         for i in range(state_count):
             reduction = 0.0
-            smoothed[j, i] = states[j, i]
+            smoothed_states[j, i] = states[j, i]
             for m in range(state_count):
-                smoothed[j, i] += covariances[j, i, m] * adjoint[m]
+                smoothed_states[j, i] += covariances[j, i, m] * adjoint[m]
                 reduction += work[i, m] * covariances[j, m, i]
             variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)
-    return smoothed, variance
+    return smoothed_states, variance

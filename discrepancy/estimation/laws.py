@@ -12,6 +12,7 @@ from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.laws.speed import POSITION_EXPONENT, steady_force
+from reporting.arrays import LEAST_DIVISOR
 
 WINDOW_NODES = 8
 """Number of speeds in the window over which a law of the speed is averaged."""
@@ -38,12 +39,12 @@ class LawForce:
     by_position: FloatArray
     by_speed: FloatArray
 
-    def plus(self, other: "LawForce") -> "LawForce":
+    def plus(self, other_force: "LawForce") -> "LawForce":
         """Return the sum with the force of other laws at the same port."""
         return LawForce(
-            self.force + other.force,
-            self.by_position + other.by_position,
-            self.by_speed + other.by_speed,
+            self.force + other_force.force,
+            self.by_position + other_force.by_position,
+            self.by_speed + other_force.by_speed,
         )
 
 
@@ -137,8 +138,8 @@ def force_and_tangents(
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     force, by_position, by_speed = np.zeros((3, len(time)))
-    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
-    rms_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
+    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), LEAST_DIVISOR)
+    rms_position = max(float(np.sqrt(np.mean(positions**2))), LEAST_DIVISOR)
     _compiled_fill()(
         LAWS.index(type(law)),
         type(law).depends_on_speed,

@@ -71,7 +71,7 @@ class LinearisedTrial:
 
     @property
     def structure(self) -> slice:
-        """The states of the structure; those of missing forces and coloured noises follow them."""
+        """The indices of the structure's states, which come before missing forces and noises."""
         return slice(0, len(self.trial.system.generator))
 
     @property
@@ -79,17 +79,17 @@ class LinearisedTrial:
         """The number W of weights: the first is one, the others are the unknowns."""
         return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
 
-    def weight_index(self, unknown: int) -> int:
-        """Return the index of the weight of a shared unknown, or of one of the trial alone.
+    def weight_index(self, unknown_index: int) -> int:
+        """Return where an unknown that is no effect parameter stands among the weights.
 
         Parameters
         ----------
-        unknown : int
+        unknown_index : int
             The number of the unknown in `PortedTrial.linearisation_point`, where those of the trial
             alone follow the shared ones. In the weights, those of effects stand between both.
         """
         shared_count = len(self.shared)
-        return 1 + unknown + (len(self.effect) if unknown >= shared_count else 0)
+        return 1 + unknown_index + (len(self.effect) if unknown_index >= shared_count else 0)
 
     @cached_property
     def law_ports(self) -> tuple[int, ...]:
@@ -137,11 +137,11 @@ class LinearisedTrial:
             speed_offset = trial.port_speeds[:, port] - trajectory.speeds[:, port]
             # unknowns that change the motion of the ports: their part of the motion is removed from
             # the offsets, which are then at zero unknowns
-            for unknown, (positions, speeds) in trial.port_motion_derivatives.items():
-                present_value = trial.linearisation_point[unknown]
+            for unknown_index, (positions, speeds) in trial.port_motion_derivatives.items():
+                present_value = trial.linearisation_point[unknown_index]
                 position_offset = position_offset - present_value * positions[:, port]
                 speed_offset = speed_offset - present_value * speeds[:, port]
-                force_coefficients[:, row, self.weight_index(unknown)] += (
+                force_coefficients[:, row, self.weight_index(unknown_index)] += (
                     law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
             # the first weight: the force at zero unknowns
@@ -149,14 +149,14 @@ class LinearisedTrial:
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
             # unknowns that change the laws; `law.force` is the force at u0
-            for unknown, derivative in self.forces[port].by_unknown.items():
-                force_coefficients[:, row, 1 + unknown] += derivative
-                force_coefficients[:, row, 0] -= self._value_of_unknown(unknown) * derivative
+            for unknown_index, derivative in self.forces[port].by_unknown.items():
+                force_coefficients[:, row, 1 + unknown_index] += derivative
+                force_coefficients[:, row, 0] -= self._value_of_unknown(unknown_index) * derivative
         return force_coefficients
 
-    def _value_of_unknown(self, unknown: int) -> float:
+    def _value_of_unknown(self, unknown_index: int) -> float:
         """Return the value of an unknown, shared or of an effect, about which laws are linear."""
-        return float(np.concatenate((self.shared, self.effect))[unknown])
+        return float(np.concatenate((self.shared, self.effect))[unknown_index])
 
     @cached_property
     def state_rate_by_force(self) -> FloatArray:
@@ -229,7 +229,7 @@ class LinearisedTrial:
         by_input_at_begin = by_input_at_begin[:, :, structure]
         by_input_at_end = by_input_at_end[:, :, structure]
         interval_of_substep = interval_of_sample[np.arange(step_count) // trial.substeps + 1]
-        for unknown, derivative in enumerate(trial.system_derivatives):
+        for unknown_index, derivative in enumerate(trial.system_derivatives):
             if derivative is None:
                 continue
             # derivative of A s - sum_p b_p force_p by the parameter, along the trajectory
@@ -244,8 +244,8 @@ class LinearisedTrial:
                 by_input_at_end, interval_of_substep, rate_change[1:]
             )
             # linear about u0 = `linearisation_point`: the change is proportional to u - u0
-            drift[:, :, 1 + unknown] += state_change
-            drift[:, :, 0] -= trial.linearisation_point[unknown] * state_change
+            drift[:, :, 1 + unknown_index] += state_change
+            drift[:, :, 0] -= trial.linearisation_point[unknown_index] * state_change
         return drift
 
     def _initial_state(self) -> tuple[FloatArray, FloatArray]:
@@ -313,18 +313,18 @@ class LinearisedTrial:
         # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
         # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
         coefficients[:, :, 0] = trial.residual - self.sensor_errors.change
-        for unknown, derivative in self.sensor_errors.by_unknown.items():
-            coefficients[:, :, 1 + unknown] -= derivative
-            coefficients[:, :, 0] += self._value_of_unknown(unknown) * derivative
+        for unknown_index, derivative in self.sensor_errors.by_unknown.items():
+            coefficients[:, :, 1 + unknown_index] -= derivative
+            coefficients[:, :, 0] += self._value_of_unknown(unknown_index) * derivative
         # The response of the model needs no constant, as `trial.residual` is at zero unknowns. The
         # unknowns of this trial follow the shared ones here; in u those of effects are between.
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
-        for unknown, derivative in enumerate(derivatives):
-            coefficients[:, :, self.weight_index(unknown)] -= derivative
+        for unknown_index, derivative in enumerate(derivatives):
+            coefficients[:, :, self.weight_index(unknown_index)] -= derivative
         # parameters and gains change the readings of a fixed state by d (u - u0)
-        for unknown, derivative in self._readings_by_shared_unknowns().items():
-            coefficients[:, :, 1 + unknown] -= derivative
-            coefficients[:, :, 0] += trial.linearisation_point[unknown] * derivative
+        for unknown_index, derivative in self._readings_by_shared_unknowns().items():
+            coefficients[:, :, 1 + unknown_index] -= derivative
+            coefficients[:, :, 0] += trial.linearisation_point[unknown_index] * derivative
         coefficients *= noise_scale[:, None]
         # A force at a port changes some readings at once, such as accelerations: by -e per unit of
         # force, with e in `direct_reading`. The force of the hypothesis' laws at the port is
@@ -350,15 +350,17 @@ class LinearisedTrial:
         trajectory = self.trajectory
         derivatives: dict[int, FloatArray] = {}
         # parameters change the matrices of the output equation
-        for unknown, derivative in enumerate(trial.system_derivatives):
+        for unknown_index, derivative in enumerate(trial.system_derivatives):
             if derivative is not None:
-                derivatives[unknown] = trial.divide_by_noise(
+                derivatives[unknown_index] = trial.divide_by_noise(
                     trial.outputs_of_state(derivative, trajectory.added_state, trajectory.forces)
                 )
         # a gain multiplies the readings of its channel
         added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
-        for unknown, channel, scale in trial.gain_unknowns:
-            derivatives[unknown] = added_readings * scale * np.eye(added_readings.shape[1])[channel]
+        for unknown_index, channel, scale in trial.gain_unknowns:
+            derivatives[unknown_index] = (
+                added_readings * scale * np.eye(added_readings.shape[1])[channel]
+            )
         return derivatives
 
     # ------------------------------------------------------------ filter and smoother
@@ -398,15 +400,15 @@ class LinearisedTrial:
         the covariance of the readings: the product of their variances, each given those before it.
         """
         record = self.filtered_record
-        whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
-        whitened = whitened.reshape(-1, self.weight_count)
+        whitened_columns = record.innovations / np.sqrt(record.variances)[:, :, None]
+        whitened_columns = whitened_columns.reshape(-1, self.weight_count)
         # the columns of `_observations` are minus the derivatives of the readings: change the sign
-        whitened[:, 1:] *= -1.0
-        used = self.trial.used
-        half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[used]))
+        whitened_columns[:, 1:] *= -1.0
+        is_used = self.trial.used
+        half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[is_used]))
         # readings were multiplied by `white_noise_scale`, and their deviations with them
-        half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * used))
-        return whitened.T @ whitened, half_log_determinant
+        half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * is_used))
+        return whitened_columns.T @ whitened_columns, half_log_determinant
 
     def smooth(self, unknowns: FloatArray) -> "SmoothedTrial":
         """Return the smoothed trajectory and forces of the trial, given all readings.
@@ -448,9 +450,11 @@ class LinearisedTrial:
             law_forces[port] = self.force_by_weight[:, row] @ weights + force_by_states
             forces[port] = forces.get(port, 0.0) + law_forces[port]
         # motion of the ports
-        shared = unknowns[: len(self.shared)]
-        local = unknowns[len(self.shared) + len(self.effect) :]
-        positions, speeds = trial.port_motion(np.concatenate((shared, local)), added_state)
+        shared_values = unknowns[: len(self.shared)]
+        local_values = unknowns[len(self.shared) + len(self.effect) :]
+        positions, speeds = trial.port_motion(
+            np.concatenate((shared_values, local_values)), added_state
+        )
         trajectory = Trajectory(added_state, positions, speeds, forces)
         return SmoothedTrial(
             trajectory=trajectory,

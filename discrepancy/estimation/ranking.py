@@ -46,7 +46,7 @@ def rank_by_missing_force(
 ) -> list[ForceHypothesis]:
     """Return hypotheses on the missing force, the most probable first.
 
-    The best ones are estimated together with the motion. Of long records, only the leading
+    The best hypotheses are estimated together with the motion. Of long records, only the leading
     hypotheses and the one without effects are returned.
 
     Parameters
@@ -54,20 +54,20 @@ def rank_by_missing_force(
     search : ForceSearch
         The search for the missing force in all samples.
     effects : sequence of Effect
-        The effects.
+        The effects that may be missing in the model.
     on_progress : callable
         The function that receives a line for the progress display, such as the comparison that
         runs.
     """
     thinned_search = search_in_thinned_records(search)
     if thinned_search is None:
-        ranked = search.rank_hypotheses(effects, on_progress)
-        return refine_hypotheses(search, ranked, len(effects), on_progress)
-    ranked = _rank_in_thinned_records(thinned_search, effects, on_progress)
+        ranked_hypotheses = search.rank_hypotheses(effects, on_progress)
+        return refine_hypotheses(search, ranked_hypotheses, len(effects), on_progress)
+    ranked_hypotheses = _rank_in_thinned_records(thinned_search, effects, on_progress)
     hypotheses = [search.hypothesis_of_all_ports]
-    for leading in _leading_hypotheses(thinned_search, ranked, len(effects)):
-        on_progress(f"estimating {leading.candidate.description} in all samples")
-        hypothesis = estimate_in_all_samples(search, leading)
+    for leading_hypothesis in _leading_hypotheses(thinned_search, ranked_hypotheses, len(effects)):
+        on_progress(f"estimating {leading_hypothesis.candidate.description} in all samples")
+        hypothesis = estimate_in_all_samples(search, leading_hypothesis)
         if hypothesis is not None:
             hypotheses.append(hypothesis)
     return sorted(hypotheses, key=lambda hypothesis: -search.score(hypothesis, len(effects)))
@@ -105,7 +105,7 @@ def _rank_in_thinned_records(
     search : ForceSearch
         The search in thinned records.
     effects : sequence of Effect
-        The effects.
+        The effects that may be missing in the model.
     on_progress : callable
         The function that receives a line for the progress display, such as the comparison that
         runs.
@@ -114,28 +114,32 @@ def _rank_in_thinned_records(
     def score(hypothesis: ForceHypothesis) -> float:
         return search.score(hypothesis, len(effects))
 
-    singles = search.rank_hypotheses(effects, on_progress, largest_set=1)
-    hypotheses = refine_hypotheses(search, singles, len(effects), on_progress)
-    best = hypotheses[0]
+    single_effects = search.rank_hypotheses(effects, on_progress, largest_set=1)
+    hypotheses = refine_hypotheses(search, single_effects, len(effects), on_progress)
+    best_hypothesis = hypotheses[0]
     for followed_count in FOLLOWED_COUNTS[1:]:
-        if not best.candidate.terms:
+        if not best_hypothesis.candidate.terms:
             break
-        extended = search.extend_hypothesis(best, effects, followed_count, on_progress)
-        refined = []
-        for hypothesis in extended[:MOST_REFINED_SETS]:
+        extended_hypotheses = search.extend_hypothesis(
+            best_hypothesis, effects, followed_count, on_progress
+        )
+        refined_hypotheses = []
+        for hypothesis in extended_hypotheses[:MOST_REFINED_SETS]:
             on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-            estimated = estimate_extended_hypothesis(search, hypothesis, best)
-            refined.append(hypothesis if estimated is None else estimated)
-        hypotheses += refined
-        best_of_sets = max(refined, key=score, default=best)
-        if score(best_of_sets) <= score(best):
+            estimated_hypothesis = estimate_extended_hypothesis(search, hypothesis, best_hypothesis)
+            refined_hypotheses.append(
+                hypothesis if estimated_hypothesis is None else estimated_hypothesis
+            )
+        hypotheses += refined_hypotheses
+        best_of_sets = max(refined_hypotheses, key=score, default=best_hypothesis)
+        if score(best_of_sets) <= score(best_hypothesis):
             break
-        best = best_of_sets
+        best_hypothesis = best_of_sets
     return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
 def _leading_hypotheses(
-    search: ForceSearch, ranked: Sequence[ForceHypothesis], effect_count: int
+    search: ForceSearch, ranked_hypotheses: Sequence[ForceHypothesis], effect_count: int
 ) -> list[ForceHypothesis]:
     """Return the hypotheses with effects that are estimated in all samples, the best first.
 
@@ -146,26 +150,30 @@ def _leading_hypotheses(
     ----------
     search : ForceSearch
         The search in thinned records.
-    ranked : sequence of ForceHypothesis
+    ranked_hypotheses : sequence of ForceHypothesis
         Its hypotheses, the most probable first.
     effect_count : int
         The number of effects that were compared.
     """
-    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    with_effects = [hypothesis for hypothesis in ranked_hypotheses if hypothesis.candidate.terms]
     if not with_effects:
         return []
-    best = with_effects[0]
-    least_score = search.score(best, effect_count) - LEADING_RANGE
-    leading = [
+    best_hypothesis = with_effects[0]
+    least_score = search.score(best_hypothesis, effect_count) - LEADING_RANGE
+    leading_hypotheses = [
         hypothesis
         for hypothesis in with_effects[:MOST_LEADING]
         if search.score(hypothesis, effect_count) > least_score
     ]
     for hypothesis in with_effects:
-        has_same_effects = hypothesis.candidate.identifiers == best.candidate.identifiers
-        if has_same_effects and hypothesis not in leading and len(leading) < MOST_LEADING:
-            leading.append(hypothesis)
-    return leading
+        has_same_effects = hypothesis.candidate.identifiers == best_hypothesis.candidate.identifiers
+        if (
+            has_same_effects
+            and hypothesis not in leading_hypotheses
+            and len(leading_hypotheses) < MOST_LEADING
+        ):
+            leading_hypotheses.append(hypothesis)
+    return leading_hypotheses
 
 
 def estimate_in_all_samples(
@@ -187,9 +195,11 @@ def estimate_in_all_samples(
     """
     thinned_trials = hypothesis.linear_trials.trials
     shared_count = search.problem.shared.unknown_count
-    shared = thinned_trials[0].linearisation_point[:shared_count]
-    local = [trial.linearisation_point[shared_count:] for trial in thinned_trials]
-    trials = search.column_builder.trials_about(search.point_of_unknowns(shared, local))
+    shared_values = thinned_trials[0].linearisation_point[:shared_count]
+    local_of_trials = [trial.linearisation_point[shared_count:] for trial in thinned_trials]
+    trials = search.column_builder.trials_about(
+        search.point_of_unknowns(shared_values, local_of_trials)
+    )
     laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
     trajectories = []
     for thinned_trial, trial, motion, own_unknowns in zip(

@@ -39,11 +39,11 @@ linearised again."""
 
 def refine_hypotheses(
     search: ForceSearch,
-    ranked: Sequence[ForceHypothesis],
+    ranked_hypotheses: Sequence[ForceHypothesis],
     effect_count: int,
     on_progress: Callable[[str], None] = lambda message: None,
 ) -> list[ForceHypothesis]:
-    """Return hypotheses, the most probable first, the best ones estimated with the motion.
+    """Estimate the best hypotheses together with the motion, and sort all by their probability.
 
     The search evaluates a law along a motion that is taken as known. That gives wrong values for a
     law that changes much within a time step, such as dry friction at a reversal of the motion; a
@@ -54,10 +54,11 @@ def refine_hypotheses(
     ----------
     search : ForceSearch
         The search for the missing force.
-    ranked : sequence of ForceHypothesis
-        The hypotheses, the most probable first.
+    ranked_hypotheses : sequence of ForceHypothesis
+        The hypotheses as the search has fitted them, the most probable first.
     effect_count : int
-        The number of effects that were compared, by which the prior of each is smaller.
+        The number of effects that were compared. The prior probability of a set of effects is
+        smaller if there are more of them.
     on_progress : callable
         The function that receives a line for the progress display: the estimate that runs.
     """
@@ -65,21 +66,20 @@ def refine_hypotheses(
     def score(hypothesis: ForceHypothesis) -> float:
         return search.score(hypothesis, effect_count)
 
-    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    with_effects = [hypothesis for hypothesis in ranked_hypotheses if hypothesis.candidate.terms]
     nearly_best = []
     for hypothesis in with_effects:
         if score(hypothesis) > score(with_effects[0]) - REFINED_WITHIN:
             nearly_best.append(hypothesis)
-    hypotheses = list(ranked)
+    hypotheses = list(ranked_hypotheses)
     for hypothesis in nearly_best[:MOST_REFINED]:
         on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-        refined_hypothesis = estimate_hypothesis(search, hypothesis)
-        if refined_hypothesis is None:
+        estimated_hypothesis = estimate_hypothesis(search, hypothesis)
+        if estimated_hypothesis is None:
             continue
-        if refined_hypothesis.log_evidence > hypothesis.log_evidence:
-            hypotheses = [
-                refined_hypothesis if other is hypothesis else other for other in hypotheses
-            ]
+        if estimated_hypothesis.log_evidence > hypothesis.log_evidence:
+            position = next(index for index, entry in enumerate(hypotheses) if entry is hypothesis)
+            hypotheses[position] = estimated_hypothesis
     return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
@@ -98,11 +98,11 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     ForceHypothesis or None
         The hypothesis; None if its laws are not possible along the motion.
     """
-    first = _estimate_about_point_of_search(search, hypothesis)
-    if first is None:
+    first_estimate = _estimate_about_point_of_search(search, hypothesis)
+    if first_estimate is None:
         return None
     trials, estimate = _linearise_about_estimate(
-        search, hypothesis.candidate, hypothesis.linear_trials, first
+        search, hypothesis.candidate, hypothesis.linear_trials, first_estimate
     )
     return hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
 
@@ -199,8 +199,8 @@ def _estimate_about_point_of_search(
             estimates.append(estimate)
     if not estimates:
         return None
-    best = max(estimates, key=lambda estimate: estimate.log_evidence)
-    return estimator.tune_processes(laws, best, COARSE_FACTORS)
+    best_estimate = max(estimates, key=lambda estimate: estimate.log_evidence)
+    return estimator.tune_processes(laws, best_estimate, COARSE_FACTORS)
 
 
 def _linearise_about_estimate(
@@ -217,16 +217,16 @@ def _linearise_about_estimate(
     search : ForceSearch
         The search for the missing force.
     candidate : Candidate
-        The effects.
+        The effects of the hypothesis, each at its place.
     trials : LinearTrials
         The trials in which the hypothesis was estimated.
     estimate : MotionEstimate
-        The estimate.
+        The estimate of the motion and of all unknowns.
 
     Returns
     -------
     trials : LinearTrials
-        The trials.
+        The trials in motion as one linear model.
     estimate : MotionEstimate
         The estimate in these trials; the given one if none can be made in them.
     """
@@ -260,21 +260,23 @@ def start_in_other_trials(
     Parameters
     ----------
     estimate : MotionEstimate
-        The estimate.
+        The estimate of the motion and of all unknowns.
     trials : sequence of PortedTrial
         The trials in which it was estimated.
     other_trials : sequence of PortedTrial
         The trials in which the next estimate is made, with the same fine stamps.
     """
     trajectories = []
-    for smoothed, trial, other, local in zip(
+    for smoothed_trial, trial, other_trial, local_values in zip(
         estimate.trials, trials, other_trials, estimate.local, strict=True
     ):
-        unknowns = np.concatenate((estimate.shared, local))
-        trajectory = smoothed.trajectory
+        unknowns = np.concatenate((estimate.shared, local_values))
+        trajectory = smoothed_trial.trajectory
         motion = np.concatenate(trial.port_motion(unknowns, trajectory.added_state), axis=1)
-        other_motion = np.concatenate(other.port_motion(unknowns, trajectory.added_state), axis=1)
-        motion_by_state = np.concatenate((other.system.positions, other.system.speeds))
+        other_motion = np.concatenate(
+            other_trial.port_motion(unknowns, trajectory.added_state), axis=1
+        )
+        motion_by_state = np.concatenate((other_trial.system.positions, other_trial.system.speeds))
         change = (motion - other_motion) @ np.linalg.pinv(motion_by_state).T
         trajectories.append(replace(trajectory, added_state=trajectory.added_state + change))
     return EstimatorStart(estimate.effect, estimate.shared, tuple(trajectories), estimate.processes)
@@ -292,7 +294,7 @@ def laws_and_estimator(
     candidate : Candidate
         The effects of the hypothesis.
     trials : LinearTrials
-        The trials.
+        The trials in motion as one linear model.
     """
     laws = EffectLaws(
         search.column_builder,
@@ -310,12 +312,13 @@ def laws_and_estimator(
 
 def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
     """Return the numbers of the shared unknowns that change the model's own laws."""
-    shared = search.point.shared
-    laws_at_point = search.evaluate_model_laws(shared)
+    shared_values = search.point.shared
+    laws_at_point = search.evaluate_model_laws(shared_values)
     return tuple(
         number
         for number in range(search.problem.shared.parameter_count)
-        if search.evaluate_model_laws(with_step(shared, number, HALF_DIFFERENCE)) != laws_at_point
+        if search.evaluate_model_laws(with_step(shared_values, number, HALF_DIFFERENCE))
+        != laws_at_point
     )
 
 
@@ -331,7 +334,7 @@ def hypothesis_of_estimate(
     search : ForceSearch
         The search for effects that explain the missing force.
     candidate : Candidate
-        The set of effects.
+        The set of effects, each at its place.
     trials : LinearTrials
         The trials from which the effects were estimated.
     estimate : MotionEstimate
@@ -344,8 +347,8 @@ def hypothesis_of_estimate(
         The hypothesis; None if an effect cannot be computed along the estimated motions.
     """
     motions = [
-        _trial_motion(trial, smoothed)
-        for trial, smoothed in zip(trials.trials, estimate.trials, strict=True)
+        _trial_motion(trial, smoothed_trial)
+        for trial, smoothed_trial in zip(trials.trials, estimate.trials, strict=True)
     ]
     linear_trials = search.linearise_effects(trials, motions, candidate, estimate.effect)
     if linear_trials is None:
@@ -369,7 +372,7 @@ def hypothesis_of_estimate(
     )
 
 
-def _trial_motion(trial: PortedTrial, smoothed: SmoothedTrial) -> TrialMotion:
+def _trial_motion(trial: PortedTrial, smoothed_trial: SmoothedTrial) -> TrialMotion:
     """Return the smoothed motion of a trial in the form that the search for effects uses.
 
     The search distinguishes the part of the added state that the hypothesis explains: all but that
@@ -378,24 +381,24 @@ def _trial_motion(trial: PortedTrial, smoothed: SmoothedTrial) -> TrialMotion:
     Parameters
     ----------
     trial : PortedTrial
-        The trial.
-    smoothed : SmoothedTrial
+        The trial as a linear system with ports.
+    smoothed_trial : SmoothedTrial
         Its smoothed trajectory and forces.
     """
-    trajectory = smoothed.trajectory
+    trajectory = smoothed_trial.trajectory
     state_by_missing_force = np.zeros_like(trajectory.added_state)
-    for port, force in smoothed.missing_forces.items():
+    for port, force in smoothed_trial.missing_forces.items():
         state_by_missing_force = state_by_missing_force + trial.state_under_force(port, force)
     deviations = {}
-    for port, deviation in smoothed.missing_force_deviations.items():
+    for port, deviation in smoothed_trial.missing_force_deviations.items():
         deviations[port] = PortDeviations(
             force=deviation[:: trial.substeps],
-            speed=_speed_deviation(trial, port, smoothed.state_deviation),
+            speed=_speed_deviation(trial, port, smoothed_trial.state_deviation),
         )
     return TrialMotion(
         added_state=trajectory.added_state,
         forces=trajectory.forces,
-        unexplained_forces=smoothed.missing_forces,
+        unexplained_forces=smoothed_trial.missing_forces,
         explained_state=trajectory.added_state - state_by_missing_force,
         positions=trajectory.positions,
         speeds=trajectory.speeds,
@@ -411,7 +414,7 @@ def _speed_deviation(trial: PortedTrial, port: int, state_deviation: FloatArray)
     Parameters
     ----------
     trial : PortedTrial
-        The trial.
+        The trial as a linear system with ports.
     port : int
         The number of the port.
     state_deviation : (F, n) array

@@ -30,18 +30,18 @@ class Trajectory:
     speeds: FloatArray
     forces: Mapping[int, FloatArray]
 
-    def interpolate(self, other: "Trajectory", fraction: float) -> "Trajectory":
+    def interpolate(self, other_trajectory: "Trajectory", fraction: float) -> "Trajectory":
         """Return the trajectory that lies a fraction of the way to another one."""
-        ports = {*self.forces, *other.forces}
+        ports = {*self.forces, *other_trajectory.forces}
         forces = {
             port: (1.0 - fraction) * self.forces.get(port, 0.0)
-            + fraction * other.forces.get(port, 0.0)
+            + fraction * other_trajectory.forces.get(port, 0.0)
             for port in ports
         }
         return Trajectory(
-            self.added_state + fraction * (other.added_state - self.added_state),
-            self.positions + fraction * (other.positions - self.positions),
-            self.speeds + fraction * (other.speeds - self.speeds),
+            self.added_state + fraction * (other_trajectory.added_state - self.added_state),
+            self.positions + fraction * (other_trajectory.positions - self.positions),
+            self.speeds + fraction * (other_trajectory.speeds - self.speeds),
             {port: np.asarray(force) for port, force in forces.items()},
         )
 
@@ -102,8 +102,8 @@ class LinearisedForce:
         law = self.law_force
         force = law.force + law.by_position * position_change
         force = force + law.by_speed * speed_change
-        for unknown, derivative in self.by_unknown.items():
-            force = force + unknowns_change[unknown] * derivative
+        for unknown_index, derivative in self.by_unknown.items():
+            force = force + unknowns_change[unknown_index] * derivative
         return force
 
 

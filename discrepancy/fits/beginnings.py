@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.fitting import MOST_FIT_STEPS, CandidateFit, try_fit
 from discrepancy.fits.problem import Problem
 
 FIRST_SAMPLES = 8
@@ -23,7 +23,11 @@ LARGEST_CHI_SQUARE = 1.5
 
 
 def refit_from_first_readings(
-    problem: Problem, fit: CandidateFit, *, iterations: int = 60, local_only: bool = False
+    problem: Problem,
+    fit: CandidateFit,
+    *,
+    iterations: int = MOST_FIT_STEPS,
+    local_only: bool = False,
 ) -> CandidateFit:
     """Repeat a fit from initial states that are fitted to the first readings.
 
@@ -35,7 +39,7 @@ def refit_from_first_readings(
     problem : Problem
         The campaign and model that were fitted.
     fit : CandidateFit
-        The fit to improve.
+        The fit that is improved.
     iterations : int
         The largest number of steps.
     local_only : bool

@@ -55,7 +55,7 @@ class EffectTerm:
 
     @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
-        """The fitted parameters, in order."""
+        """The parameters of the effect that are fitted: its own, then those of a free shape."""
         if self.free_shape:
             return (*self.effect.parameters, *self.effect.shape)
         return self.effect.parameters
@@ -67,23 +67,25 @@ class EffectTerm:
         return not low_ends or min(low_ends) < 0.0
 
     def physical_values(self, scaled_values: Sequence[float] | FloatArray) -> dict[str, float]:
-        """Return the physical values by name, at the standard normal variables (E,)."""
-        pairs = zip(self.parameters, scaled_values, strict=True)
-        return {parameter.name: parameter.prior.value(float(u)) for parameter, u in pairs}
+        """Return the parameters of the effect in their units by name, given their scaled values."""
+        values = {}
+        for parameter, scaled_value in zip(self.parameters, scaled_values, strict=True):
+            values[parameter.name] = parameter.prior.value(float(scaled_value))
+        return values
 
     def patch(self, setting: Setting, scaled_values: Sequence[float] | FloatArray) -> ModelPatch:
         """Return the change of the model by the effect, given its scaled parameters (E,)."""
         return self.effect.patch(setting, self.physical_values(scaled_values), self.place)
 
     def start_values(self) -> FloatArray:
-        """Return the scaled parameters (E,): medians of the prior, and canonical shapes."""
-        variables = []
+        """Return the scaled parameters (E,) at the median of the prior and the canonical shape."""
+        scaled_values = []
         for parameter in self.parameters:
             if isinstance(parameter, ShapeParameter):
-                variables.append(parameter.prior.standard_normal(parameter.canonical))
+                scaled_values.append(parameter.prior.standard_normal(parameter.canonical))
             else:
-                variables.append(0.0)
-        return np.array(variables)
+                scaled_values.append(0.0)  # the median of a standard normal variable
+        return np.array(scaled_values)
 
     def multiply_magnitudes(
         self, scaled_values: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
@@ -164,7 +166,7 @@ class Candidate:
         return effects[parameter_index].acts_on
 
     def split_by_term(self, scaled_values: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
-        """Return each term with its own part of the scaled effect parameters (E,)."""
+        """Split the scaled parameters (E,) of all effects, and return each effect with its own."""
         if not self.terms:
             return []
         ends = np.cumsum([len(term.parameters) for term in self.terms])
@@ -179,24 +181,26 @@ class Candidate:
         Parameters
         ----------
         scaled_values : (E,) array
-            The scaled effect parameters.
+            The E parameters of the effects, on the scale on which their priors are standard normal.
         step : (E,) array
-            The step of these variables.
+            The step of these scaled values.
         """
-        variables = []
-        moves = zip(self.parameters, scaled_values.tolist(), step.tolist(), strict=True)
-        for parameter, u, du in moves:
-            variables.append(
-                parameter.prior.step_within_prior(u, du) if parameter.magnitude else u + du
-            )
-        return np.array(variables)
+        next_values = []
+        for parameter, scaled_value, change in zip(
+            self.parameters, scaled_values.tolist(), step.tolist(), strict=True
+        ):
+            if parameter.magnitude:
+                next_values.append(parameter.prior.step_within_prior(scaled_value, change))
+            else:
+                next_values.append(scaled_value + change)
+        return np.array(next_values)
 
     def patches(self, setting: Setting, scaled_values: FloatArray) -> list[ModelPatch]:
-        """Return the patch of each term at the standard normal variables (E,)."""
+        """Return the change of the model by each effect, given all scaled parameters (E,)."""
         return [term.patch(setting, values) for term, values in self.split_by_term(scaled_values)]
 
     def patch(self, setting: Setting, scaled_values: FloatArray) -> ModelPatch:
-        """Return the patch of all terms together at the standard normal variables (E,)."""
+        """Return the change of the model by all effects, given their scaled parameters (E,)."""
         return sum(self.patches(setting, scaled_values), ModelPatch())
 
     def start_values(self) -> FloatArray:
@@ -206,7 +210,7 @@ class Candidate:
         return np.concatenate([term.start_values() for term in self.terms])
 
     def with_term(self, term: EffectTerm) -> "Candidate":
-        """Return the candidate with one more effect."""
+        """Return the candidate that has one more effect than this one."""
         return Candidate((*self.terms, term))
 
     def subset_of_terms(
@@ -309,9 +313,9 @@ class FitState:
 
 def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
     """Return a copy of the values in which one of them is larger by a step."""
-    changed = values.copy()
-    changed[index] += step
-    return changed
+    stepped_values = values.copy()
+    stepped_values[index] += step
+    return stepped_values
 
 
 @dataclass(frozen=True, eq=False)

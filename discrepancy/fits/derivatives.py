@@ -24,8 +24,8 @@ from .trial_data import SharedUnknowns, TrialData
 def nuisance_derivatives(
     data: TrialData,
     shared_unknowns: SharedUnknowns,
-    shared: FloatArray,
-    local: FloatArray,
+    shared_point: FloatArray,
+    local_point: FloatArray,
     respond: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]],
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of a trial's response with respect to its nuisances.
@@ -39,48 +39,54 @@ def nuisance_derivatives(
         The trial and its unknowns.
     shared_unknowns : SharedUnknowns
         The layout of the shared unknowns.
-    shared, local : (Q,), (L,) array
-        The scaled shared unknowns, and those of the trial.
+    shared_point, local_point : (Q,), (L,) array
+        The scaled values of the Q shared unknowns, and of the L unknowns of the trial, at which the
+        derivatives are computed.
     respond : callable
-        Returns the response (N, C) at shared and local unknowns, and its time derivative (N, C), or
-        None if the model does not give it.
+        The function that returns the response at given shared and local unknowns, for N samples of
+        C channels, and its time derivative (N, C), or None if the model does not give it.
 
     Returns
     -------
     by_parameters : (P, N, C) array
-        The derivatives with respect to the calibrated parameters.
+        The derivatives with respect to the P calibrated parameters.
     by_local : (I, N, C) array
-        The derivatives with respect to the unknowns of the trial except its zeros.
+        The derivatives with respect to the I unknowns of the trial that are not zeros of channels.
     """
     unknowns = data.unknowns
-    response, rates = respond(shared, local)
+    response, rates = respond(shared_point, local_point)
 
     def slope(
         shared_values: FloatArray, local_values: FloatArray, step: float = PARAMETER_STEP
     ) -> FloatArray:
-        stepped, _ = respond(shared_values, local_values)
-        return (stepped - response) / step
+        stepped_response, _ = respond(shared_values, local_values)
+        return (stepped_response - response) / step
 
     # calibrated parameters: a step from the upper end of the range goes downwards
     _, high = shared_unknowns.bounds
-    is_at_end = shared + SHARED_STEP > high
+    is_at_end = shared_point + SHARED_STEP > high
     steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.parameter_count]
     by_parameters = [
-        slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
+        slope(with_step(shared_point, k, step), local_point, step)
+        for k, step in enumerate(steps.tolist())
     ]
     # initial state and constants of inputs
     zeros_end, _, inputs_end, time_zero_end = unknowns.ends_by_kind
-    by_local = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
+    by_local = [
+        slope(shared_point, with_step(local_point, k)) for k in range(zeros_end, inputs_end)
+    ]
     if unknowns.has_time_zero:
         if rates is None:
-            by_local.append(slope(shared, with_step(local, inputs_end)))
+            by_local.append(slope(shared_point, with_step(local_point, inputs_end)))
         else:
             # a shift of time zero by scale u changes the response by its rate times scale u
             by_local.append(rates * unknowns.scale[inputs_end])
     # health
     if len(unknowns.health_rows):
         by_local.extend(
-            _health_derivatives(data, local, time_zero_end, response.shape, partial(slope, shared))
+            _health_derivatives(
+                data, local_point, time_zero_end, response.shape, partial(slope, shared_point)
+            )
         )
     shape = (-1, *response.shape)
     return np.array(by_parameters).reshape(shape), np.array(by_local).reshape(shape)
@@ -88,7 +94,7 @@ def nuisance_derivatives(
 
 def _health_derivatives(
     data: TrialData,
-    local: FloatArray,
+    local_values: FloatArray,
     first_health: int,
     shape: tuple[int, ...],
     slope: Callable[[FloatArray], FloatArray],
@@ -103,7 +109,7 @@ def _health_derivatives(
     ----------
     data : TrialData
         The trial and its unknowns.
-    local : (L,) array
+    local_values : (L,) array
         The scaled unknowns of the trial.
     first_health : int
         The index of the first health entry among these unknowns.
@@ -119,7 +125,7 @@ def _health_derivatives(
         region_entries = np.flatnonzero(unknowns.health_columns == region)
         if not len(region_entries):
             continue
-        stepped_local = local.copy()
+        stepped_local = local_values.copy()
         # step towards zero, away from the limits of the stiffness loss
         step_signs = np.where(stepped_local[first_health + region_entries] > 0.0, -1.0, 1.0)
         stepped_local[first_health + region_entries] += step_signs * PARAMETER_STEP
@@ -139,7 +145,7 @@ def _health_derivatives(
 def prediction_derivatives(
     data: TrialData,
     shared_unknowns: SharedUnknowns,
-    shared: FloatArray,
+    shared_values: FloatArray,
     derivatives: TrialDerivatives,
     candidate: Candidate,
 ) -> tuple[FloatArray, IntArray]:
@@ -154,8 +160,8 @@ def prediction_derivatives(
         The trial and its unknowns.
     shared_unknowns : SharedUnknowns
         The layout of the shared unknowns.
-    shared : (Q,) array
-        The scaled shared unknowns.
+    shared_values : (Q,) array
+        The scaled values of the Q unknowns that all trials share.
     derivatives : TrialDerivatives
         The response and its derivatives.
     candidate : Candidate
@@ -173,7 +179,7 @@ def prediction_derivatives(
     unknowns = data.unknowns
     channels = data.trial.channels
     response = derivatives.response
-    gains = 1.0 + shared_unknowns.gains(shared, channels)
+    gains = 1.0 + shared_unknowns.gains(shared_values, channels)
     # zeros of the channels
     by_zeros = np.zeros((unknowns.zero_count, *response.shape))
     zero_scale = unknowns.scale[: unknowns.zero_count, np.newaxis]

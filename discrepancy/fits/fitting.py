@@ -41,6 +41,15 @@ LARGEST_DAMPING = 1.0
 convergence."""
 HOPELESS_DAMPING = 1e6
 """Damping beyond which a fit ends without convergence."""
+MOST_FIT_STEPS = 60
+"""Largest number of steps of a fit, unless its caller states another number."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-9
+"""Damping of the first step, and the least damping of any step."""
+LEAST_RAISED_DAMPING = 1e-4
+"""Least damping after a step that did not lower the objective."""
+GOOD_DECREASE, OUTDATED_DECREASE = 0.5, 0.7
+"""Decrease of the objective over the predicted decrease: above the first the damping is reduced
+more, and below the second the reused derivatives are outdated."""
 STEP_FRACTIONS = (1.0, 0.3)
 """Fractions of a step that are tried before the damping is increased."""
 
@@ -65,8 +74,8 @@ class CandidateFit(FitState):
     converged : bool
         Whether the predicted decrease of the objective fell below `CONVERGED_DECREASE`.
     draws : (N, E) array or None
-        Posterior draws of the effect parameters, if their posterior is wider than the covariance
-        says (see `predictive.with_draws`).
+        The posterior draws of the effect parameters, if their posterior is wider than the
+        covariance says (see `predictive.with_draws`).
     residual_process : ResidualProcess or None
         The random process of the residuals besides the noise, if hypotheses are compared under a
         wider noise than recorded.
@@ -93,12 +102,12 @@ class CandidateFit(FitState):
     @property
     def effect_covariance(self) -> FloatArray:
         """The covariance (E, E) of the scaled effect parameters."""
-        first = len(self.covariance) - self.candidate.parameter_count
-        return self.covariance[first:, first:]
+        first_parameter = len(self.covariance) - self.candidate.parameter_count
+        return self.covariance[first_parameter:, first_parameter:]
 
     @property
     def chi_square(self) -> float:
-        """The sum of squared standardised residuals."""
+        """The sum of the squared residuals of all channels, in units of the noise variance."""
         return float(self.squares_by_channel.sum())
 
 
@@ -109,7 +118,7 @@ def fit(
     start: Point,
     *,
     nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
-    iterations: int = 60,
+    iterations: int = MOST_FIT_STEPS,
     local_only: bool = False,
     objective_limit: float | None = None,
 ) -> CandidateFit:
@@ -118,14 +127,14 @@ def fit(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     candidate : Candidate
         The effects whose parameters are fitted.
     start : Point
         The point from which the fit begins.
     nearby_derivatives : tuple of TrialDerivatives, optional
-        Derivatives of each trial with respect to nuisances at a nearby point, used for the first
-        steps instead of new ones.
+        The derivatives of each trial with respect to nuisances at a nearby point, used for the
+        first steps instead of new ones.
     iterations : int
         The largest number of steps.
     local_only : bool
@@ -142,7 +151,7 @@ def fit(
         singular.
     """
     descent = _Descent(problem, candidate, local_only)
-    damping = 1e-3
+    damping = FIRST_DAMPING
     state = descent.state_at(_within_bounds(problem, start), nearby_derivatives)
     if not np.isfinite(state.objective):
         names = comma_list(candidate.identifiers) if candidate.terms else "no effect"
@@ -160,13 +169,14 @@ def fit(
         if next_state is not None:
             decrease = state.objective - next_state.objective
             # less damping for the next step, the more so the better the predicted decrease was
-            reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
-            damping = max(damping * reduction, 1e-9)
+            reduction = 0.1 if decrease > GOOD_DECREASE * predicted_decrease else 0.5
+            damping = max(damping * reduction, LEAST_DAMPING)
             state = next_state
             # a decrease well below the predicted one shows that the derivatives are outdated
-            has_current_derivatives = decrease < 0.7 * predicted_decrease
-            if has_current_derivatives:
+            is_outdated = decrease < OUTDATED_DECREASE * predicted_decrease
+            if is_outdated:
                 state = descent.state_at(state.point)
+            has_current_derivatives = is_outdated
             # the further decrease is taken to be at most twice the one predicted for this step
             is_near_newton = damping < NEWTON_DAMPING
             expected_end = state.objective - 2.0 * predicted_decrease
@@ -180,7 +190,7 @@ def fit(
             converged = damping < LARGEST_DAMPING
             break
         else:
-            damping = max(10.0 * damping, 1e-4)
+            damping = max(10.0 * damping, LEAST_RAISED_DAMPING)
             if damping > HOPELESS_DAMPING:
                 break
     if not has_current_derivatives:
@@ -194,7 +204,7 @@ def try_fit(
     start: Point,
     *,
     nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
-    iterations: int = 60,
+    iterations: int = MOST_FIT_STEPS,
     local_only: bool = False,
     objective_limit: float | None = None,
 ) -> CandidateFit | None:
@@ -219,9 +229,9 @@ def try_fit(
 
 @np.errstate(over="ignore", invalid="ignore")  # a motion that overflows has no probability
 def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
-    """Return the negative log posterior of a candidate at a point, up to a constant [nat].
+    """Return the negative log posterior of a candidate at a point [nat].
 
-    The constant is the same for all candidates.
+    A constant is left out, which is the same for all candidates.
 
     Raises
     ------
@@ -261,7 +271,7 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     point : Point
         The values of all unknowns.
     responses : sequence of (N, C) array
@@ -274,8 +284,8 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
     sums = problem.squares_by_channel(residuals)
     minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
     minus_log_prior += 0.5 * float(point.effect @ point.effect)
-    for data, u in zip(problem.trials, point.local, strict=True):
-        minus_log_prior += 0.5 * float(data.unknowns.precision @ u**2)
+    for data, scaled_values in zip(problem.trials, point.local, strict=True):
+        minus_log_prior += 0.5 * float(data.unknowns.precision @ scaled_values**2)
     negative_log_posterior = problem.misfit(sums) + minus_log_prior
     if not np.isfinite(negative_log_posterior):
         negative_log_posterior = np.inf
@@ -289,7 +299,7 @@ class _Descent:
     Attributes
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     candidate : Candidate
         The effects that are fitted.
     local_only : bool
@@ -387,19 +397,19 @@ class _Descent:
         predicted_decrease = 0.5 * float(equations.gradient @ step)
         return self._split_step(step), predicted_decrease
 
-    def _is_held_at_bound(self, shared: FloatArray, downhill: FloatArray) -> BoolArray:
+    def _is_held_at_bound(self, shared_values: FloatArray, downhill: FloatArray) -> BoolArray:
         """Return which shared unknowns (Q,) are at an end of their range and would leave it.
 
         Parameters
         ----------
-        shared : (Q,) array
-            The scaled shared unknowns.
+        shared_values : (Q,) array
+            The scaled values of the Q unknowns that all trials share.
         downhill : (Q,) array
             The direction in which the objective decreases.
         """
         low, high = self.problem.shared.bounds
-        is_held_low = (shared <= low) & (downhill < 0.0)
-        is_held_high = (shared >= high) & (downhill > 0.0)
+        is_held_low = (shared_values <= low) & (downhill < 0.0)
+        is_held_high = (shared_values >= high) & (downhill > 0.0)
         return np.asarray(is_held_low | is_held_high)
 
     def _split_step(self, step: FloatArray) -> Point:
@@ -468,12 +478,15 @@ def _move_point(
     problem: Problem, candidate: Candidate, point: Point, step: Point, fraction: float
 ) -> Point:
     """Return the point after a fraction of a step, clipped to the ranges of the unknowns."""
-    stepped = Point(
+    stepped_point = Point(
         shared=point.shared + fraction * step.shared,
-        local=tuple(u + fraction * du for u, du in zip(point.local, step.local, strict=True)),
+        local=tuple(
+            values + fraction * change
+            for values, change in zip(point.local, step.local, strict=True)
+        ),
         effect=candidate.add_step(point.effect, fraction * step.effect),
     )
-    return _within_bounds(problem, stepped)
+    return _within_bounds(problem, stepped_point)
 
 
 def _within_bounds(problem: Problem, point: Point) -> Point:
@@ -497,7 +510,7 @@ def fit_free_shape(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     canonical_fit : CandidateFit
         The fit in which all shapes have their canonical values.
     term_index : int
@@ -512,10 +525,13 @@ def fit_free_shape(
     term, values = terms_with_values[term_index]
     if not term.effect.shape:
         return None
-    canonical = [
+    canonical_values = [
         parameter.prior.standard_normal(parameter.canonical) for parameter in term.effect.shape
     ]
-    terms_with_values[term_index] = (replace(term, free_shape=True), np.append(values, canonical))
+    terms_with_values[term_index] = (
+        replace(term, free_shape=True),
+        np.append(values, canonical_values),
+    )
     terms, effect_values = zip(*terms_with_values, strict=True)
     start = replace(canonical_fit.point, effect=np.concatenate(effect_values))
     return try_fit(problem, Candidate(terms), start)

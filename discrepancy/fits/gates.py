@@ -43,9 +43,9 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
-        The fit to test.
+        The fit whose residuals are tested.
 
     Returns
     -------
@@ -83,9 +83,9 @@ def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
-        The fit to test.
+        The fit whose residuals are tested.
     """
     # correlated residuals count as fewer independent ones: all degrees of freedom are divided
     samples_per_independent = _recorded_colour_factor(problem, fit) ** 2
@@ -137,10 +137,10 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     tests are conservative, since estimates scatter less than the prior.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
-    shared = problem.shared
-    parameter_deviations = fit.point.shared[: shared.parameter_count]
-    has_proper_prior = shared.precision[shared.parameter_count :] > 0.0
-    gain_deviations = fit.point.shared[shared.parameter_count :][has_proper_prior]
+    layout = problem.shared
+    parameter_deviations = fit.point.shared[: layout.parameter_count]
+    has_proper_prior = layout.precision[layout.parameter_count :] > 0.0
+    gain_deviations = fit.point.shared[layout.parameter_count :][has_proper_prior]
     tests = []
     if parameter_deviations.size:
         p_value = float(
@@ -152,25 +152,27 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         tests.append(NamedTest("gains outside their priors", p_value))
     for term, values in fit.candidate.split_by_term(fit.effect):
         # the values of free shape parameters follow those of the effect, and are not tested
-        for parameter, u in zip(term.effect.parameters, values.tolist(), strict=False):
+        for parameter, scaled_value in zip(term.effect.parameters, values.tolist(), strict=False):
             # the ends of a uniform prior are as probable as its middle
             is_uniform = parameter.prior.shape == "uniform"
             if parameter.magnitude or is_uniform:
                 continue
             name = f"{parameter.name} of {term.effect.identifier} outside its prior"
-            tests.append(NamedTest(name, float(chi2.sf(u**2, 1))))
+            tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1))))
     return tests
 
 
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return the Ljung-Box test of each channel, over its records in all trials in motion.
+    """Return for each channel the test whether its residuals are uncorrelated in time (Ljung-Box).
 
-    A channel is left out if its noise record is not white, or if its residuals have the correlation
-    of that record.
+    The records of a channel in all trials in motion are tested together. A channel is left out if
+    its noise record is correlated in time, or if its residuals are fitted by a process that has the
+    correlation of the noise record.
     """
     tests = []
-    is_white_noise = _recorded_colour_factor(problem, fit) == 1.0
-    for channel in np.flatnonzero(is_white_noise).tolist():
+    # the factor differs from 1 if the residuals are fitted with the correlation of the noise record
+    has_white_residuals = _recorded_colour_factor(problem, fit) == 1.0
+    for channel in np.flatnonzero(has_white_residuals).tolist():
         if not problem.is_whiteness_tested[channel]:
             continue
         records = residual_records(problem, fit, channel)
@@ -210,9 +212,9 @@ def residual_records(problem: Problem, fit: CandidateFit, channel: int) -> list[
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
-        The fit.
+        The fit of a hypothesis to all trials.
     channel : int
         The index of the channel among those of the campaign.
     """

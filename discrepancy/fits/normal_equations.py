@@ -55,17 +55,17 @@ def cholesky_factor(matrix: FloatArray) -> FloatArray:
         ) from cause
 
 
-def solve_factored(factor: FloatArray, right: FloatArray) -> FloatArray:
+def solve_factored(factor: FloatArray, right_side: FloatArray) -> FloatArray:
     """Return the solution x (n, ...) of U^T U x = b.
 
     Parameters
     ----------
     factor : (n, n) array
         The upper Cholesky factor U, as `cholesky_factor` returns it.
-    right : (n, ...) array
+    right_side : (n, ...) array
         The right-hand sides b.
     """
-    return np.asarray(cho_solve((factor, False), right, check_finite=False))
+    return np.asarray(cho_solve((factor, False), right_side, check_finite=False))
 
 
 # ---------------------------------------------------------------- normal equations
@@ -102,7 +102,7 @@ class TrialJacobian:
     local_precision: FloatArray
 
     def eliminate_local(self) -> tuple[FloatArray, FloatArray]:
-        """Return the matrices by which the trial's own unknowns are eliminated.
+        """Return the matrices that eliminate the trial's own unknowns from the normal equations.
 
         Let A be the block of the normal equations of the trial's own unknowns, and B the block
         between them and the shared unknowns. The own unknowns that minimise the objective change
@@ -133,7 +133,7 @@ def trial_jacobian(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial.
     state : FitState
@@ -198,7 +198,7 @@ def normal_equations(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     state : FitState
         The point, its residuals and derivatives.
     candidate : Candidate

@@ -30,16 +30,14 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.search_settings import SEARCH
 
 
-def residual_set(
-    problem: Problem, fitted: CandidateFit, *, sensitivities: bool = True
-) -> ResidualSet:
+def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = True) -> ResidualSet:
     """Return the residuals of all trials of a campaign, fitted and held out, with their variance.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model that were fitted.
-    fitted : CandidateFit
+    fit : CandidateFit
         The fit with its covariance.
     sensitivities : bool
         Whether the factor of the exact covariance of the residuals is computed (P columns for each
@@ -53,29 +51,33 @@ def residual_set(
     is estimated from the residuals of the fitted trials.
     """
     precision = np.where(
-        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fitted.squares_by_channel)
+        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
     )
-    predictions = _TrialPredictions(problem, fitted, fitted, precision)
+    predictions = _TrialPredictions(problem, fit, fit, precision)
     trials = predictions.fitted_trials(sensitivities=sensitivities)
     if problem.campaign.held_out:
-        held_out_problem, held_out = fit_held_out(problem, fitted)
-        trials += _TrialPredictions(held_out_problem, fitted, held_out, precision).fitted_trials()
+        held_out_problem, held_out = fit_held_out(problem, fit)
+        trials += _TrialPredictions(held_out_problem, fit, held_out, precision).fitted_trials()
     by_name = {trial.trial.name: trial for trial in trials}
     in_order = [by_name[trial.name] for trial in problem.campaign.trials if trial.name in by_name]
     return ResidualSet(problem.campaign.channels, tuple(in_order))
 
 
-def fit_held_out(problem: Problem, fitted: CandidateFit) -> tuple[Problem, CandidateFit]:
+def fit_held_out(
+    problem: Problem, fit_of_other_trials: CandidateFit
+) -> tuple[Problem, CandidateFit]:
     """Return the problem of the held-out trials, and the fit of their own unknowns.
 
     A trial's own unknowns are, for example, zeros of channels and the initial state. The shared
     unknowns and the effects keep the values fitted to the other trials, so that the held-out trials
     test them.
     """
-    candidate = fitted.candidate
+    candidate = fit_of_other_trials.candidate
     held_out = problem.with_trials(problem.campaign.held_out)
     start = replace(
-        held_out.prior_mean_point(candidate), shared=fitted.point.shared, effect=fitted.point.effect
+        held_out.prior_mean_point(candidate),
+        shared=fit_of_other_trials.point.shared,
+        effect=fit_of_other_trials.point.effect,
     )
     if all(trial.name in problem.initial_states for trial in problem.campaign.held_out):
         start = with_initial_states_of_first_readings(held_out, start)
@@ -116,13 +118,13 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
             amplitude_step = 0.1 * nominal_amplitude
         least_objective = np.inf
         for amplitude in nominal_amplitude + amplitude_step * np.array(RELEASE_AMPLITUDES):
-            local = start.local[trial_index].copy()
-            local[amplitude_index] = amplitude
-            trial_locals = (*best_local[:trial_index], local, *best_local[trial_index + 1 :])
+            local_values = start.local[trial_index].copy()
+            local_values[amplitude_index] = amplitude
+            trial_locals = (*best_local[:trial_index], local_values, *best_local[trial_index + 1 :])
             trial_objective = objective(held_out, candidate, replace(start, local=trial_locals))
             if trial_objective < least_objective:
                 least_objective = trial_objective
-                best_local[trial_index] = local
+                best_local[trial_index] = local_values
     return replace(start, local=tuple(best_local))
 
 
@@ -174,17 +176,17 @@ class _TrialPredictions:
     def __init__(
         self,
         problem: Problem,
-        fitted: CandidateFit,
+        fit: CandidateFit,
         local_fit: CandidateFit,
         precision: FloatArray,
     ) -> None:
         self.problem = problem
-        self.fitted = fitted
+        self.fitted = fit
         self.local_fit = local_fit
         self.precision = precision
-        covariance = fitted.covariance
+        covariance = fit.covariance
         self.covariance_root = np.linalg.cholesky(covariance + 1e-14 * np.eye(len(covariance)))
-        self.is_held_out = local_fit is not fitted
+        self.is_held_out = local_fit is not fit
 
     def fitted_trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
         """Return each trial with its prediction, residuals and their expected variance.
@@ -240,7 +242,7 @@ class _TrialPredictions:
     def _leverage_and_variance(
         self, trial_index: int, data: TrialData, factors: _CovarianceFactors
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the leverage of the readings and the variance of a new reading, both (N, C).
+        """Return the leverage (N, C) of the readings, and the variance (N, C) of a new reading.
 
         Both are relative to the noise variance; `FittedTrial` defines the leverage.
         """
@@ -279,7 +281,7 @@ class _TrialPredictions:
         trial_index : int
             The index of the trial.
         data : TrialData
-            The trial.
+            The trial with its noise models and unknowns.
         factors : _CovarianceFactors
             The factors of the covariance of its prediction.
         sensitivity : (N, C, P) array or None

@@ -65,14 +65,16 @@ def channel_misfits(
         The sums of squared standardised residuals.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        recorded = 0.5 * (record_freedom + sample_counts) * np.log1p(squares / record_freedom)
-        unrecorded = (
+        recorded_misfits = (
+            0.5 * (record_freedom + sample_counts) * np.log1p(squares / record_freedom)
+        )
+        unrecorded_misfits = (
             0.5 * sample_counts * np.log(np.maximum(squares, LEAST_VARIANCE * sample_counts))
         )
     return np.where(
         np.isinf(record_freedom),
         0.5 * squares,
-        np.where(record_freedom > 0.0, recorded, unrecorded),
+        np.where(record_freedom > 0.0, recorded_misfits, unrecorded_misfits),
     )
 
 
@@ -184,12 +186,12 @@ class Problem:
                     continue
                 readings = data.trial.values[:, column]
                 deviation_from_median = readings - np.median(readings)
-                local = point.local[number]
+                local_values = point.local[number]
                 # a free initial state is zero at its prior mean, where nothing would move
                 if release is not None and not release.at_rest:
                     first_amplitude = data.unknowns.zero_count
-                    local[first_amplitude] = 1.0 / data.unknowns.scale[first_amplitude]
-                response, _ = self.response(number, point.shared, local, ModelPatch())
+                    local_values[first_amplitude] = 1.0 / data.unknowns.scale[first_amplitude]
+                response, _ = self.response(number, point.shared, local_values, ModelPatch())
                 response_amplitude = float(np.abs(response[:, column]).max())
                 if response_amplitude > 0.0:
                     has_same_sign = (
@@ -223,9 +225,9 @@ class Problem:
         trial_index : int
             The index of the trial.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
-            The scaled effect parameters.
+            The E parameters of the effects, on the scale on which their priors are standard normal.
         """
         if self.trials[trial_index].trial.kind not in candidate.acts_on:
             return ModelPatch()
@@ -234,8 +236,8 @@ class Problem:
     def response(
         self,
         trial_index: int,
-        shared: FloatArray,
-        local: FloatArray,
+        shared_values: FloatArray,
+        local_values: FloatArray,
         patch: ModelPatch,
         refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray | None]:
@@ -247,9 +249,9 @@ class Problem:
         ----------
         trial_index : int
             The index of the trial.
-        shared : (Q,) array
-            The scaled shared unknowns.
-        local : (L,) array
+        shared_values : (Q,) array
+            The scaled values of the Q unknowns that all trials share.
+        local_values : (L,) array
             The scaled unknowns of the trial.
         patch : ModelPatch
             The change of the model by effects.
@@ -264,12 +266,14 @@ class Problem:
             Its time derivative; None if the model does not give it.
         """
         data = self.trials[trial_index]
-        conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
+        conditions = data.unknowns.conditions(
+            data.trial, self.shared.parameters(shared_values), local_values
+        )
         conditions = replace(conditions, refinement=self.refinement * refinement)
 
         def simulate() -> tuple[FloatArray, FloatArray | None]:
-            observed = observe(self.model, self.campaign, data.trial, patch, conditions)
-            return observed.values, observed.rates
+            observation = observe(self.model, self.campaign, data.trial, patch, conditions)
+            return observation.values, observation.rates
 
         return self._responses.get((trial_index, patch.primitives, conditions.key), simulate)
 
@@ -317,9 +321,10 @@ class Problem:
         point : Point
             The values of all unknowns.
         candidate : Candidate
-            The effects that act.
+            The effects that act, each at its place.
         nearby_derivatives : TrialDerivatives, optional
-            Derivatives with respect to nuisances at a nearby point, which are not computed again.
+            The derivatives with respect to nuisances at a nearby point, which are not computed
+            again.
         effect_steps : (E,) array, optional
             The posterior standard deviations of the effect parameters, used as steps of their
             finite differences, at least `LEAST_EFFECT_STEP` and at most `PARAMETER_STEP`. Such a
@@ -359,8 +364,10 @@ class Problem:
         """Return the `nuisance_derivatives` of a trial while the effects of a candidate act."""
         patch = self.patch_in_trial(trial_index, candidate, point.effect)
 
-        def respond(shared: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-            return self.response(trial_index, shared, local, patch)
+        def respond(
+            shared_values: FloatArray, local_values: FloatArray
+        ) -> tuple[FloatArray, FloatArray | None]:
+            return self.response(trial_index, shared_values, local_values, patch)
 
         return nuisance_derivatives(
             self.trials[trial_index], self.shared, point.shared, point.local[trial_index], respond
@@ -369,7 +376,7 @@ class Problem:
     def prediction_derivatives(
         self, trial_index: int, point: Point, derivatives: TrialDerivatives, candidate: Candidate
     ) -> tuple[FloatArray, IntArray]:
-        """Return the `prediction_derivatives` of a trial, given those of its response."""
+        """Return the derivatives of a trial's predicted readings, given those of its response."""
         return prediction_derivatives(
             self.trials[trial_index], self.shared, point.shared, derivatives, candidate
         )
@@ -444,11 +451,11 @@ class Problem:
         model : Model, optional
             Another model; that of this problem if left out.
         """
-        other = copy(self)
+        problem = copy(self)
         if model is not None:
-            other.model = model.with_response_cache()
-        other._prepare_trials(trials)
-        return other
+            problem.model = model.with_response_cache()
+        problem._prepare_trials(trials)
+        return problem
 
     def with_first_samples(self, count: int) -> "Problem":
         """Return the problem in which only the first samples of each trial in motion are compared.

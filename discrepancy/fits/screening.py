@@ -88,7 +88,7 @@ class Screen:
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit whose nuisances are eliminated; its own effects keep their values, unless
         `effect_precision` is given.
@@ -168,7 +168,7 @@ class Screen:
         candidate : Candidate
             The effects after the change.
         effect : (E,) array
-            Their scaled parameters.
+            The E parameters of the effects, on the scale on which their priors are standard normal.
         kinds : frozenset of TrialKind
             The kinds of trials whose prediction changes.
         """
@@ -316,7 +316,9 @@ def _largest_peaks(power: FloatArray) -> list[int]:
     peaks_by_power = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.most_peaks]]
     separate_peaks: list[int] = []
     for index in peaks_by_power:
-        is_apart = all(abs(index - other) > 2 * SEARCH.zero_padding for other in separate_peaks)
+        is_apart = all(
+            abs(index - other_index) > 2 * SEARCH.zero_padding for other_index in separate_peaks
+        )
         if is_apart and len(separate_peaks) < SEARCH.most_peaks:
             separate_peaks.append(int(index))
     return separate_peaks
@@ -380,7 +382,7 @@ def _magnitude_levels(
     Parameters
     ----------
     parameter : EffectParameter or ShapeParameter
-        The magnitude.
+        The parameter that is the magnitude of the effect.
     is_first : bool
         Whether it is the first magnitude of its effect. The screen finds the best factor on that
         one, of either sign, so that it needs fewer values than others.

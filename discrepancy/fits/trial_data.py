@@ -109,14 +109,19 @@ class SharedUnknowns:
         scaled_ends[:, uncertain] = (physical_ends[:, uncertain] - centre) / self.scale[uncertain]
         return scaled_ends
 
-    def parameters(self, u: FloatArray) -> FloatArray:
-        """Return the calibrated parameters (P,) within their ranges, given scaled values u (Q,)."""
-        return np.clip((self.centre + self.scale * u)[: self.parameter_count], self.low, self.high)
+    def parameters(self, scaled_values: FloatArray) -> FloatArray:
+        """Return the calibrated parameters (P,), given the scaled shared unknowns (Q,).
 
-    def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
-        """Return the gain errors (C,) of channels, given the scaled variables u (Q,)."""
-        values = (self.centre + self.scale * u)[self.parameter_count :]
-        gains = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
+        Parameters beyond their ranges are clipped.
+        """
+        values = self.centre + self.scale * scaled_values
+        return np.clip(values[: self.parameter_count], self.low, self.high)
+
+    def gains(self, scaled_values: FloatArray, channels: tuple[str, ...]) -> FloatArray:
+        """Return the gain errors (C,) of channels, given the scaled shared unknowns (Q,)."""
+        values = self.centre + self.scale * scaled_values
+        fitted_gains = values[self.parameter_count :]
+        gains = self.fixed_gain | dict(zip(self.gain_channels, fitted_gains, strict=True))
         return np.array([gains.get(name, 0.0) for name in channels])
 
 
@@ -176,30 +181,32 @@ class LocalUnknowns:
         )
         return list(accumulate(counts))
 
-    def channel_zeros(self, u: FloatArray, channel_count: int) -> FloatArray:
-        """Return the zeros (C,) of the trial's channels, given the scaled variables u (L,)."""
-        values = np.zeros(channel_count)
-        values[self.zero_columns] = (self.scale * u)[: self.zero_count]
-        return values
+    def channel_zeros(self, scaled_values: FloatArray, channel_count: int) -> FloatArray:
+        """Return the zeros (C,) of the trial's channels, given its scaled unknowns (L,)."""
+        zeros = np.zeros(channel_count)
+        zeros[self.zero_columns] = (self.scale * scaled_values)[: self.zero_count]
+        return zeros
 
-    def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
-        """Return the conditions for which the model is evaluated: initial state, health and inputs.
+    def conditions(
+        self, trial: Trial, parameters: FloatArray, scaled_values: FloatArray
+    ) -> Conditions:
+        """Return the conditions of a trial for the model: initial state, health and inputs.
 
         Parameters
         ----------
         trial : Trial
-            The trial.
+            The trial with its readings, inputs and sample times.
         parameters : (P,) array
             The calibrated parameters.
-        u : (L,) array
-            The scaled variables of the trial.
+        scaled_values : (L,) array
+            The scaled values of the L unknowns of the trial.
         """
         _, initial_entries, input_constants, time_zero, loss_changes = np.split(
-            self.scale * u, self.ends_by_kind
+            self.scale * scaled_values, self.ends_by_kind
         )
         rows, width = self.initial_shape
-        initial = np.zeros((rows, 2))
-        initial[:, :width] = initial_entries.reshape(rows, width)
+        initial_states = np.zeros((rows, 2))
+        initial_states[:, :width] = initial_entries.reshape(rows, width)
         offset = np.zeros(len(trial.inputs))
         offset[self.offset_inputs] = input_constants
         health = trial.health[:1] if trial.is_dynamic else trial.health
@@ -211,7 +218,7 @@ class LocalUnknowns:
             )
         # the sum is 0 without an unknown time zero, and its only entry otherwise
         times = (0.0, float(time_zero.sum()))
-        return Conditions(parameters, initial, times, health, tuple(offset.tolist()))
+        return Conditions(parameters, initial_states, times, health, tuple(offset.tolist()))
 
 
 def shared_unknowns(
@@ -275,7 +282,7 @@ def local_unknowns(
     campaign : Campaign
         The campaign of the trial.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     deviation : (C,) array
         The noise deviation of each channel, which scales a zero with a flat prior.
     model : Model
@@ -305,7 +312,9 @@ def local_unknowns(
         initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
         initial_scale = FREE_STATE_DEVIATION * np.pad(sizes, (0, len(sizes) % 2))
     # constants of inputs
-    offset_deviations = np.array([recorded.offset_deviation for recorded in trial.inputs])
+    offset_deviations = np.array(
+        [recorded_input.offset_deviation for recorded_input in trial.inputs]
+    )
     offset_inputs = np.flatnonzero(offset_deviations > 0.0)
     # health, region by region, as its derivatives are taken
     health_deviation = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
@@ -339,7 +348,7 @@ class TrialData:
     Attributes
     ----------
     trial : Trial
-        The trial as measured.
+        The trial with its clock as measured.
     deviation : (C,) array
         The noise standard deviation s0 of each column [unit of the channel]. If the column is
         whitened, it is that of the whitened samples.
@@ -374,13 +383,13 @@ class TrialData:
             The values over s0, after the whitening filter if the noise of the column is coloured;
             0 for samples that are not compared.
         """
-        scaled = columns / self.deviation
+        standardised = columns / self.deviation
         for number, noise in enumerate(self.noise_models):
             if noise.can_whiten(self.trial.whitening_interval):
-                scaled[..., number] = noise.whiten(
-                    scaled[..., number], self.trial.whitening_interval
+                standardised[..., number] = noise.whiten(
+                    standardised[..., number], self.trial.whitening_interval
                 )
-        return np.asarray(scaled * self.weight)
+        return np.asarray(standardised * self.weight)
 
     @classmethod
     def prepare(
@@ -397,7 +406,7 @@ class TrialData:
         campaign : Campaign
             The campaign of the trial.
         trial : Trial
-            The trial.
+            The trial with its readings, inputs and sample times.
         models_by_channel : mapping of str to NoiseModel
             The noise model of each channel.
         model : Model

@@ -46,9 +46,12 @@ def residuals_with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> R
     reference : ResidualSet
         The residuals of the same trials by another hypothesis.
     """
-    noise = {fitted.trial.name: fitted.noise_deviation for fitted in reference.trials}
+    noise = {
+        fitted_trial.trial.name: fitted_trial.noise_deviation for fitted_trial in reference.trials
+    }
     trials = [
-        replace(fitted, noise_deviation=noise[fitted.trial.name]) for fitted in residuals.trials
+        replace(fitted_trial, noise_deviation=noise[fitted_trial.trial.name])
+        for fitted_trial in residuals.trials
     ]
     return replace(residuals, trials=tuple(trials))
 
@@ -84,30 +87,32 @@ class SquaredErrors:
         times_drawn = generator.multinomial(
             block_count, np.full(block_count, 1.0 / block_count), BOOTSTRAP_DRAWS
         )
-        before = times_drawn @ self.before
-        after = times_drawn @ self.after
+        sums_before = times_drawn @ self.before
+        sums_after = times_drawn @ self.after
         # a draw of blocks without any error has no share
-        has_error = before > 0.0
-        shares = 1.0 - after[has_error] / before[has_error]
+        has_error = sums_before > 0.0
+        shares = 1.0 - sums_after[has_error] / sums_before[has_error]
         low, high = np.quantile(shares, (0.05, 0.95))
         return float(low), float(high)
 
 
-def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
+def squared_errors(residuals_before: ResidualSet, residuals_after: ResidualSet) -> SquaredErrors:
     """Return the sums of squares of residuals without and with a hypothesis, over the same noise.
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials without and with the hypothesis.
     """
     block_sums = []
-    for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
+    for without_effect, with_effect in zip(
+        residuals_before.trials, residuals_after.trials, strict=True
+    ):
         noise = without_effect.noise_deviation
-        used = without_effect.used & with_effect.used
-        squares_before = np.where(used, without_effect.residual / noise, 0.0) ** 2
-        squares_after = np.where(used, with_effect.residual / noise, 0.0) ** 2
-        samples = np.arange(len(used))
+        is_used = without_effect.used & with_effect.used
+        squares_before = np.where(is_used, without_effect.residual / noise, 0.0) ** 2
+        squares_after = np.where(is_used, with_effect.residual / noise, 0.0) ** 2
+        samples = np.arange(len(is_used))
         for block in np.array_split(samples, _block_count(without_effect)):
             sums = (float(squares_before[block].sum()), float(squares_after[block].sum()))
             block_sums.append(sums)
@@ -115,35 +120,35 @@ def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
     return SquaredErrors(sums_before, sums_after)
 
 
-def _block_count(fitted: FittedTrial) -> int:
+def _block_count(fitted_trial: FittedTrial) -> int:
     """Return the number of blocks of a trial for the bootstrap.
 
     A static trial is one block, as its rows are different loads and no repetition of each other.
     """
-    if not fitted.trial.is_dynamic:
+    if not fitted_trial.trial.is_dynamic:
         return 1
-    return min(BLOCKS_OF_TRIAL, max(1, len(fitted.used) // SHORTEST_BLOCK))
+    return min(BLOCKS_OF_TRIAL, max(1, len(fitted_trial.used) // SHORTEST_BLOCK))
 
 
-def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
+def closed_share(residuals_before: ResidualSet, residuals_after: ResidualSet) -> ClosedShare | None:
     """Return the share of the mean square error that a hypothesis removes; None without an error.
 
     Parameters
     ----------
-    before, after : ResidualSet
-        All trials of a campaign without and with the hypothesis. The share is that of the held-out
-        trials if there are any, else that of the fitted ones.
+    residuals_before, residuals_after : ResidualSet
+        All trials of a campaign without and with the hypothesis. The share is computed in the
+        held-out trials if there are any, else in the fitted trials.
     """
-    trials = "fitted"
-    if before.held_out is not None and after.held_out is not None:
-        trials = "held-out"
-        before = before.held_out
-        after = after.held_out
-    errors = squared_errors(before, after)
+    trial_role = "fitted"
+    if residuals_before.held_out is not None and residuals_after.held_out is not None:
+        trial_role = "held-out"
+        residuals_before = residuals_before.held_out
+        residuals_after = residuals_after.held_out
+    errors = squared_errors(residuals_before, residuals_after)
     if not errors.before.sum() > 0.0:
         return None
     low, high = errors.interval()
-    return ClosedShare(errors.share, low, high, trials, len(before.trials))
+    return ClosedShare(errors.share, low, high, trial_role, len(residuals_before.trials))
 
 
 def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
@@ -151,8 +156,8 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
     rms: dict[str, float] = {}
     for name in residuals.channel_names:
         squares = []
-        for fitted, column, used in channel_fits(residuals.trials, name):
-            squares.append(fitted.residual[used, column] ** 2)
+        for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
+            squares.append(fitted_trial.residual[is_used, column] ** 2)
         all_squares = np.concatenate(squares)
         if all_squares.size:
             rms[name] = float(np.sqrt(all_squares.mean()))
@@ -162,12 +167,12 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
 # ---------------------------------------------------------------- words
 
 
-def percent_with_interval(closed: ClosedShare) -> str:
+def percent_with_interval(share: ClosedShare) -> str:
     """Return a share in percent with its interval, if it has one, as in "93.1 % (91 to 95)"."""
     interval = ""
-    if isfinite(closed.low) and isfinite(closed.high):
-        interval = f" ({_percent_text(closed.low)} to {_percent_text(closed.high)})"
-    return f"{_percent_text(closed.value)} %{interval}"
+    if isfinite(share.low) and isfinite(share.high):
+        interval = f" ({_percent_text(share.low)} to {_percent_text(share.high)})"
+    return f"{_percent_text(share.value)} %{interval}"
 
 
 def _percent_text(share: float) -> str:
@@ -178,47 +183,49 @@ def _percent_text(share: float) -> str:
     return f"{percent:.3g}"
 
 
-def compared_trials_text(closed: ClosedShare) -> str:
+def compared_trials_text(share: ClosedShare) -> str:
     """Return in words the trials that a share refers to."""
-    role = "not fitted" if closed.trials == "held-out" else "fitted"
-    if closed.trial_count == 1:
+    role = "not fitted" if share.trials == "held-out" else "fitted"
+    if share.trial_count == 1:
         return f"one trial that was {role}"
-    return f"{counted(closed.trial_count, 'trial')} that were {role}"
+    return f"{counted(share.trial_count, 'trial')} that were {role}"
 
 
 def rms_errors_text(
-    channels: Mapping[str, Channel], before: Mapping[str, float], after: Mapping[str, float]
+    channels: Mapping[str, Channel], rms_before: Mapping[str, float], rms_after: Mapping[str, float]
 ) -> str:
     """Return rms errors before and after in the units of their channels, as in "x 3.6 to 0.95 mm".
 
     Parameters
     ----------
     channels : mapping of str to Channel
-        The channels by name.
-    before, after : mapping of str to float
+        The channels of the campaign by name.
+    rms_before, rms_after : mapping of str to float
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
     # the largest error over its noise first
     names = sorted(
-        before,
-        key=lambda name: -before[name] / _recorded_noise_or_fallback(channels[name], before[name]),
+        rms_before,
+        key=lambda name: (
+            -rms_before[name] / _recorded_noise_or_fallback(channels[name], rms_before[name])
+        ),
     )
     channel_texts = []
     for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
-        change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
+        change = f"{factor * rms_before[name]:.3g} to {factor * rms_after.get(name, nan):.3g}"
         change = f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
         channel_texts.append(f"{name} {change}")
-    remaining = len(names) - CHANNELS_MENTIONED
-    if remaining > 0:
-        channel_texts.append(f"{remaining} more in the report")
+    unmentioned_count = len(names) - CHANNELS_MENTIONED
+    if unmentioned_count > 0:
+        channel_texts.append(f"{unmentioned_count} more in the report")
     return ", ".join(channel_texts)
 
 
 def _recorded_noise_or_fallback(channel: Channel, fallback: float) -> float:
     """Return the recorded noise deviation of a channel, or a fallback without a record; never 0."""
-    recorded = channel.noise.standard_deviation if channel.noise is not None else 0.0
-    return recorded or fallback or 1.0
+    recorded_deviation = channel.noise.standard_deviation if channel.noise is not None else 0.0
+    return recorded_deviation or fallback or 1.0
 
 
 def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) -> str:
@@ -227,17 +234,17 @@ def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) 
     Parameters
     ----------
     channels : mapping of str to Channel
-        The channels by name.
+        The channels of the campaign by name.
     errors : ErrorComparison
         The errors without and with the hypothesis; they must have a share.
     """
-    closed = errors.closed
-    assert closed is not None
+    share = errors.closed
+    assert share is not None
     rms_errors = rms_errors_text(channels, errors.rms_before, errors.rms_after)
-    trials = compared_trials_text(closed)
-    if closed.has_grown:
+    trials = compared_trials_text(share)
+    if share.has_grown:
         return f"it makes the error in {trials} larger (rms of {rms_errors})"
     return (
-        f"it explains {percent_with_interval(closed)} of the mean square error in {trials} "
+        f"it explains {percent_with_interval(share)} of the mean square error in {trials} "
         f"(rms of {rms_errors})"
     )

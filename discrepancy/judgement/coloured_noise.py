@@ -29,10 +29,10 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
     """
     problem = comparison.problem
     search = comparison.search
-    best = search.best()
+    best_fit = search.best()
     no_effect = search.compared_no_effect
     probabilities = search.set_probabilities()
-    conclusion = Conclusion.from_probabilities(search, best, probabilities)
+    conclusion = Conclusion.from_probabilities(search, best_fit, probabilities)
     # the model without effect
     no_effect_gate = check_absolute_fit(problem, no_effect)
     probability_of_none = probabilities.get((), 0.0)
@@ -45,22 +45,22 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
         return _nothing_missing_outcome(conclusion, no_effect, no_effect_gate, probability_of_none)
     # the best hypothesis
     if (
-        not best.candidate.terms
-        or best.candidate.has_free_shape
-        or not _residuals_have_recorded_colour(best)
+        not best_fit.candidate.terms
+        or best_fit.candidate.has_free_shape
+        or not _residuals_have_recorded_colour(best_fit)
     ):
         return None
-    probability = comparison.probability(best)
-    held_out_residuals = comparison.search.residuals(replace(best, residual_process=None))
+    probability = comparison.probability(best_fit)
+    held_out_residuals = comparison.search.residuals(replace(best_fit, residual_process=None))
     gates = (
-        check_absolute_fit(problem, best),
-        check_consistency(problem, best),
+        check_absolute_fit(problem, best_fit),
+        check_consistency(problem, best_fit),
         check_held_out(held_out_residuals),
     )
     if probability < SEARCH.name_probability or any(gate.has_failed for gate in gates):
         return None
     return conclusion.build_named_outcome(
-        best, probability, gates, remainder_estimates(problem, best)
+        best_fit, probability, gates, remainder_estimates(problem, best_fit)
     )
 
 

@@ -98,7 +98,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         Parameters
         ----------
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters from which the fit begins.
         """
@@ -144,14 +144,14 @@ class Comparison(ABC, Generic[HypothesisT]):
     def errors(self, hypothesis: HypothesisT) -> ErrorComparison:
         """Return the errors of simulations without and with a hypothesis.
 
-        They are those of simulations even if hypotheses are compared by the missing force.
+        Simulations are taken even if the hypotheses are compared by the missing force.
         """
         return errors_of_fit(self.search, self.simulation(hypothesis))
 
     def closed_share_clause(self, hypothesis: HypothesisT) -> str:
         """Return the share of the mean square error that a hypothesis removes, as a clause.
 
-        It is the reason why there is no share, if there is none.
+        If there is no share, the clause states the reason.
         """
         errors = self.errors(hypothesis)
         if errors.closed is None:
@@ -169,9 +169,10 @@ class Comparison(ABC, Generic[HypothesisT]):
     # ---------------------------------------------------------------- which may be named
 
     def held_out_or_fitted_share(self, hypothesis: HypothesisT) -> GapShare:
-        """Return the share of the gap by which a hypothesis is judged.
+        """Return the explained share of the gap that decides about a hypothesis.
 
-        It is that in held-out trials if these can test the hypothesis, else that in fitted trials.
+        The share in held-out trials is taken if these trials can test the hypothesis, else the
+        share in fitted trials.
         """
         if self.has_held_out:
             held_out_share = self.gap_share(hypothesis, held_out=True)
@@ -197,8 +198,8 @@ class Comparison(ABC, Generic[HypothesisT]):
             )
         if self.has_held_out and not self._survives_held_out(hypothesis, self.least_low_end):
             held_out_share = self.gap_share(hypothesis, held_out=True)
-            remaining = self.unexplained_text(hypothesis, held_out_share)
-            return f"in trials that were not fitted it leaves {remaining}"
+            unexplained_text = self.unexplained_text(hypothesis, held_out_share)
+            return f"in trials that were not fitted it leaves {unexplained_text}"
         implausible = self._implausible_unknowns(hypothesis)
         if implausible:
             return f"it needs {implausible} far outside their priors: check these priors"
@@ -211,11 +212,11 @@ class Comparison(ABC, Generic[HypothesisT]):
         `SEARCH.prior_widening` times the stated ones, since calibrated values also compensate
         errors that the hypothesis does not explain.
         """
-        shared = self.problem.shared
-        has_prior = shared.precision > 0.0
+        layout = self.problem.shared
+        has_prior = layout.precision > 0.0
         indices_by_kind = {
-            "calibrated parameters": slice(shared.parameter_count),
-            "gains": slice(shared.parameter_count, None),
+            "calibrated parameters": slice(layout.parameter_count),
+            "gains": slice(layout.parameter_count, None),
         }
         for kind, indices in indices_by_kind.items():
             scaled_values = hypothesis.shared[indices][has_prior[indices]]
@@ -238,7 +239,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         Parameters
         ----------
         hypothesis : HypothesisT
-            The hypothesis.
+            The hypothesis that the trials judge.
         least_low_end : float
             The least lower end of the interval of its share in held-out trials.
         """
@@ -255,7 +256,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         they describe whatever the law does not explain. A set without them keeps the score of the
         whole set.
         """
-        contenders: dict[CandidateKey, tuple[HypothesisT, float]] = {}
+        contenders_with_scores: dict[CandidateKey, tuple[HypothesisT, float]] = {}
         for hypothesis in self.ranked_hypotheses:
             terms = hypothesis.candidate.terms
             law_indices = [
@@ -264,68 +265,80 @@ class Comparison(ABC, Generic[HypothesisT]):
             laws_only: HypothesisT | None = hypothesis
             if 0 < len(law_indices) < len(terms):
                 laws_only = self._fit_subset(hypothesis, law_indices)
-            if not terms or laws_only is None or laws_only.candidate.key in contenders:
+            if not terms or laws_only is None or laws_only.candidate.key in contenders_with_scores:
                 continue
             if not self.objection_to_naming(laws_only):
-                contenders[laws_only.candidate.key] = (laws_only, self.score(hypothesis))
-        best_score = max((score for _, score in contenders.values()), default=0.0)
+                contenders_with_scores[laws_only.candidate.key] = (
+                    laws_only,
+                    self.score(hypothesis),
+                )
+        best_score = max((score for _, score in contenders_with_scores.values()), default=0.0)
         least_score = best_score - SEARCH.contender_range
-        return [hypothesis for hypothesis, score in contenders.values() if score > least_score]
+        return [
+            hypothesis
+            for hypothesis, score in contenders_with_scores.values()
+            if score > least_score
+        ]
 
     def _fit_subset(
         self, hypothesis: HypothesisT, term_indices: Sequence[int]
     ) -> HypothesisT | None:
-        """Return the hypothesis of some terms of a hypothesis, given their indices.
+        """Return the hypothesis that has only some of the effects of a given hypothesis.
 
-        It is None if these terms cannot be fitted alone.
+        The effects are given by their indices in the candidate. None is returned if they cannot be
+        fitted without the others.
         """
-        candidate, effect = hypothesis.candidate.subset_of_terms(term_indices, hypothesis.effect)
+        candidate, effect_values = hypothesis.candidate.subset_of_terms(
+            term_indices, hypothesis.effect
+        )
         key = candidate.key
-        for fitted in self.ranked_hypotheses:
-            if fitted.candidate.key == key:
-                return fitted
+        for ranked_hypothesis in self.ranked_hypotheses:
+            if ranked_hypothesis.candidate.key == key:
+                return ranked_hypothesis
         if key not in self._subsets:
-            self._subsets[key] = self.fit_candidate(candidate, effect)
+            self._subsets[key] = self.fit_candidate(candidate, effect_values)
         return self._subsets[key]
 
-    def simplest_equivalent_hypothesis(self, best: HypothesisT) -> HypothesisT:
+    def simplest_equivalent_hypothesis(self, best_hypothesis: HypothesisT) -> HypothesisT:
         """Return the simplest hypothesis that explains nearly as much of the gap as the best one.
 
         The simplest has the fewest effects, then the fewest free shapes, then the highest score.
         """
-        count = len(best.candidate.terms)
+        effect_count = len(best_hypothesis.candidate.terms)
         options: dict[CandidateKey, HypothesisT] = {}
         for hypothesis in self.ranked_hypotheses:
             options[hypothesis.candidate.key] = hypothesis
-        if count > 1:
-            for term_index in range(count):
-                single = self._fit_subset(best, [term_index])
-                if single is not None:
-                    options[single.candidate.key] = single
-        simpler = [option for option in options.values() if self._is_simpler(option, best)]
+        if effect_count > 1:
+            for term_index in range(effect_count):
+                single_effect = self._fit_subset(best_hypothesis, [term_index])
+                if single_effect is not None:
+                    options[single_effect.candidate.key] = single_effect
+        simpler_options = [
+            option for option in options.values() if self._is_simpler(option, best_hypothesis)
+        ]
         return min(
-            simpler,
+            simpler_options,
             key=lambda hypothesis: (*_complexity(hypothesis), -self.score(hypothesis)),
-            default=best,
+            default=best_hypothesis,
         )
 
-    def _is_simpler(self, option: HypothesisT, best: HypothesisT) -> bool:
+    def _is_simpler(self, option: HypothesisT, best_hypothesis: HypothesisT) -> bool:
         """Return whether a hypothesis may replace the best one because it is simpler.
 
         Its families must be among those of the best one, it must explain nearly the same share of
         the gap, and it must be one that may be named.
         """
-        if not option.candidate.terms or _complexity(option) >= _complexity(best):
+        if not option.candidate.terms or _complexity(option) >= _complexity(best_hypothesis):
             return False
-        if not family_place_pairs(option) <= family_place_pairs(best):
+        if not family_place_pairs(option) <= family_place_pairs(best_hypothesis):
             return False
         # Any further parameter explains a little more of the fitted trials, by fitting noise. So
         # the simpler hypothesis may explain less there, by three times the tolerance.
-        best_fitted_share = self.gap_share(best, held_out=False).value
+        best_fitted_share = self.gap_share(best_hypothesis, held_out=False).value
         least_fitted_share = best_fitted_share - 3.0 * SEARCH.least_added_share
         if self.gap_share(option, held_out=False).value <= least_fitted_share:
             return False
-        best_share = self.held_out_or_fitted_share(best).value
+        best_share = self.held_out_or_fitted_share(best_hypothesis).value
         least_share = best_share - SEARCH.least_added_share
         if self.held_out_or_fitted_share(option).value <= least_share:
             return False
@@ -338,22 +351,25 @@ class Comparison(ABC, Generic[HypothesisT]):
         its families at their places. Hypotheses that trials refute have no probability.
         """
         not_refuted = []
-        for compared in self.ranked_hypotheses:
-            is_asked = any(compared is hypothesis for hypothesis in hypotheses)
-            if is_asked or not compared.candidate.terms or not self._is_refuted_by_trials(compared):
-                not_refuted.append(compared)
-        scores = np.array([self.score(compared) for compared in not_refuted])
-        families_asked = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
-        includes_asked = []
-        for compared in not_refuted:
-            families = family_place_pairs(compared)
-            includes_asked.append(
-                any(asked_families <= families for asked_families in families_asked)
-            )
-        is_true_with_asked = np.array(includes_asked)
-        if not is_true_with_asked.any():
+        for ranked_hypothesis in self.ranked_hypotheses:
+            is_asked_about = any(ranked_hypothesis is hypothesis for hypothesis in hypotheses)
+            has_effects = bool(ranked_hypothesis.candidate.terms)
+            if (
+                is_asked_about
+                or not has_effects
+                or not self._is_refuted_by_trials(ranked_hypothesis)
+            ):
+                not_refuted.append(ranked_hypothesis)
+        scores = np.array([self.score(hypothesis) for hypothesis in not_refuted])
+        # the hypotheses of which one is true exactly if one of those asked about is true
+        families_asked_about = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
+        is_counted = np.zeros(len(not_refuted), dtype=bool)
+        for index, hypothesis in enumerate(not_refuted):
+            families = family_place_pairs(hypothesis)
+            is_counted[index] = any(asked <= families for asked in families_asked_about)
+        if not is_counted.any():
             return 0.0
-        return float(np.exp(logsumexp(scores[is_true_with_asked]) - logsumexp(scores)))
+        return float(np.exp(logsumexp(scores[is_counted]) - logsumexp(scores)))
 
     def _is_refuted_by_trials(self, hypothesis: HypothesisT) -> bool:
         """Return whether trials show that a hypothesis does not explain enough of the gap."""
@@ -362,24 +378,25 @@ class Comparison(ABC, Generic[HypothesisT]):
             return True
         return self.has_held_out and not self._survives_held_out(hypothesis, 0.0)
 
-    def competing_hypotheses(self, best: HypothesisT) -> list[HypothesisT]:
+    def competing_hypotheses(self, best_hypothesis: HypothesisT) -> list[HypothesisT]:
         """Return the hypotheses that could be named instead of the best one.
 
-        The data do not separate them from it: their score is within `SEARCH.force_rival_range` of
-        that of the best one, and their share of the gap is not smaller beyond chance.
+        The data do not separate a competing hypothesis from the best one: its score is within
+        `SEARCH.force_rival_range` of the best score, and its share of the gap is not smaller beyond
+        chance.
 
         Parameters
         ----------
-        best : HypothesisT
+        best_hypothesis : HypothesisT
             The hypothesis that would be named.
         """
-        best_share = self.held_out_or_fitted_share(best)
-        least_competing_score = self.score(best) - SEARCH.force_rival_range
+        best_share = self.held_out_or_fitted_share(best_hypothesis)
+        least_competing_score = self.score(best_hypothesis) - SEARCH.force_rival_range
         by_effects: dict[EffectPlacePairs, HypothesisT] = {}
         for hypothesis in self.nameable_hypotheses:
             candidate = hypothesis.candidate
-            is_same_family = family_place_pairs(hypothesis) == family_place_pairs(best)
-            is_longer = len(candidate.terms) > len(best.candidate.terms)
+            is_same_family = family_place_pairs(hypothesis) == family_place_pairs(best_hypothesis)
+            is_longer = len(candidate.terms) > len(best_hypothesis.candidate.terms)
             # no competitors: the same law with a free shape, and hypotheses of more effects
             if (candidate.has_free_shape and is_same_family) or is_longer:
                 continue
@@ -387,7 +404,7 @@ class Comparison(ABC, Generic[HypothesisT]):
                 continue
             if not best_share.is_larger_than(self.held_out_or_fitted_share(hypothesis)):
                 by_effects.setdefault(effect_place_pairs(hypothesis), hypothesis)
-        by_effects.pop(effect_place_pairs(best), None)
+        by_effects.pop(effect_place_pairs(best_hypothesis), None)
         return list(by_effects.values())
 
 
@@ -408,6 +425,6 @@ def effect_place_pairs(hypothesis: ComparedHypothesis) -> EffectPlacePairs:
 
 
 def _complexity(hypothesis: ComparedHypothesis) -> tuple[int, int]:
-    """Return the number of effects of a hypothesis, and of those whose shape is free."""
+    """Return how many effects a hypothesis has, and how many of them have a free shape."""
     terms = hypothesis.candidate.terms
     return len(terms), sum(term.free_shape for term in terms)

@@ -86,7 +86,7 @@ class Conclusion:
     Attributes
     ----------
     search : Search
-        The search.
+        The search with all of its fits.
     log_bayes_factor : float
         ln of the evidence of the best hypothesis over that of the model without effect.
     hypotheses : sequence of WeightedHypothesis
@@ -99,24 +99,26 @@ class Conclusion:
 
     @classmethod
     def from_probabilities(
-        cls, search: Search, best: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
+        cls, search: Search, best_fit: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
     ) -> "Conclusion":
         """Return the conclusion on the sets of effects of a search.
 
         Parameters
         ----------
         search : Search
-            The search.
-        best : CandidateFit
+            The search with all of its fits.
+        best_fit : CandidateFit
             The best set of effects. For the Bayes factor its evidence is divided by the number of
             places from which its places were chosen.
         probabilities : mapping of tuple of str to float
             The probability of each set of identifiers, the most probable first.
         """
         setting = search.problem.setting
-        log_places = sum(np.log(len(term.effect.places(setting))) for term in best.candidate.terms)
+        log_places = sum(
+            np.log(len(term.effect.places(setting))) for term in best_fit.candidate.terms
+        )
         no_effect = search.compared_no_effect
-        log_bayes_factor = float(best.log_evidence - log_places - no_effect.log_evidence)
+        log_bayes_factor = float(best_fit.log_evidence - log_places - no_effect.log_evidence)
         hypotheses = [
             WeightedHypothesis(search.best_fit_of_set(names), probability)
             for names, probability in probabilities.items()
@@ -128,11 +130,11 @@ class Conclusion:
         """The probability of each effect to be one of the missing effects, by its identifier."""
         inclusion = {}
         for effect in self.search.effects:
-            total: float = 0
+            total_probability: float = 0
             for hypothesis, probability in self.hypotheses:
                 if effect.identifier in names_without_free_shape(hypothesis.candidate.identifiers):
-                    total += probability
-            inclusion[effect.identifier] = total
+                    total_probability += probability
+            inclusion[effect.identifier] = total_probability
         return inclusion
 
     def build_outcome(
@@ -192,7 +194,7 @@ class Conclusion:
         Parameters
         ----------
         fit : CandidateFit
-            The fit.
+            The fit of a hypothesis to all trials.
         probability : float
             The probability of the set.
         gates : tuple of Gate
@@ -224,7 +226,7 @@ class Conclusion:
         Parameters
         ----------
         fit : CandidateFit
-            The fit.
+            The fit of a hypothesis to all trials.
         probability : float
             The probability of the set.
         gates : tuple of Gate
@@ -322,7 +324,9 @@ def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatA
 
 
 def _estimate(
-    parameter: EffectParameter | ShapeParameter, scaled: float, bounds: tuple[float, float]
+    parameter: EffectParameter | ShapeParameter,
+    scaled_value: float,
+    scaled_ends: tuple[float, float],
 ) -> Estimate:
     """Return the estimate of a parameter in its unit.
 
@@ -330,15 +334,15 @@ def _estimate(
     ----------
     parameter : EffectParameter or ShapeParameter
         The parameter, whose prior maps scaled to physical values.
-    scaled : float
-        The scaled value.
-    bounds : tuple of float
+    scaled_value : float
+        The value on the scale on which the prior is standard normal.
+    scaled_ends : tuple of float
         The ends of its scaled 90 % interval.
     """
-    ends = [parameter.prior.value(bound) for bound in bounds]
+    ends = [parameter.prior.value(scaled_end) for scaled_end in scaled_ends]
     return Estimate(
         name=parameter.name,
-        value=parameter.prior.value(scaled),
+        value=parameter.prior.value(scaled_value),
         low=min(ends),
         high=max(ends),
         unit=parameter.unit,
@@ -366,14 +370,14 @@ def calibrated_parameters(
     scaled_variances = np.diag(hypothesis.covariance)[: layout.parameter_count]
     scaled_deviations = np.sqrt(np.maximum(scaled_variances, 0.0))
     deviations = layout.scale[: layout.parameter_count] * scaled_deviations
-    calibrated = []
+    parameter_records = []
     for parameter, value, deviation in zip(
         problem.model.parameters, values, deviations, strict=True
     ):
-        calibrated.append(
+        parameter_records.append(
             CalibratedParameter(parameter.name, float(value), float(deviation), parameter.unit)
         )
-    return tuple(calibrated)
+    return tuple(parameter_records)
 
 
 # ---------------------------------------------------------------- words
@@ -404,14 +408,14 @@ def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
     Parameters
     ----------
     names : sequence of str
-        The identifiers of the effects, of which the first four are mentioned.
+        The identifiers of the effects. The first four are mentioned in the sentence.
     noise_clause : str
         A clause on the noise, such as " that is coloured".
     """
-    nearest = f"; the nearest are {', '.join(names[:4])}" if names else ""
+    nearest_clause = f"; the nearest are {', '.join(names[:4])}" if names else ""
     return (
         "Something may be missing, but it is too small for these data to distinguish from "
-        f"noise{noise_clause}{nearest}."
+        f"noise{noise_clause}{nearest_clause}."
     )
 
 

@@ -76,7 +76,7 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit of the effects that would be named.
 
@@ -117,7 +117,7 @@ def score_tests(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit, converged, with its derivatives.
     groups : mapping of str to mapping of str to Direction
@@ -135,10 +135,12 @@ def score_tests(
     effect_precision = np.where(is_determined, 0.0, 1.0)
     screen = Screen(problem, fit, record_noise=False, effect_precision=effect_precision)
     tests = []
-    for name, group in groups.items():
-        projected = _projected_directions(problem, screen, group)
-        if projected.labels:
-            test = _score_test(name, projected, _noise_freedom(problem, fit, group.values()))
+    for name, directions in groups.items():
+        projected_directions = _projected_directions(problem, screen, directions)
+        if projected_directions.labels:
+            test = _score_test(
+                name, projected_directions, _noise_freedom(problem, fit, directions.values())
+            )
             if test is not None:
                 tests.append(test)
     return tests
@@ -163,24 +165,24 @@ class _ProjectedDirections(NamedTuple):
 
 
 def _projected_directions(
-    problem: Problem, screen: Screen, group: Mapping[str, Direction]
+    problem: Problem, screen: Screen, directions: Mapping[str, Direction]
 ) -> _ProjectedDirections:
     """Return directions without the part that nuisances and effect parameters can compensate.
 
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     screen : Screen
         The fit, with its nuisances and effect parameters eliminated.
-    group : mapping of str to Direction
+    directions : mapping of str to Direction
         The directions by their names.
     """
     signs = screen.inner_product_signs
     labels = []
     unit_vectors = []
     scores = []
-    for label, direction in group.items():
+    for label, direction in directions.items():
         changes = {}
         for trial_index, change in direction.items():
             changes[trial_index] = problem.trials[trial_index].standardise(change)
@@ -213,11 +215,11 @@ class _NoiseFreedom(NamedTuple):
 
 
 def _noise_freedom(
-    problem: Problem, fit: CandidateFit, group: Iterable[Direction]
+    problem: Problem, fit: CandidateFit, directions: Iterable[Direction]
 ) -> _NoiseFreedom:
     """Return the degrees of freedom of the noise of the channels that directions change."""
     channels: set[int] = set()
-    for direction in group:
+    for direction in directions:
         for trial_index, change in direction.items():
             is_changed = np.any(change != 0.0, axis=0)
             channels.update(problem.trials[trial_index].channel_indices[is_changed].tolist())
@@ -230,7 +232,7 @@ def _noise_freedom(
 
 
 def _score_test(
-    name: str, projected: _ProjectedDirections, noise: _NoiseFreedom
+    name: str, directions: _ProjectedDirections, noise: _NoiseFreedom
 ) -> ScoreTest | None:
     """Return the score test of a group of directions; None if nothing can be tested.
 
@@ -240,13 +242,13 @@ def _score_test(
     ----------
     name : str
         The name of the group.
-    projected : _ProjectedDirections
-        The directions.
+    directions : _ProjectedDirections
+        The directions of the group, after projection.
     noise : _NoiseFreedom
         The degrees of freedom of the noise of the channels that they change.
     """
-    gradient = projected.gradient
-    eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
+    gradient = directions.gradient
+    eigenvalues, eigenvectors = np.linalg.eigh(directions.information)
     is_independent = eigenvalues > LEAST_REMAINING_LENGTH
     direction_count = int(is_independent.sum())
     gradient_components = (eigenvectors.T @ gradient)[is_independent]
@@ -254,44 +256,46 @@ def _score_test(
     if not direction_count or noise.freedom - direction_count < LEAST_FREEDOM:
         return None
     # the strongest direction by itself
-    single_information = np.diag(projected.information)
-    single_information = np.where(
-        single_information > LEAST_REMAINING_LENGTH, single_information, np.inf
+    information_of_single = np.diag(directions.information)
+    information_of_single = np.where(
+        information_of_single > LEAST_REMAINING_LENGTH, information_of_single, np.inf
     )
-    z_scores = np.abs(gradient) / np.sqrt(single_information)
+    z_scores = np.abs(gradient) / np.sqrt(information_of_single)
     strongest = int(np.argmax(z_scores))
     return ScoreTest(
         name=name,
         statistic=statistic,
         count=direction_count,
         p_value=_p_value(statistic, direction_count, noise),
-        strongest=f"{projected.labels[strongest]} ({z_scores[strongest]:.1f} deviations)",
+        strongest=f"{directions.labels[strongest]} ({z_scores[strongest]:.1f} deviations)",
     )
 
 
-def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
+def _p_value(statistic: float, direction_count: int, noise: _NoiseFreedom) -> float:
     """Return the p-value of a score statistic: by χ² if the noise is known, else by an F test.
 
     Parameters
     ----------
     statistic : float
-        The score statistic.
-    count : int
+        The score statistic, see `_score_test`.
+    direction_count : int
         The number of independent directions.
     noise : _NoiseFreedom
         The degrees of freedom of the noise estimate.
     """
     if isinf(noise.freedom):
-        return float(chi2.sf(statistic, count))
+        return float(chi2.sf(statistic, direction_count))
     # The statistic is in units of the noise variance estimated by all degrees of freedom. In units
     # of the variance estimated by the remaining ones, the sum of squares before the test is
     # `freedom`, and freedom - statistic is what the directions do not explain.
     scaled_statistic = statistic * noise.remaining_share
     if scaled_statistic >= noise.freedom:
         return 0.0
-    remaining_freedom = noise.freedom - count
-    f_ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
-    return float(f.sf(f_ratio, count, remaining_freedom))
+    remaining_freedom = noise.freedom - direction_count
+    f_ratio = (scaled_statistic / direction_count) / (
+        (noise.freedom - scaled_statistic) / remaining_freedom
+    )
+    return float(f.sf(f_ratio, direction_count, remaining_freedom))
 
 
 # ---------------------------------------------------------------- directions
@@ -345,54 +349,54 @@ def directions_by_test(
 
 
 def _add_load_directions(
-    collected: _DirectionGroups, problem: Problem, trial_index: int, response: FloatArray
+    groups: _DirectionGroups, problem: Problem, trial_index: int, response: FloatArray
 ) -> None:
     """Add the size, zero and slope over the span of the response of a trial under load.
 
     Parameters
     ----------
-    collected : _DirectionGroups
-        The directions.
+    groups : _DirectionGroups
+        The collection to which the directions are added.
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial.
     response : (N, C) array
-        Its response to the load.
+        The response of each channel to the load [unit of the channel].
     """
     data = problem.trials[trial_index]
     is_static = data.trial.kind is TrialKind.STATIC
     group = "static loads" if is_static else "loads of flight"
     place_text = _load_place_text(data) if is_static else "in flight"
-    collected.add_change(group, f"the size {place_text}", trial_index, response)
+    groups.add_change(group, f"the size {place_text}", trial_index, response)
     if is_static:
         zero = response[np.argmax(np.abs(data.trial.force))]
-        collected.add_change(
+        groups.add_change(
             group, f"the zero {place_text}", trial_index, np.broadcast_to(zero, response.shape)
         )
     positions = _positions_along_span(problem, data)
     if positions is not None:
         label = f"the slope over the span {place_text}"
-        collected.add_change(group, label, trial_index, response * positions)
+        groups.add_change(group, label, trial_index, response * positions)
 
 
-def _add_run_zeros(collected: _DirectionGroups, problem: Problem, trial_index: int) -> None:
+def _add_run_zeros(groups: _DirectionGroups, problem: Problem, trial_index: int) -> None:
     """Add, for each quantity, a zero that all its channels have in common in a static run."""
     data = problem.trials[trial_index]
     trial = data.trial
     quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
     run_text = f"in run {trial.run}" if trial.run else "in the runs without a label"
     for quantity in sorted(set(quantities)):
-        is_quantity = np.array([other is quantity for other in quantities])
+        is_quantity = np.array([channel_quantity is quantity for channel_quantity in quantities])
         zero = is_quantity * _zero_scale(problem, quantity)
         label = f"the zero of {quantity.value} {run_text}"
-        collected.add_change(
+        groups.add_change(
             "zeros of the static runs", label, trial_index, np.broadcast_to(zero, data.weight.shape)
         )
 
 
 def _add_channel_directions(
-    collected: _DirectionGroups,
+    groups: _DirectionGroups,
     problem: Problem,
     trial_index: int,
     channel: str,
@@ -403,10 +407,10 @@ def _add_channel_directions(
 
     Parameters
     ----------
-    collected : _DirectionGroups
-        The directions.
+    groups : _DirectionGroups
+        The collection to which the directions are added.
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial.
     channel : str
@@ -424,9 +428,9 @@ def _add_channel_directions(
     if kind is TrialKind.STATIC:
         trials_text = _load_place_text(data)
     group = f"channel {channel}"
-    collected.add_change(group, f"the size {trials_text}", trial_index, response * is_channel)
+    groups.add_change(group, f"the size {trials_text}", trial_index, response * is_channel)
     drift = zero * data.trial.start / last_start * np.ones(response.shape) * is_channel
-    collected.add_change(group, "the zero over time", trial_index, drift)
+    groups.add_change(group, "the zero over time", trial_index, drift)
 
 
 def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -> FloatArray:
@@ -463,8 +467,8 @@ def _load_place_text(data: TrialData) -> str:
 def _positions_along_span(problem: Problem, data: TrialData) -> FloatArray | None:
     """Return the position of each channel along the span (C,); None with too few stations.
 
-    It is the difference of the channel's station from their mean, over their range; 0 for a channel
-    without a station.
+    A position is the station of the channel minus the mean of all stations, divided by their range.
+    It is 0 for a channel without a station.
     """
     stations = [problem.campaign.channels[name].station for name in data.trial.channels]
     station_values = np.array([np.nan if station is None else station for station in stations])

@@ -35,7 +35,7 @@ class _Nuisance(NamedTuple):
     key : str
         The key of its deviation in `[[channel]]`.
     noun : str
-        Its name.
+        The name of the property in sentences.
     wide_deviation : float
         The prior standard deviation with which it is fitted as an unknown.
     """

@@ -72,7 +72,12 @@ class ForceComparison(Comparison[ForceHypothesis]):
         (term,) = hypothesis.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
         return next(
-            (fitted for fitted in self.ranked_hypotheses if fitted.candidate.key == key), None
+            (
+                ranked_hypothesis
+                for ranked_hypothesis in self.ranked_hypotheses
+                if ranked_hypothesis.candidate.key == key
+            ),
+            None,
         )
 
     def start_point(self, hypothesis: ForceHypothesis) -> Point:
@@ -120,10 +125,12 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     def gap_sentence(self) -> str:
         """Return a sentence on the size and port of the missing force, and on what it depends."""
-        missing = missing_force(self.force_search, self.force_search.hypothesis_of_best_port())
-        if missing is None:
+        force_of_best_port = missing_force(
+            self.force_search, self.force_search.hypothesis_of_best_port()
+        )
+        if force_of_best_port is None:
             return ""
-        force = missing.at_port
+        force = force_of_best_port.at_port
         order = "ordered by none of displacement, velocity, amplitude and time"
         if force.ordered_by:
             variables = " and ".join(force.ordered_by)

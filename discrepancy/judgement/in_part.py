@@ -179,19 +179,20 @@ def _key_of_notable_terms(
 ) -> set[tuple[str, str]]:
     """Return the pairs (label, place) of the effects of a fit that are worth a name of their own.
 
-    Errors of instruments that are too small are not. If the campaign has one channel under a
-    recorded drive, no error of readings is.
+    Errors of instruments that are too small to be named are left out. So are all errors of readings
+    if the campaign has only one channel, under a recorded drive: such an error could not be told
+    from a change of the model's parameters.
     """
     problem = comparison.problem
     one_channel = has_one_driven_channel(problem)
     patches = fit.candidate.patches(problem.setting, fit.effect)
-    notable = set()
+    notable_key = set()
     for term, patch in zip(fit.candidate.terms, patches, strict=True):
         if is_negligible_instrument_error(problem, patch, least_unstated_gain=LEAST_UNSTATED_GAIN):
             continue
         if comparison.acts_on_structure(term) or not one_channel:
-            notable.add((term.label, term.place))
-    return notable
+            notable_key.add((term.label, term.place))
+    return notable_key
 
 
 # ---------------------------------------------------------------- verdicts of a comparison
@@ -205,36 +206,36 @@ def _verdict_by_comparison(
     Parameters
     ----------
     comparison : Comparison
-        The hypotheses.
+        The comparison of all hypotheses.
     simulation_verdict : Verdict
         The verdict on the simulations, with the tests that they failed.
     """
     if not comparison.nameable_hypotheses:
         return _unexplained_outcome(comparison, simulation_verdict)
     # the best hypothesis, and those that the data do not separate from it
-    best = comparison.simplest_equivalent_hypothesis(comparison.nameable_hypotheses[0])
-    members = [best, *comparison.competing_hypotheses(best)]
+    best_hypothesis = comparison.simplest_equivalent_hypothesis(comparison.nameable_hypotheses[0])
+    members = [best_hypothesis, *comparison.competing_hypotheses(best_hypothesis)]
     other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
         reason = f"{other_count} others explain as much, so that none of them can be named"
-        return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
     # conditions that a name must fulfil
-    if comparison.enlarges_error(best):
-        return _unexplained_outcome(comparison, simulation_verdict, best)
+    if comparison.enlarges_error(best_hypothesis):
+        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis)
     probability = comparison.probability(*members)
     if probability < SEARCH.name_probability:
-        return _unexplained_outcome(comparison, simulation_verdict, best)
-    log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
+        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis)
+    log_bayes_factor = best_hypothesis.log_evidence - comparison.no_effect.log_evidence
     if log_bayes_factor < SEARCH.least_log_bayes_factor:
         reason = (
             "a missing force without any law explains the readings as well "
             f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs "
             f"{SEARCH.least_log_bayes_factor:g})"
         )
-        return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
     # one hypothesis is named in part; several are a group if all of them pass the absolute test
     if other_count == 0:
-        return _named_in_part_outcome(comparison, best, probability)
+        return _named_in_part_outcome(comparison, best_hypothesis, probability)
     if all(comparison.passes_absolute_fit(member) for member in members):
         return _group_outcome(comparison, members, probability)
     names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
@@ -242,55 +243,56 @@ def _verdict_by_comparison(
         "it leaves more than noise, and these data do not distinguish it from "
         f"{listing(names, 'or')}"
     )
-    return _unexplained_outcome(comparison, simulation_verdict, best, reason)
+    return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
 
 
 def _named_in_part_outcome(
-    comparison: Comparison[HypothesisT], best: HypothesisT, probability: float
+    comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT, probability: float
 ) -> VerdictOutcome:
     """Return the verdict that names the effects of a hypothesis in part.
 
     Parameters
     ----------
     comparison : Comparison
-        The hypotheses.
-    best : HypothesisT
+        The comparison of all hypotheses.
+    best_hypothesis : HypothesisT
         The hypothesis that is named.
     probability : float
-        Its probability.
+        The probability of that hypothesis.
     """
-    effects = named_effects(comparison.problem, best)
-    share = comparison.held_out_or_fitted_share(best)
-    families = {term.effect.family for term in best.candidate.terms if term.free_shape}
+    effects = named_effects(comparison.problem, best_hypothesis)
+    share = comparison.held_out_or_fitted_share(best_hypothesis)
+    families = {term.effect.family for term in best_hypothesis.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
     # what is missing: effects of the catalogue, and families with a shape of their own
     phrases = []
-    canonical = effects_text(effect for effect in effects if not effect.shape)
-    if canonical:
-        phrases.append(canonical)
+    names_of_canonical = effects_text(effect for effect in effects if not effect.shape)
+    if names_of_canonical:
+        phrases.append(names_of_canonical)
     if family:
         phrases.append(f"an effect of the family {family}, with a fitted shape,")
     # what it explains, and what remains
-    share_clause = comparison.closed_share_clause(best)
+    share_clause = comparison.closed_share_clause(best_hypothesis)
     sentence = (
         f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
         f"{share_clause}."
     )
     if comparison.has_held_out and not share.held_out:
         sentence += " In the held-out trials it has hardly any force."
-    sentence += f" It leaves {comparison.unexplained_text(best, share)}, which is unexplained."
-    sentence += shape_sentence(comparison, best)
-    sentence += unproved_addition_sentence(comparison, best)
+    unexplained_text = comparison.unexplained_text(best_hypothesis, share)
+    sentence += f" It leaves {unexplained_text}, which is unexplained."
+    sentence += shape_sentence(comparison, best_hypothesis)
+    sentence += unproved_addition_sentence(comparison, best_hypothesis)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.NAMED_IN_PART,
         sentence,
         probability,
-        judged_hypothesis=best,
-        members=[best],
+        judged_hypothesis=best_hypothesis,
+        members=[best_hypothesis],
         effects=effects,
         family=family,
-        gates=(comparison.check_fit(best),),
+        gates=(comparison.check_fit(best_hypothesis),),
     )
 
 
@@ -304,7 +306,7 @@ def _group_outcome(
     Parameters
     ----------
     comparison : Comparison
-        The hypotheses.
+        The comparison of all hypotheses.
     members : sequence of HypothesisT
         The hypotheses of the group, the best one first.
     probability : float
@@ -312,10 +314,10 @@ def _group_outcome(
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
     sentence = _group_sentence(comparison, members, effects_by_member)
-    common = frozenset.intersection(*(effect_place_pairs(member) for member in members))
+    common_pairs = frozenset.intersection(*(effect_place_pairs(member) for member in members))
     common_effects = []
     for effect in effects_by_member[0]:
-        if (effect.identifier, effect.place) in common:
+        if (effect.identifier, effect.place) in common_pairs:
             common_effects.append(effect)
     if common_effects:
         sentence = f"{capital(effects_text(common_effects))} is missing. {sentence}"
@@ -344,7 +346,7 @@ def _group_sentence(
     members: Sequence[HypothesisT],
     effects_by_member: Sequence[Sequence[NamedEffect]],
 ) -> str:
-    """Return the sentence that lists the members of a group, each with the share it explains."""
+    """Return the sentence that lists the members of a group and the share that each explains."""
     member_texts = []
     for member, effects in zip(members, effects_by_member, strict=True):
         member_share = comparison.errors(member).closed
@@ -365,7 +367,7 @@ def _group_sentence(
 def _unexplained_outcome(
     comparison: Comparison[HypothesisT],
     simulation_verdict: Verdict,
-    considered: HypothesisT | None = None,
+    considered_hypothesis: HypothesisT | None = None,
     reason: str = "",
 ) -> VerdictOutcome:
     """Return the verdict that there is an unexplained gap.
@@ -376,10 +378,10 @@ def _unexplained_outcome(
     Parameters
     ----------
     comparison : Comparison
-        The hypotheses.
+        The comparison of all hypotheses.
     simulation_verdict : Verdict
         The verdict on the simulations.
-    considered : HypothesisT, optional
+    considered_hypothesis : HypothesisT, optional
         The hypothesis that was considered for a name; if left out, the one that explains the
         largest share of the gap is mentioned.
     reason : str
@@ -387,23 +389,31 @@ def _unexplained_outcome(
         or else that its probability is too low.
     """
     gap_sentences = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
-    mentioned = _hypothesis_explaining_most(comparison) if considered is None else considered
+    mentioned_hypothesis = (
+        _hypothesis_explaining_most(comparison)
+        if considered_hypothesis is None
+        else considered_hypothesis
+    )
     judged_hypothesis = None
     resembles: tuple[str, ...] = ()
-    if mentioned is None or not _explains_mentioned_share(comparison, mentioned):
+    if mentioned_hypothesis is None or not _explains_mentioned_share(
+        comparison, mentioned_hypothesis
+    ):
         sentence = f"{gap_sentences} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(mentioned):
-        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned)}"
+    elif comparison.enlarges_error(mentioned_hypothesis):
+        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned_hypothesis)}"
     else:
-        reason = reason or comparison.objection_to_naming(mentioned)
-        if considered is not None and not reason:
-            probability = comparison.probability(mentioned)
+        reason = reason or comparison.objection_to_naming(mentioned_hypothesis)
+        if considered_hypothesis is not None and not reason:
+            probability = comparison.probability(mentioned_hypothesis)
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        sentence = f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned, reason)}"
-        judged_hypothesis = mentioned
-        resembles = names_without_free_shape(mentioned.candidate.identifiers)
+        sentence = (
+            f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned_hypothesis, reason)}"
+        )
+        judged_hypothesis = mentioned_hypothesis
+        resembles = names_without_free_shape(mentioned_hypothesis.candidate.identifiers)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,
@@ -464,11 +474,11 @@ def not_named_sentence(reason: str) -> str:
 def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> str:
     """Return the sentence on a hypothesis that is not named because it makes the error larger."""
     effects = effects_text(named_effects(comparison.problem, hypothesis))
-    nearest = f"The nearest in the catalogue is {effects}, but"
+    opening = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
-        return f"{nearest} it cannot be simulated: no effect is named."
+        return f"{opening} it cannot be simulated: no effect is named."
     share_clause = comparison.closed_share_clause(hypothesis)
-    return f"{nearest} {share_clause}: no effect is named, and there is nothing to apply."
+    return f"{opening} {share_clause}: no effect is named, and there is nothing to apply."
 
 
 def _outcome_of_comparison(
@@ -485,12 +495,12 @@ def _outcome_of_comparison(
     gates: tuple[Gate, ...] = (),
     resembles: tuple[str, ...] = (),
 ) -> VerdictOutcome:
-    """Return a verdict that lists all hypotheses.
+    """Return a verdict that lists all hypotheses of a comparison with their probabilities.
 
     Parameters
     ----------
     comparison : Comparison
-        The hypotheses.
+        The comparison of all hypotheses.
     kind, sentence, probability
         What is concluded, see `Verdict`.
     judged_hypothesis : HypothesisT or None
@@ -501,27 +511,28 @@ def _outcome_of_comparison(
         Further attributes of the `Verdict`.
     """
     # all hypotheses with their probabilities: the members first, then the others by probability
-    remaining = []
-    for ranked in comparison.ranked_hypotheses:
-        if not any(ranked is member for member in members):
-            remaining.append(ranked)
-    listed: list[HypothesisT] = [*members, *remaining]
-    scores = np.array([comparison.score(hypothesis) for hypothesis in listed])
+    other_hypotheses = []
+    for hypothesis in comparison.ranked_hypotheses:
+        if not any(hypothesis is member for member in members):
+            other_hypotheses.append(hypothesis)
+    listed_hypotheses: list[HypothesisT] = [*members, *other_hypotheses]
+    scores = np.array([comparison.score(hypothesis) for hypothesis in listed_hypotheses])
     probabilities = np.exp(scores - logsumexp(scores)).tolist()
-    weighted: list[WeightedHypothesis] = []
-    for hypothesis, weight in zip(listed, probabilities, strict=True):
-        weighted.append(WeightedHypothesis(hypothesis, weight))
-    first_other = len(members)
-    other_weighted = sorted(weighted[first_other:], key=lambda entry: -entry.probability)
-    weighted = weighted[:first_other] + other_weighted
+    weighted_hypotheses: list[WeightedHypothesis] = []
+    for hypothesis, hypothesis_probability in zip(listed_hypotheses, probabilities, strict=True):
+        weighted_hypotheses.append(WeightedHypothesis(hypothesis, hypothesis_probability))
+    weighted_members = weighted_hypotheses[: len(members)]
+    weighted_others = weighted_hypotheses[len(members) :]
+    weighted_others.sort(key=lambda weighted_hypothesis: -weighted_hypothesis.probability)
     # the simulation that represents the verdict
     fit = comparison.search.no_effect
     if judged_hypothesis is not None:
         fit = comparison.simulation(judged_hypothesis)
     comparison.judged_hypothesis = judged_hypothesis
-    best = listed[0] if judged_hypothesis is None else judged_hypothesis
-    log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
-    return Conclusion(comparison.search, log_bayes_factor, weighted).build_outcome(
+    best_hypothesis = listed_hypotheses[0] if judged_hypothesis is None else judged_hypothesis
+    log_bayes_factor = best_hypothesis.log_evidence - comparison.no_effect.log_evidence
+    conclusion = Conclusion(comparison.search, log_bayes_factor, weighted_members + weighted_others)
+    return conclusion.build_outcome(
         kind,
         sentence,
         probability,

@@ -40,7 +40,7 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit, usually that of the model without effect.
     """
@@ -107,9 +107,9 @@ def _reference_sizes(problem: Problem) -> dict[str, float]:
 
     It is the stated value of a parameter, one for a gain, and the largest reading for a zero.
     """
-    shared = problem.shared
-    sizes = {f"gain of {channel}": 1.0 for channel in shared.gain_channels}
-    for parameter, centre in zip(problem.model.parameters, shared.centre, strict=False):
+    layout = problem.shared
+    sizes = {f"gain of {channel}": 1.0 for channel in layout.gain_channels}
+    for parameter, centre in zip(problem.model.parameters, layout.centre, strict=False):
         sizes[parameter.name] = abs(float(centre))
     for data in problem.trials:
         for column, channel in enumerate(data.trial.channels):
@@ -121,12 +121,12 @@ def _reference_sizes(problem: Problem) -> dict[str, float]:
 
 def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the stated and fitted values of the calibrated parameters with a prior deviation."""
-    shared = problem.shared
-    values = shared.parameters(fit.point.shared)
+    layout = problem.shared
+    values = layout.parameters(fit.point.shared)
     unknowns = []
     for parameter_index, parameter in enumerate(problem.model.parameters):
-        centre = float(shared.centre[parameter_index])
-        scale = float(shared.scale[parameter_index])
+        centre = float(layout.centre[parameter_index])
+        scale = float(layout.scale[parameter_index])
         if scale <= 0.0:
             continue
         value = float(values[parameter_index])
@@ -145,13 +145,13 @@ def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]
 
 def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted values of the gain errors with a stated deviation; they are stated as 0."""
-    shared = problem.shared
+    layout = problem.shared
     unknowns = []
-    for gain_number, channel in enumerate(shared.gain_channels):
-        shared_number = shared.parameter_count + gain_number
-        if shared.precision[shared_number] > 0.0:
+    for gain_number, channel in enumerate(layout.gain_channels):
+        shared_number = layout.parameter_count + gain_number
+        if layout.precision[shared_number] > 0.0:
             scaled_value = float(fit.point.shared[shared_number])
-            scale = float(shared.scale[shared_number])
+            scale = float(layout.scale[shared_number])
             unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", scaled_value, scale, "1"))
     return unknowns
 
@@ -159,14 +159,14 @@ def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
 def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted zeros of channels and constants of inputs that have a stated deviation."""
     unknowns = []
-    for data, local in zip(problem.trials, fit.point.local, strict=True):
+    for data, local_values in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
         zeros_end, initial_end, inputs_end, _ = layout.ends_by_kind
         indices = [*range(zeros_end), *range(initial_end, inputs_end)]
         for (name, unit), index in zip(names_and_units, indices, strict=True):
             if layout.precision[index] > 0.0:
-                scaled_value = float(local[index])
+                scaled_value = float(local_values[index])
                 unknowns.append(
                     _unknown_stated_as_zero(name, scaled_value, float(layout.scale[index]), unit)
                 )
@@ -182,9 +182,9 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
         unit = UNITS[problem.campaign.channels[channel].quantity].si
         names_and_units.append((f"zero of {channel} in {trial.name!r}", unit))
     for row in data.unknowns.offset_inputs:
-        recorded = trial.inputs[row]
-        unit = UNITS[recorded.quantity].si
-        names_and_units.append((f"constant of {recorded.name} in {trial.name!r}", unit))
+        recorded_input = trial.inputs[row]
+        unit = UNITS[recorded_input.quantity].si
+        names_and_units.append((f"constant of {recorded_input.name} in {trial.name!r}", unit))
     return names_and_units
 
 
@@ -198,11 +198,11 @@ def _unknown_stated_as_zero(
     name : str
         The name of the unknown.
     scaled_value : float
-        Its scaled value in the fit.
+        The scaled value of the unknown in the fit.
     scale : float
         Its stated standard deviation [unit].
     unit : str
-        Its unit.
+        The unit of the unknown.
     """
     return MovedUnknown(
         name=name,
@@ -256,9 +256,9 @@ def hiding_sentences(
 def _moved_texts(unknowns: Sequence[MovedUnknown]) -> str:
     """Return the first unknowns in words, and how many more there are."""
     parts = [_moved_text(unknown) for unknown in unknowns[:MOST_MENTIONED]]
-    remaining = len(unknowns) - MOST_MENTIONED
-    if remaining > 0:
-        parts.append(f"{remaining} more")
+    unmentioned_count = len(unknowns) - MOST_MENTIONED
+    if unmentioned_count > 0:
+        parts.append(f"{unmentioned_count} more")
     return listing(parts)
 
 
@@ -270,8 +270,8 @@ def _moved_text(unknown: MovedUnknown) -> str:
     distance = f"{abs(unknown.deviations):.1f} deviations"
     unit = "" if unknown.unit == "1" else f" {unknown.unit}"
     if name.startswith("gain of "):
-        stated = f"stated to {100.0 * deviation:.3g} %"
-        return f"the {name} by {100.0 * value:+.3g} % ({stated}; {distance})"
+        stated_text = f"stated to {100.0 * deviation:.3g} %"
+        return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance})"
     if unknown.stated == 0.0:
         factor = 1.0
         if name.startswith("zero of ") and unknown.unit == UNITS[Quantity.STRAIN].si:
@@ -281,5 +281,5 @@ def _moved_text(unknown: MovedUnknown) -> str:
             f"the {name} to {factor * value:.3g}{unit} (stated to {factor * deviation:.3g}{unit}; "
             f"{distance})"
         )
-    stated = f"{unknown.stated:.4g} ± {deviation:.2g}"
-    return f"{name!r} from {stated} to {value:.4g}{unit} ({distance})"
+    stated_text = f"{unknown.stated:.4g} ± {deviation:.2g}"
+    return f"{name!r} from {stated_text} to {value:.4g}{unit} ({distance})"

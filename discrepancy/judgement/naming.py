@@ -47,9 +47,9 @@ def reach_verdict(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     effects : sequence of Effect
-        The catalogue.
+        The effects of the catalogue.
     on_progress : callable
         The function that receives a line for the progress display: the fit that runs, and how many
         remain.
@@ -240,7 +240,7 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
 
 
 def _are_instrument_errors_with_gain(verdict: Verdict) -> bool:
-    """Return whether all effects of a verdict are errors of instruments, one of them of a gain."""
+    """Return whether a verdict names only errors of instruments, and among them a wrong gain."""
     has_gain = False
     for effect in verdict.effects:
         for primitive in effect.patch:

@@ -49,7 +49,7 @@ class Proposal:
     trial : Trial
         The trial; its readings are not used, as it has not been made.
     description, reason : str
-        Sentences for the user: what to do, and why.
+        The sentences for the user: what to do, and why.
     cost : float
         The cost relative to one more trial of a kind that was done already.
     added_patch : ModelPatch
@@ -112,7 +112,7 @@ def mutual_information(
     problem : Problem
         The campaign and model of the fits.
     proposal : Proposal
-        The new trial.
+        The proposal with the new trial.
     fits : sequence of CandidateFit
         The fit of each of the H hypotheses, the most probable first.
     weights : (H,) array
@@ -230,7 +230,10 @@ def _reduce_dimensions(
     mean_of_hypotheses = np.average(means, axis=0, weights=weights)
     directions = np.concatenate((np.stack(means) - mean_of_hypotheses, *factors))
     _, singular_values, basis = np.linalg.svd(check_finite(directions), full_matrices=False)
-    basis = basis[singular_values > LEAST_SINGULAR_VALUE * max(singular_values[0], 1e-300)]
+    # no direction is left if all hypotheses predict the same, with singular values of zero
+    largest_singular_value = singular_values[0]
+    differ_along = singular_values > LEAST_SINGULAR_VALUE * largest_singular_value
+    basis = basis[differ_along & (singular_values > 0.0)]
     # the rows of the basis are orthonormal, so the noise keeps its unit covariance
     gaussians = []
     for mean, factor in zip(means, factors, strict=True):
@@ -339,7 +342,7 @@ class _ChangedTrial(NamedTuple):
     Attributes
     ----------
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     value : float
         The new value of a length, place or mass, as the description prints it; 0 if the load, the
         release or the temperature is changed.
@@ -360,9 +363,9 @@ def _changed_trial(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial : Trial
-        The trial to vary.
+        The trial that is varied.
     change : str
         The kind of change: `change` of a [[proposal]] table in `sentences.toml`.
     amount : float

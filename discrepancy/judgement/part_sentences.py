@@ -12,19 +12,21 @@ from .conclusion import (
 )
 
 
-def shape_sentence(comparison: Comparison[HypothesisT], best: HypothesisT) -> str:
+def shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT) -> str:
     """Return the sentence on the shape parameters of a single law that the data determine.
 
     It is empty if there are none, or if the law explains less with a free shape in the decisive
     trials.
     """
-    if len(best.candidate.terms) != 1:
+    if len(best_hypothesis.candidate.terms) != 1:
         return ""
-    (term,) = best.candidate.terms
-    free_shape_hypothesis = comparison.fit_with_free_shape(best)
+    (term,) = best_hypothesis.candidate.terms
+    free_shape_hypothesis = comparison.fit_with_free_shape(best_hypothesis)
     if free_shape_hypothesis is None:
         return ""
-    least_share = comparison.held_out_or_fitted_share(best).value - SEARCH.least_added_share
+    least_share = (
+        comparison.held_out_or_fitted_share(best_hypothesis).value - SEARCH.least_added_share
+    )
     if comparison.held_out_or_fitted_share(free_shape_hypothesis).value < least_share:
         return ""
     first_shape = len(free_shape_hypothesis.shared) + len(term.effect.parameters)
@@ -39,14 +41,16 @@ def shape_sentence(comparison: Comparison[HypothesisT], best: HypothesisT) -> st
     return f" With a fitted shape: {', '.join(texts)}." if texts else ""
 
 
-def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: HypothesisT) -> str:
+def unproved_addition_sentence(
+    comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT
+) -> str:
     """Return the sentence on a further law that may act too, but has too little evidence.
 
     It is empty if there is none.
     """
     # the most probable set of laws that contains all families of the best hypothesis and more
-    families = family_place_pairs(best)
-    least_score = comparison.score(best) - SEARCH.contender_range
+    families = family_place_pairs(best_hypothesis)
+    least_score = comparison.score(best_hypothesis) - SEARCH.contender_range
     larger_hypothesis = None
     for hypothesis in comparison.ranked_hypotheses:
         has_more_laws = family_place_pairs(hypothesis) > families
@@ -57,14 +61,16 @@ def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: Hypoth
     if larger_hypothesis is None:
         return ""
     # it must explain notably more of the gap
-    least_share = comparison.held_out_or_fitted_share(best).value + SEARCH.negligible_share
+    least_share = (
+        comparison.held_out_or_fitted_share(best_hypothesis).value + SEARCH.negligible_share
+    )
     if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
         return ""
-    added = []
+    added_effects = []
     for effect in named_effects(comparison.problem, larger_hypothesis):
         if (effect.family, effect.place) not in families:
-            added.append(effect)
+            added_effects.append(effect)
     return (
-        f" {capital(effects_text(added))} may be missing, too, but this is not proved: it gains "
-        "less evidence than it costs."
+        f" {capital(effects_text(added_effects))} may be missing, too, but this is not proved: it "
+        "gains less evidence than it costs."
     )

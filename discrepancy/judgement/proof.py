@@ -65,17 +65,24 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         If no sample is used.
     """
     # residuals over their predictive deviations: standard normal if the predictions are right
-    standardised = [fitted.residual / fitted.predictive_deviation for fitted in residuals.trials]
-    used = [fitted.used for fitted in residuals.trials]
+    standardised = [
+        fitted_trial.residual / fitted_trial.predictive_deviation
+        for fitted_trial in residuals.trials
+    ]
+    used_by_trial = [fitted_trial.used for fitted_trial in residuals.trials]
     used_standardised = np.concatenate(
-        [values[use] for values, use in zip(standardised, used, strict=True)]
+        [values[is_used] for values, is_used in zip(standardised, used_by_trial, strict=True)]
     )
     if used_standardised.size == 0:
         raise FitError("Scores need at least one used sample, but there is none.")
-    log_densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
+    log_densities = [
+        log_density(fitted_trial)[fitted_trial.used] for fitted_trial in residuals.trials
+    ]
     chi_square = chi_square_of(residuals)
-    whitened = residuals.whitened_residuals(np.random.default_rng(seed))
-    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(whitened)]
+    white_residuals = residuals.whitened_residuals(np.random.default_rng(seed))
+    p_values = [
+        ljung_box(series.values).p_value for series in residuals.dynamic_series(white_residuals)
+    ]
     bin_counts, _ = np.histogram(stats.norm.cdf(used_standardised), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
@@ -89,18 +96,18 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         chi_square_expected=chi_square.expected,
         chi_square_deviation=chi_square.deviation,
         pit=tuple(float(share) for share in bin_counts / used_standardised.size),
-        pit_p_value=_uniformity_p_value(standardised, used, bin_counts),
+        pit_p_value=_uniformity_p_value(standardised, used_by_trial, bin_counts),
     )
 
 
-def log_density(fitted: FittedTrial) -> FloatArray:
+def log_density(fitted_trial: FittedTrial) -> FloatArray:
     """Return the predictive log density (N, C) of each sample, in units of its noise deviation.
 
     It is ln N(residual; 0, predictive_deviation^2) + ln s0. A perfect model with exact parameters
     has -(1 + ln 2 pi) / 2 = -1.419 on average.
     """
-    deviations = fitted.residual / fitted.predictive_deviation
-    relative_deviation = fitted.predictive_deviation / fitted.noise_deviation
+    deviations = fitted_trial.residual / fitted_trial.predictive_deviation
+    relative_deviation = fitted_trial.predictive_deviation / fitted_trial.noise_deviation
     return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(relative_deviation) - 0.5 * deviations**2)
 
 
@@ -138,43 +145,45 @@ class ChiSquare:
 def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     """Return χ² per sample of trials that are all fitted, or all held out.
 
-    Residuals are compared with the noise records. Channels without a record do not count; all is
-    nan if none has one. The sum of squares of a right model is that of the noise, less what the fit
-    absorbs, or plus what its uncertainty adds to held-out trials.
+    Residuals are compared with the noise records. Channels without a record do not count; if no
+    channel has one, all values are nan. The expected sum of squares of a right model is that of the
+    noise, minus what the fit absorbs in fitted trials, plus what the uncertainty of the fit adds in
+    held-out trials.
     """
-    unknown = ChiSquare(nan, nan, nan)
+    undetermined = ChiSquare(nan, nan, nan)
     channels = residuals.recorded_channels
     if not channels:
-        return unknown
+        return undetermined
     _, freedom = mean_square_ratio(residuals, channels)
     if freedom <= 0.0:
-        return unknown
+        return undetermined
     squares = []
     variances = []
     for name in channels:
-        for fitted, column, used in channel_fits(residuals.trials, name):
-            squares.append(fitted.standardised[used, column] ** 2)
-            variances.append(fitted.expected_variance[used, column])
-    expected = float(np.concatenate(variances).mean())
+        for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
+            squares.append(fitted_trial.standardised[is_used, column] ** 2)
+            variances.append(fitted_trial.expected_variance[is_used, column])
+    expected_chi_square = float(np.concatenate(variances).mean())
     # Channels may share their record or not. The worst case is assumed: all share the poorest one.
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
     # relative variance of a mean square of n degrees of freedom: 2 / n, for residuals and record
-    deviation = expected * sqrt(2.0 / freedom + 2.0 / noise_freedom)
-    return ChiSquare(float(np.concatenate(squares).mean()), expected, deviation)
+    deviation = expected_chi_square * sqrt(2.0 / freedom + 2.0 / noise_freedom)
+    return ChiSquare(float(np.concatenate(squares).mean()), expected_chi_square, deviation)
 
 
 def correlation_time(series: FloatArray) -> float:
-    """Return the number of samples of a series (N,) per independent one: 1 + 2 sum rho_k.
+    """Return how many samples of a correlated series (N,) count as one independent sample.
 
-    It is at least 1. The sum is Geyer's initial positive sequence (Geyer 1992, Statistical Science
+    The number is 1 + 2 sum rho_k, with the autocorrelation rho_k at the lag of k samples, and at
+    least 1. The sum is Geyer's initial positive sequence (Geyer 1992, Statistical Science
     7, 473-483): sums of neighbouring pairs are added while they are positive.
     """
     count = series.size
-    centred = series - series.mean()
-    sum_of_squares = float(centred @ centred)
+    centred_series = series - series.mean()
+    sum_of_squares = float(centred_series @ centred_series)
     if count < 4 or sum_of_squares == 0.0:
         return 1.0
-    autocorrelation = lag_products(centred, count - 1)[0] / sum_of_squares
+    autocorrelation = lag_products(centred_series, count - 1)[0] / sum_of_squares
     pair_sums = autocorrelation[0 : count - 1 : 2] + autocorrelation[1:count:2]
     nonpositive = np.flatnonzero(pair_sums <= 0.0)
     # autocorrelation[0] = 1, so that 1 + 2 (sum over k >= 1) = 2 (sum over k >= 0) - 1
@@ -183,26 +192,26 @@ def correlation_time(series: FloatArray) -> float:
 
 
 def _uniformity_p_value(
-    transforms: Sequence[FloatArray], used: Sequence[BoolArray], counts: IntArray
+    transforms: Sequence[FloatArray], used_by_trial: Sequence[BoolArray], counts: IntArray
 ) -> float:
-    """Return the p-value of Pearson's χ² over the bins of a histogram that should be uniform.
+    """Return the p-value of Pearson's χ² test that a histogram is uniform over its bins.
 
-    Samples that depend on each other count as fewer independent ones.
+    Samples that depend on each other count as fewer independent samples.
 
     Parameters
     ----------
     transforms : sequence of (N, C) array
         The residuals of each trial over their predictive deviation.
-    used : sequence of (N, C) array of bool
-        Whether a sample counts.
+    used_by_trial : sequence of (N, C) array of bool
+        For each trial, whether a sample counts.
     counts : (bins,) array of int
-        The samples in each bin.
+        The number of samples in each bin.
     """
     sample_count = 0
     independent_count = 0.0
-    for values, use in zip(transforms, used, strict=True):
+    for values, is_used in zip(transforms, used_by_trial, strict=True):
         for column in range(values.shape[1]):
-            series = values[use[:, column], column]
+            series = values[is_used[:, column], column]
             if series.size:
                 samples_per_independent = max(
                     correlation_time(series), correlation_time(np.abs(series))
@@ -221,7 +230,7 @@ def _uniformity_p_value(
     return float(stats.chi2.sf(statistic, PIT_BINS - 1))
 
 
-def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
+def score_gain(residuals_before: ResidualSet, residuals_after: ResidualSet) -> tuple[float, float]:
     """Return the gain of the mean predictive log density per sample, and its standard error [nat].
 
     Trials are the units: the error is that of a ratio over clusters. With fewer than five trials it
@@ -230,20 +239,22 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials without and with the effect.
     """
     trial_sums = []
     trial_counts = []
     variance_within = 0.0
-    for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
-        used = without_effect.used
+    for without_effect, with_effect in zip(
+        residuals_before.trials, residuals_after.trials, strict=True
+    ):
+        is_used = without_effect.used
         # densities are in units of the noise deviation, which differs for channels without a record
         noise_ratio = np.log(without_effect.noise_deviation / with_effect.noise_deviation)
         gain = log_density(with_effect) - log_density(without_effect) + noise_ratio
-        gain = np.where(used, gain, 0.0)
+        gain = np.where(is_used, gain, 0.0)
         trial_sums.append(float(gain.sum()))
-        trial_counts.append(int(used.sum()))
+        trial_counts.append(int(is_used.sum()))
         variance_within += _variance_of_sum(gain.sum(axis=1))
     sample_count = sum(trial_counts)
     mean_gain = sum(trial_sums) / sample_count
@@ -278,12 +289,12 @@ def _variance_of_sum(series: FloatArray) -> float:
 # ---------------------------------------------------------------- the test on held-out trials
 
 
-def check_held_out(after: ResidualSet) -> Gate:
+def check_held_out(residuals_after: ResidualSet) -> Gate:
     """Test whether a hypothesis predicts the held-out trials.
 
     Parameters
     ----------
-    after : ResidualSet
+    residuals_after : ResidualSet
         All trials with their predictions by the hypothesis.
 
     Returns
@@ -293,17 +304,17 @@ def check_held_out(after: ResidualSet) -> Gate:
         deviations above what is expected, or the coverage of 90 % intervals is outside `COVERAGE`.
         `passed` is None without a held-out trial or without a noise record.
     """
-    if after.held_out is None:
+    if residuals_after.held_out is None:
         return _held_out_gate(None, nan, "No trial was held out.")
-    held_out_scores = compute_scores(after.held_out)
-    excess = chi_square_of(after.held_out).excess
+    held_out_scores = compute_scores(residuals_after.held_out)
+    excess = chi_square_of(residuals_after.held_out).excess
     if not isfinite(excess):
         return _held_out_gate(None, nan, "There is no noise record to judge them by.")
     if excess > HELD_OUT_DEVIATIONS:
         reason = f"On held-out trials χ² per sample is {chi_square_text(held_out_scores)}."
         return _held_out_gate(False, excess, reason)
-    least, largest = COVERAGE
-    is_covered = least <= held_out_scores.coverage_90 <= largest
+    least_coverage, largest_coverage = COVERAGE
+    is_covered = least_coverage <= held_out_scores.coverage_90 <= largest_coverage
     if held_out_scores.sample_count >= LEAST_SAMPLES_FOR_COVERAGE and not is_covered:
         percent = 100.0 * held_out_scores.coverage_90
         reason = f"90 % intervals hold {percent:.0f} % of the samples of held-out trials."
@@ -318,29 +329,34 @@ def _held_out_gate(passed: bool | None, excess: float, reason: str) -> Gate:
 
 def chi_square_text(trial_scores: Scores) -> str:
     """Return χ² per sample in words, with the value that is expected of a right model."""
-    expected = f"{trial_scores.chi_square_expected:.3g} ± {trial_scores.chi_square_deviation:.2g}"
-    return (
-        f"{trial_scores.chi_square_per_sample:.3g}, where {expected} is expected of a right model"
+    expected_text = (
+        f"{trial_scores.chi_square_expected:.3g} ± {trial_scores.chi_square_deviation:.2g}"
     )
+    per_sample = f"{trial_scores.chi_square_per_sample:.3g}"
+    return f"{per_sample}, where {expected_text} is expected of a right model"
 
 
 # ---------------------------------------------------------------- proof of a verdict
 
 
-def compare_errors(before: ResidualSet, after: ResidualSet) -> ErrorComparison:
+def compare_errors(residuals_before: ResidualSet, residuals_after: ResidualSet) -> ErrorComparison:
     """Return the errors of the deciding trials without and with a hypothesis.
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the hypothesis.
     """
-    closed, reason = _closed_share_or_reason(before, after)
+    share, reason = _closed_share_or_reason(residuals_before, residuals_after)
     return ErrorComparison(
-        closed=closed,
+        closed=share,
         closed_reason=reason,
-        rms_before=rms_by_channel(before.held_out or before.fitted or before),
-        rms_after=rms_by_channel(after.held_out or after.fitted or after),
+        rms_before=rms_by_channel(
+            residuals_before.held_out or residuals_before.fitted or residuals_before
+        ),
+        rms_after=rms_by_channel(
+            residuals_after.held_out or residuals_after.fitted or residuals_after
+        ),
     )
 
 
@@ -351,13 +367,13 @@ def errors_of_fit(search: FittedCandidates, fit: CandidateFit) -> ErrorCompariso
     """
     key = (fit, search.problem.refinement)
     if key not in search.errors_by_fit:
-        before = search.residuals(search.no_effect)
-        search.errors_by_fit[key] = compare_errors(before, search.residuals(fit))
+        residuals_before = search.residuals(search.no_effect)
+        search.errors_by_fit[key] = compare_errors(residuals_before, search.residuals(fit))
     return search.errors_by_fit[key]
 
 
 def _closed_share_or_reason(
-    before: ResidualSet, after: ResidualSet
+    residuals_before: ResidualSet, residuals_after: ResidualSet
 ) -> tuple[ClosedShare | None, str]:
     """Return the share of the mean square error that a hypothesis removes, or None and the reason.
 
@@ -367,28 +383,28 @@ def _closed_share_or_reason(
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the hypothesis.
 
     Returns
     -------
     share : ClosedShare or None
-        The share.
+        The share of the mean square error that the hypothesis removes.
     reason : str
         The reason why there is no share, or why it is that of fitted trials; else empty.
     """
-    closed = closed_share(before, after)
-    if closed is None:
+    share = closed_share(residuals_before, residuals_after)
+    if share is None:
         return None, "The unchanged model leaves no error at all."
-    if closed.trials != "held-out":
-        return closed, "No trial was held out."
-    chi_square_before = _chi_square_by_diagonal(before.held_out or before)
-    chi_square_after = _chi_square_by_diagonal(after.held_out or after)
+    if share.trials != "held-out":
+        return share, "No trial was held out."
+    chi_square_before = _chi_square_by_diagonal(residuals_before.held_out or residuals_before)
+    chi_square_after = _chi_square_by_diagonal(residuals_after.held_out or residuals_after)
     has_no_gap_before = chi_square_before.excess_over_noise < LEAST_EXCESS_DEVIATIONS
     if has_no_gap_before and chi_square_after.excess_over_noise <= HELD_OUT_DEVIATIONS:
         chi_square = f"χ² per sample {chi_square_before.per_sample:.3g}, 1 for noise alone"
         return None, f"Held-out trials show no gap before: {chi_square}."
-    return closed, ""
+    return share, ""
 
 
 def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
@@ -396,13 +412,13 @@ def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
 
     So it does not depend on whether sensitivities were computed.
     """
-    trials = tuple(replace(fitted, sensitivity=None) for fitted in residuals.trials)
+    trials = tuple(replace(fitted_trial, sensitivity=None) for fitted_trial in residuals.trials)
     return chi_square_of(replace(residuals, trials=trials))
 
 
 def prove_effects(
-    before: ResidualSet,
-    after: ResidualSet,
+    residuals_before: ResidualSet,
+    residuals_after: ResidualSet,
     *,
     errors: ErrorComparison | None = None,
     effects: tuple[str, ...] = (),
@@ -412,7 +428,7 @@ def prove_effects(
 
     Parameters
     ----------
-    before, after : ResidualSet
+    residuals_before, residuals_after : ResidualSet
         The same trials and samples, without and with the effect.
     errors : ErrorComparison, optional
         Their errors, if they are known already, as the sentence of a verdict states them.
@@ -427,17 +443,17 @@ def prove_effects(
         If no sample of the fitted or of the held-out trials is used.
     """
     # the same noise deviation for both, so that errors and scores can be compared
-    after = residuals_with_noise_of(after, before)
-    held_out_before = _held_out_scores(before, seed)
-    held_out_after = _held_out_scores(after, seed)
-    fitted_before = compute_scores(before.fitted or before, seed=seed)
-    fitted_after = compute_scores(after.fitted or after, seed=seed)
-    errors = errors or compare_errors(before, after)
+    residuals_after = residuals_with_noise_of(residuals_after, residuals_before)
+    held_out_before = _held_out_scores(residuals_before, seed)
+    held_out_after = _held_out_scores(residuals_after, seed)
+    fitted_before = compute_scores(residuals_before.fitted or residuals_before, seed=seed)
+    fitted_after = compute_scores(residuals_after.fitted or residuals_after, seed=seed)
+    errors = errors or compare_errors(residuals_before, residuals_after)
     gain = nan
     gain_error = nan
-    if before.held_out is not None and after.held_out is not None:
-        gain, gain_error = score_gain(before.held_out, after.held_out)
-    decisive_trials = after.held_out or after.fitted or after
+    if residuals_before.held_out is not None and residuals_after.held_out is not None:
+        gain, gain_error = score_gain(residuals_before.held_out, residuals_after.held_out)
+    decisive_trials = residuals_after.held_out or residuals_after.fitted or residuals_after
     return Proof(
         held_out_before=held_out_before,
         held_out_after=held_out_after,
@@ -494,6 +510,6 @@ def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:
     """Return the mean square residual of a channel over its noise variance."""
     squares = []
-    for fitted, column, used in channel_fits(residuals.trials, name):
-        squares.append(fitted.standardised[used, column] ** 2)
+    for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
+        squares.append(fitted_trial.standardised[is_used, column] ** 2)
     return float(np.concatenate(squares).mean())

@@ -61,8 +61,8 @@ def gap_times_sentence(windows: Sequence[GapWindow]) -> str:
         count = len(without_effect)
         return f"The gap comes and goes, {count} times; the largest is {_gap_window_text(largest)}."
     # gaps that begin inside a record first, then the others; the largest of each first
-    ordered = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
-    return f"The gap is there {'; '.join(_gap_window_text(window) for window in ordered)}."
+    sorted_windows = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
+    return f"The gap is there {'; '.join(_gap_window_text(window) for window in sorted_windows)}."
 
 
 def _gap_window_text(window: GapWindow) -> str:
@@ -79,9 +79,9 @@ def sentence_with_times(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
     Parameters
     ----------
     verdict : Verdict
-        The verdict.
+        The verdict on the campaign.
     windows : sequence of GapWindow
-        The windows of gaps.
+        The windows in time in which there is a gap.
     """
     times_sentence = active_windows_sentence(verdict.effects)
     is_informative = has_gap_beginning_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
@@ -129,11 +129,11 @@ def verdict_with_untested_effects(
     Parameters
     ----------
     verdict : Verdict
-        The verdict.
+        The verdict on the campaign.
     setting : Setting
-        The campaign and model.
+        The campaign and the model, for which the effects may be available.
     effects : sequence of Effect
-        The catalogue.
+        The effects of the catalogue.
     """
     is_name = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
     names_several = is_name and len(verdict.effects) > 1
@@ -149,9 +149,9 @@ def verdict_with_untested_effects(
             members.append(by_identifier[named_effect.identifier])
     untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
     names = [effect.name for effect in untested[:MOST_MENTIONED]]
-    remaining = len(untested) - MOST_MENTIONED
-    if remaining > 0:
-        names.append(f"{remaining} more")
+    unmentioned_count = len(untested) - MOST_MENTIONED
+    if unmentioned_count > 0:
+        names.append(f"{unmentioned_count} more")
     untested_sentence = f"These trials cannot test all effects that may act so: {listing(names)}."
     return replace(verdict, sentence=f"{verdict.sentence} {untested_sentence}")
 
@@ -164,7 +164,7 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     verdict : Verdict
         The verdict with its effects.
     compared : iterable of Effect
-        The effects that can act in the campaign and were compared with the named ones.
+        The effects that can act in the campaign and were compared with the named effects.
 
     Returns
     -------
@@ -174,15 +174,16 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     if verdict.kind is not VerdictKind.NAMED:
         return None
     # similar effects that were compared, and those that were not
-    named = {effect.identifier: effect.name for effect in verdict.effects}
+    named_effects = {effect.identifier: effect.name for effect in verdict.effects}
     compared_by_identifier = {effect.identifier: effect for effect in compared}
-    similar = _similar_effects(set(named), compared_by_identifier)
-    compared_similar = sorted(similar & compared_by_identifier.keys())
-    not_compared_similar = sorted(similar - compared_by_identifier.keys())
-    does = "does" if len(named) == 1 else "do together"
+    similar_identifiers = _similar_effects(set(named_effects), compared_by_identifier)
+    compared_similar = sorted(similar_identifiers & compared_by_identifier.keys())
+    not_compared_similar = sorted(similar_identifiers - compared_by_identifier.keys())
+    does = "does" if len(named_effects) == 1 else "do together"
+    names_text = " and ".join(named_effects.values())
     remark = (
         "A cause that is not in the catalogue would get the same name if it acts on these trials "
-        f"as {' and '.join(named.values())} {does}, within the noise."
+        f"as {names_text} {does}, within the noise."
     )
     not_compared = (
         f"{', '.join(not_compared_similar)} {_was_or_were(not_compared_similar)} not compared."
@@ -198,18 +199,18 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     return remark
 
 
-def _similar_effects(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
+def _similar_effects(named_identifiers: set[str], compared: Mapping[str, Effect]) -> set[str]:
     """Return the identifiers of effects that are similar to a named one.
 
     The catalogue declares this for either of the two effects (`Effect.confusable`).
     """
     similar_identifiers = set()
     for identifier, effect in compared.items():
-        if not named.isdisjoint(effect.confusable):
+        if not named_identifiers.isdisjoint(effect.confusable):
             similar_identifiers.add(identifier)
-    for identifier in named & compared.keys():
+    for identifier in named_identifiers & compared.keys():
         similar_identifiers.update(compared[identifier].confusable)
-    return similar_identifiers - named
+    return similar_identifiers - named_identifiers
 
 
 def _was_or_were(names: Sequence[str]) -> str:

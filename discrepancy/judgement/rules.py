@@ -99,17 +99,16 @@ class VerdictCase:
         It is summed over all sets that contain the leading one, with or without further effects.
         For a law of free shape it includes all effects of its family.
         """
-        leading = set(names_without_free_shape(self.leading_set))
-        total: float = 0
+        leading_names = set(names_without_free_shape(self.leading_set))
+        total_probability: float = 0
         for names, probability in self.probabilities.items():
-            if leading <= set(names_without_free_shape(names)):
-                total += probability
-        if (
-            self.leading_fit.candidate.has_free_shape
-        ):  # one family is reached from several members or places
+            if leading_names <= set(names_without_free_shape(names)):
+                total_probability += probability
+        # with a free shape, a family is reached from several of its effects and at several places
+        if self.leading_fit.candidate.has_free_shape:
             family = self.leading_fit.candidate.terms[0].effect.family
-            total = max(total, _family_probability(self.search, family))
-        return min(total, 1.0)
+            total_probability = max(total_probability, _family_probability(self.search, family))
+        return min(total_probability, 1.0)
 
     @property
     def is_sure(self) -> bool:
@@ -221,10 +220,12 @@ class VerdictCase:
         It does not depend on which further effects there are. None is returned if these effects are
         not a probable set themselves, or cannot be named.
         """
-        common = set.intersection(
+        common_names = set.intersection(
             *(set(names_without_free_shape(names)) for names in self.probable_sets)
         )
-        common_set = next((names for names in self.probable_sets if set(names) == common), None)
+        common_set = next(
+            (names for names in self.probable_sets if set(names) == common_names), None
+        )
         if not common_set:
             return None
         case = VerdictCase(self.search, self.probabilities, common_set)
@@ -242,13 +243,13 @@ class VerdictCase:
             fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
             members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are not members, and their probability is not counted
-        fitting = [member for member in members if not member.absolute_fit.has_failed]
-        probability = sum(self.probabilities[member.effect_names] for member in fitting)
+        passing_members = [member for member in members if not member.absolute_fit.has_failed]
+        probability = sum(self.probabilities[member.effect_names] for member in passing_members)
         # an effect with its canonical and with a free shape is one member
-        distinct: dict[EffectSet, FittedEffectSet] = {}
-        for member in fitting:
-            distinct.setdefault(names_without_free_shape(member.effect_names), member)
-        group = list(distinct.values())
+        distinct_members: dict[EffectSet, FittedEffectSet] = {}
+        for member in passing_members:
+            distinct_members.setdefault(names_without_free_shape(member.effect_names), member)
+        group = list(distinct_members.values())
         if not group or len(group) > SEARCH.largest_group:
             return self._no_group_verdict(members[0], len(group))
         return self._group_verdict(group, probability)
@@ -267,20 +268,22 @@ class VerdictCase:
             gates=(check_absolute_fit(self.problem, self.leading_fit),),
         )
 
-    def _no_group_verdict(self, most_probable: FittedEffectSet, count: int) -> VerdictOutcome:
+    def _no_group_verdict(
+        self, most_probable: FittedEffectSet, passing_count: int
+    ) -> VerdictOutcome:
         """Return the verdict of an unexplained gap if no set passes the test, or too many do.
 
         Parameters
         ----------
         most_probable : FittedEffectSet
             The most probable set.
-        count : int
+        passing_count : int
             The number of sets that pass the test of absolute fit.
         """
         reason = most_probable.absolute_fit.reason
         sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
-        if count:
-            sentence = f"There is a gap, and {count} explanations fit it equally well."
+        if passing_count:
+            sentence = f"There is a gap, and {passing_count} explanations fit it equally well."
         return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
@@ -297,7 +300,7 @@ class VerdictCase:
         Parameters
         ----------
         members : sequence of FittedEffectSet
-            The sets.
+            The sets of effects that the group consists of.
         probability : float
             The probability that one of them is missing.
         """
@@ -332,37 +335,37 @@ class VerdictCase:
     def family_verdict(self) -> VerdictOutcome:
         """Return the verdict that names the family of the leading set, with a free shape."""
         if self.tested_family_set is None:
-            tested = self.tested_set
-            gates: tuple[Gate, ...] = (tested.absolute_fit, tested.consistency)
+            checked_fit = self.tested_set
+            gates: tuple[Gate, ...] = (checked_fit.absolute_fit, checked_fit.consistency)
         else:
-            tested = self.tested_family_set
-            gates = (tested.absolute_fit, self.shape_gate, tested.consistency)
-        return self.conclusion.build_family_outcome(tested.fit, self.probability, gates)
+            checked_fit = self.tested_family_set
+            gates = (checked_fit.absolute_fit, self.shape_gate, checked_fit.consistency)
+        return self.conclusion.build_family_outcome(checked_fit.fit, self.probability, gates)
 
     def failed_test_verdict(self) -> VerdictOutcome:
         """Return the verdict of an unexplained gap, as the set or its family fails a test."""
         # the reason of the test that failed: absolute fit, or else consistency
-        tested = self.tested_family_set or self.tested_set
-        reason = tested.absolute_fit.reason
-        if not tested.absolute_fit.has_failed and tested.consistency.has_failed:
-            reason = tested.consistency.reason
+        checked_fit = self.tested_family_set or self.tested_set
+        reason = checked_fit.absolute_fit.reason
+        if not checked_fit.absolute_fit.has_failed and checked_fit.consistency.has_failed:
+            reason = checked_fit.consistency.reason
         # a law of free shape has no nearest effect to mention
         if self.leading_fit.candidate.has_free_shape:
             sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
-            gates = (tested.absolute_fit, tested.consistency)
+            gates = (checked_fit.absolute_fit, checked_fit.consistency)
             return self._unexplained_verdict(sentence, self.probability, gates)
         if self.family_fit is not None and self.tested_family_set is None:
             reason = (
                 "one of them would need a free shape, and with that much freedom nearly anything "
                 "fits."
             )
-        nearest = " with ".join(self.leading_fit.candidate.identifiers)
+        nearest_effects = " with ".join(self.leading_fit.candidate.identifiers)
         clause = f"{reason[0].lower()}{reason[1:]}"
         sentence = (
-            f"There is a gap that no effect of the catalogue fits; the nearest is {nearest}, but "
-            f"{clause}"
+            "There is a gap that no effect of the catalogue fits; the nearest is "
+            f"{nearest_effects}, but {clause}"
         )
-        gates_with_shape = (tested.absolute_fit, self.shape_gate, tested.consistency)
+        gates_with_shape = (checked_fit.absolute_fit, self.shape_gate, checked_fit.consistency)
         return self._unexplained_verdict(sentence, self.probability, gates_with_shape)
 
     def _unexplained_verdict(
@@ -410,12 +413,13 @@ def _any_fails(gates: Iterable[Gate]) -> bool:
 
 def most_probable_sets(probabilities: Mapping[EffectSet, float]) -> list[EffectSet]:
     """Return the most probable sets whose probabilities add up to that which a name needs."""
-    cumulative = np.cumsum(list(probabilities.values()))
-    return list(probabilities)[: int(np.searchsorted(cumulative, SEARCH.name_probability)) + 1]
+    cumulative_probabilities = np.cumsum(list(probabilities.values()))
+    last_set = int(np.searchsorted(cumulative_probabilities, SEARCH.name_probability))
+    return list(probabilities)[: last_set + 1]
 
 
 def _family_probability(search: Search, family: str) -> float:
-    """Return the probability of a family: that of all its single effects, of any shape."""
+    """Return the probability that one effect of a family, with any shape, is missing alone."""
     fits = list(search.compared_fits().values())
     scores = np.array([search.score(fit) for fit in fits])
     weights = np.exp(scores - scores.max())

@@ -37,11 +37,11 @@ def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimat
 
 def _gain_estimates(problem: Problem, fit: CandidateFit) -> list[SensorEstimate]:
     """Return the relative errors of the gains that were fitted; the stated value is zero."""
-    shared = problem.shared
-    deviations = shared.scale * np.sqrt(np.diag(fit.covariance)[: shared.unknown_count])
-    values = shared.centre + shared.scale * fit.point.shared
+    layout = problem.shared
+    deviations = layout.scale * np.sqrt(np.diag(fit.covariance)[: layout.unknown_count])
+    values = layout.centre + layout.scale * fit.point.shared
     estimates = []
-    for index, channel in enumerate(shared.gain_channels, start=shared.parameter_count):
+    for index, channel in enumerate(layout.gain_channels, start=layout.parameter_count):
         estimates.append(
             _estimate(
                 channel=channel,
@@ -49,7 +49,7 @@ def _gain_estimates(problem: Problem, fit: CandidateFit) -> list[SensorEstimate]
                 trial="",
                 value=float(values[index]),
                 deviation=float(deviations[index]),
-                stated_deviation=_stated_deviation(shared.scale[index], shared.precision[index]),
+                stated_deviation=_stated_deviation(layout.scale[index], layout.precision[index]),
                 unit="1",
             )
         )

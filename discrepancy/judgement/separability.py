@@ -25,6 +25,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
+from reporting.arrays import LEAST_DIVISOR
 
 from .noise_forecast import NoiseForecast
 
@@ -44,7 +45,7 @@ class Detectability:
     Attributes
     ----------
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     reason : str
         The reason why the campaign cannot test it; empty if it can.
     place : str
@@ -117,7 +118,7 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
     Parameters
     ----------
     campaign : Campaign
-        The campaign as measured.
+        The campaign with its readings as measured.
     model : Model
         The unchanged model.
     setting : Setting
@@ -162,10 +163,10 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
     if not any(has_free_initial_state(data.trial) for data in problem.trials):
         return start
     # parameters are fitted, too: with a wrong frequency the initial motion would fade out
-    fitted = fit(problem, Candidate(), start).point
+    fitted_point = fit(problem, Candidate(), start).point
     local_unknowns = []
     for data, fitted_unknowns, prior_unknowns in zip(
-        problem.trials, fitted.local, start.local, strict=True
+        problem.trials, fitted_point.local, start.local, strict=True
     ):
         is_free = has_free_initial_state(data.trial)
         local_unknowns.append(fitted_unknowns if is_free else prior_unknowns)
@@ -190,7 +191,7 @@ def compute_separability(
     setting : Setting
         The scales by which the catalogue states its priors.
     effects : sequence of Effect
-        The catalogue.
+        The effects of the catalogue.
     """
     problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
@@ -198,7 +199,7 @@ def compute_separability(
     screen = Screen(problem, no_effect)
     forecast = NoiseForecast(problem, no_effect)
     detectability: list[Detectability] = []
-    visible: list[_VisibleEffect] = []
+    visible_effects: list[_VisibleEffect] = []
     for effect in effects:
         reason = effect.unavailable(setting)
         if reason is not None:
@@ -221,9 +222,11 @@ def compute_separability(
             row = _with_forecast(row, reference, small_reference, forecast)
         detectability.append(row)
         if reference.squared_size > VISIBILITY_DISTANCE:
-            visible.append(_VisibleEffect(effect.identifier, reference, [reference, *grid_changes]))
-    identifiers = tuple(effect.identifier for effect in visible)
-    distance_matrix = _distances(screen, visible)
+            visible_effects.append(
+                _VisibleEffect(effect.identifier, reference, [reference, *grid_changes])
+            )
+    identifiers = tuple(effect.identifier for effect in visible_effects)
+    distance_matrix = _distances(screen, visible_effects)
     groups = _confusion_groups(identifiers, distance_matrix)
     return Separability(tuple(detectability), identifiers, distance_matrix, groups)
 
@@ -272,20 +275,23 @@ def _reference_change(
     Parameters
     ----------
     screen : Screen
-        The fit without effect.
+        The fit without effect, about which changes are linear.
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
     references = _changes_at_prior_median(screen, effect) or options
     if not references:
         return None
-    best = max(references, key=lambda change: change.squared_size)
-    if best.squared_size < DETECTION_DISTANCE:  # its median place may be where nothing is measured
+    largest_change = max(references, key=lambda change: change.squared_size)
+    # the median of a place along the span may be where nothing is measured
+    if largest_change.squared_size < DETECTION_DISTANCE:
         at_reference = [change for change in options if _has_reference_magnitude(change)]
-        best = max([best, *at_reference], key=lambda change: change.squared_size)
-    return best
+        largest_change = max(
+            [largest_change, *at_reference], key=lambda change: change.squared_size
+        )
+    return largest_change
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
@@ -307,7 +313,7 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
 
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
-    """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
+    """Return whether a change has magnitudes as in `_changes_at_prior_median`."""
     for parameter, scaled_value in zip(change.term.parameters, change.effect_values, strict=True):
         if parameter.magnitude and abs(scaled_value) not in (0.0, 1.0):
             return False
@@ -323,25 +329,27 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     Parameters
     ----------
     effect : Effect
-        The effect.
+        The effect of the catalogue.
     change : ScreenedChange
-        Its reference change.
+        The change of the readings by the effect at its reference magnitude.
     distance : float
         The squared distance of that change from the model [sigma^2].
     """
     for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.effect_values[index])))
-            detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
+            typical_value = abs(parameter.prior.value(float(change.effect_values[index])))
+            least_detectable_value = (
+                typical_value * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
+            )
             return Detectability(
                 effect=effect,
                 reason="",
                 place=change.term.place,
                 distance=distance,
                 parameter=parameter.name,
-                detectable=detectable,
+                detectable=least_detectable_value,
                 unit=parameter.unit,
-                typical=typical,
+                typical=typical_value,
             )
     return Detectability(effect, "", change.term.place, distance)
 
@@ -396,20 +404,22 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     for i, effect in enumerate(effects):
         reference = effect.reference
         small_reference = small_changes[i][0]
-        for j, other in enumerate(effects):
+        for j, other_effect in enumerate(effects):
             if i == j:
                 continue
-            small_changes_of_other = [small.change for small in small_changes[j]]
+            small_changes_of_other = [small_change.change for small_change in small_changes[j]]
             first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
-            least_distance = min(_squared_distance(screen, reference, other.options), first_order)
+            least_distance = min(
+                _squared_distance(screen, reference, other_effect.options), first_order
+            )
             distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
     return distance
 
 
 def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]:
-    """Return the changes of an effect, each with a magnitude at which it is linear."""
+    """Return the changes of an effect, made so small that they are linear in its magnitude."""
     small_changes = []
     for option in effect.options:
         change, factor = screen.shrink_change(option)
@@ -431,7 +441,7 @@ def _squared_distance(
     screen : Screen
         The fit whose inner product measures distances.
     target : ScreenedChange
-        The change.
+        The change whose distance is computed.
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
@@ -445,27 +455,27 @@ def _squared_distance(
             return 0.0
         return abs(float(target.vector * sign @ option.vector)) / sqrt(option.squared_size)
 
-    nearest = max(options, key=cosine)
-    if nearest.squared_size <= 0.0:
+    nearest_change = max(options, key=cosine)
+    if nearest_change.squared_size <= 0.0:
         return target.squared_size
     # spanning changes: the nearest option, and its differences by the parameters, over ten times
     # the step of derivatives
-    changes = [nearest.vector]
-    for index in range(len(nearest.effect_values)):
-        stepped = nearest.effect_values.copy()
-        stepped[index] += 10.0 * PARAMETER_STEP
+    changes = [nearest_change.vector]
+    for index in range(len(nearest_change.effect_values)):
+        stepped_values = nearest_change.effect_values.copy()
+        stepped_values[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change_by_effect(nearest.term, stepped)
-            changes.append(change.vector - nearest.vector)
+            change = screen.change_by_effect(nearest_change.term, stepped_values)
+            changes.append(change.vector - nearest_change.vector)
     # least squares by normal equations, scaled to unit length; a small multiple of the identity is
     # added because changes by several parameters may be nearly parallel
     spanning_changes = np.stack(changes)
     gram = (spanning_changes * sign) @ spanning_changes.T
-    lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    lengths = np.sqrt(np.maximum(np.diag(gram), LEAST_DIVISOR))
     gram = gram / np.outer(lengths, lengths) + 1e-6 * np.eye(len(gram))
     overlaps = (spanning_changes * sign) @ target.vector / lengths
-    explained = float(overlaps @ np.linalg.solve(gram, overlaps))
-    return max(target.squared_size - explained, 0.0)
+    explained_squares = float(overlaps @ np.linalg.solve(gram, overlaps))
+    return max(target.squared_size - explained_squares, 0.0)
 
 
 def _confusion_groups(
@@ -493,11 +503,11 @@ def usable_effects(effects: Sequence[Effect], setting: Setting) -> tuple[Effect,
     DiscrepancyError
         If no effect can be tested.
     """
-    usable = tuple(effect for effect in effects if effect.unavailable(setting) is None)
-    if not usable:
+    usable_catalogue = tuple(effect for effect in effects if effect.unavailable(setting) is None)
+    if not usable_catalogue:
         raise DiscrepancyError(
             "No effect of the catalogue can be tested with this campaign and model: the campaign "
             "needs static, ring-down, forced or flight trials whose channels are outputs of the "
             "model."
         )
-    return usable
+    return usable_catalogue

@@ -75,8 +75,8 @@ class SimulationComparison(Comparison[CandidateFit]):
         trials_before = _trials_in_role(without_effect, held_out=held_out)
         trials_after = _trials_in_role(with_effect, held_out=held_out)
         block_sums: list[list[float]] = []
-        for before, after in zip(trials_before, trials_after, strict=True):
-            block_sums += self._block_sums(before, after)
+        for trial_before, trial_after in zip(trials_before, trials_after, strict=True):
+            block_sums += self._block_sums(trial_before, trial_after)
         sums_before, sums_after, noise_sums = np.array(block_sums).T
         return GapShare(
             squares_before=sums_before,
@@ -90,7 +90,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             is_tested=True,
         )
 
-    def _block_sums(self, before: FittedTrial, after: FittedTrial) -> list[list[float]]:
+    def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[list[float]]:
         """Return sums over each block of a trial without and with a hypothesis.
 
         Returns
@@ -99,14 +99,14 @@ class SimulationComparison(Comparison[CandidateFit]):
             For each block the sums of squared residuals over the noise variance, without and with
             the hypothesis, and the number of used samples, which is the expected sum of the noise.
         """
-        noise = before.noise_deviation * [
-            self._noise_scales[name] for name in before.trial.channels
+        noise = trial_before.noise_deviation * [
+            self._noise_scales[name] for name in trial_before.trial.channels
         ]
-        squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
-        squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
-        sample_count = len(before.used)
+        squares_before = np.where(trial_before.used, trial_before.residual / noise, 0.0) ** 2
+        squares_after = np.where(trial_after.used, trial_after.residual / noise, 0.0) ** 2
+        sample_count = len(trial_before.used)
         block_count = 1
-        if before.trial.is_dynamic:
+        if trial_before.trial.is_dynamic:
             block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
         sums_of_blocks = []
         for block in np.array_split(np.arange(sample_count), block_count):
@@ -114,7 +114,7 @@ class SimulationComparison(Comparison[CandidateFit]):
                 [
                     float(squares_before[block].sum()),
                     float(squares_after[block].sum()),
-                    float(before.used[block].sum()),
+                    float(trial_before.used[block].sum()),
                 ]
             )
         return sums_of_blocks
@@ -125,16 +125,16 @@ class SimulationComparison(Comparison[CandidateFit]):
         It is that under the wider noise; None if the candidate cannot be fitted.
         """
         no_effect = self.search.no_effect
-        fitted = self.search.exact_fits.get(candidate.key)
-        if fitted is None:
+        exact_fit = self.search.exact_fits.get(candidate.key)
+        if exact_fit is None:
             start = Point(no_effect.point.shared, no_effect.point.local, effect)
-            fitted = try_fit(self.problem, candidate, start)
-        return None if fitted is None else self._fit_under_wide_noise(fitted)
+            exact_fit = try_fit(self.problem, candidate, start)
+        return None if exact_fit is None else self._fit_under_wide_noise(exact_fit)
 
-    def _fit_under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
+    def _fit_under_wide_noise(self, exact_fit: CandidateFit) -> CandidateFit | None:
         """Return the fit of a hypothesis under the wider noise; None if it cannot be fitted."""
         wide_problem = self.search.wide_problem or self.problem
-        return refit_under_wide_noise(self.problem, wide_problem, fitted)
+        return refit_under_wide_noise(self.problem, wide_problem, exact_fit)
 
     def add_free_shape_families(self) -> None:
         """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
@@ -142,41 +142,45 @@ class SimulationComparison(Comparison[CandidateFit]):
         The best law and those that are easily mistaken for it are fitted with a free shape. A fit
         is added if its evidence is above that of the best law by more than `LEAST_SHAPE_GAIN`.
         """
-        best = self.search.best()
-        if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
+        best_fit = self.search.best()
+        if len(best_fit.candidate.terms) != 1 or not self.acts_on_structure(
+            best_fit.candidate.terms[0]
+        ):
             return
         compared = dict(self.search.wide_fits)
-        for single in self._single_laws_like(best):
-            free_shape_fit = fit_free_shape(self.problem, single, 0)
+        for single_fit in self._single_laws_like(best_fit):
+            free_shape_fit = fit_free_shape(self.problem, single_fit, 0)
             wide_free_shape_fit = (
                 None if free_shape_fit is None else self._fit_under_wide_noise(free_shape_fit)
             )
             if wide_free_shape_fit is None:
                 continue
-            self._free_shape_fits[single.candidate.key] = wide_free_shape_fit
-            if wide_free_shape_fit.log_evidence > best.log_evidence + LEAST_SHAPE_GAIN:
+            self._free_shape_fits[single_fit.candidate.key] = wide_free_shape_fit
+            if wide_free_shape_fit.log_evidence > best_fit.log_evidence + LEAST_SHAPE_GAIN:
                 compared[wide_free_shape_fit.candidate.key] = wide_free_shape_fit
         self.search.wide_fits = compared
 
-    def _single_laws_like(self, best: CandidateFit) -> list[CandidateFit]:
+    def _single_laws_like(self, best_fit: CandidateFit) -> list[CandidateFit]:
         """Return the best single law of each family and place that is easily mistaken for the best.
 
         The best law itself is one of them, if it has a shape parameter.
         """
-        (best_term,) = best.candidate.terms
-        singles: dict[tuple[str, str], CandidateFit] = {}
+        (best_term,) = best_fit.candidate.terms
+        single_fits: dict[tuple[str, str], CandidateFit] = {}
         fits = (*self.search.rough_fits.values(), *self.search.exact_fits.values())
-        for fitted in fits:
-            if len(fitted.candidate.terms) != 1:
+        for other_fit in fits:
+            if len(other_fit.candidate.terms) != 1:
                 continue
-            (term,) = fitted.candidate.terms
+            (term,) = other_fit.candidate.terms
             has_shape_to_free = bool(term.effect.shape) and not term.free_shape
             if not has_shape_to_free or not self.acts_on_structure(term):
                 continue
             if term == best_term or are_related(term.effect, best_term.effect):
                 key = (term.effect.family, term.place)
-                singles[key] = max(singles.get(key, fitted), fitted, key=self.search.score)
-        return list(singles.values())
+                single_fits[key] = max(
+                    single_fits.get(key, other_fit), other_fit, key=self.search.score
+                )
+        return list(single_fits.values())
 
     def fit_with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
         """Return the fit of a single law with its shape free; None if there is none."""
@@ -185,7 +189,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         return self._free_shape_fits.get(hypothesis.candidate.key)
 
     def start_point(self, hypothesis: CandidateFit) -> Point:
-        """Return the fitted point of a hypothesis."""
+        """Return the values of all unknowns of a hypothesis, at which the simulation was fitted."""
         return hypothesis.point
 
     def check_fit(self, hypothesis: CandidateFit) -> Gate:
@@ -227,7 +231,7 @@ class SimulationComparison(Comparison[CandidateFit]):
 
 def _trials_in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTrial]:
     """Return the trials that were held out, or those that were not."""
-    return [fitted for fitted in trials if fitted.trial.held_out is held_out]
+    return [fitted_trial for fitted_trial in trials if fitted_trial.trial.held_out is held_out]
 
 
 def _rms_beyond_noise(sums: FloatArray, noise_sums: FloatArray) -> float:

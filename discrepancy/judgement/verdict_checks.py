@@ -133,20 +133,20 @@ def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
     a noise record the noise is what the fit leaves in the fitted trials.
     """
     far_records = []
-    for fitted in residuals.trials:
-        if not fitted.trial.held_out:
+    for fitted_trial in residuals.trials:
+        if not fitted_trial.trial.held_out:
             continue
-        for column, channel in enumerate(fitted.trial.channels):
-            used = fitted.used[:, column]
-            if not used.any():
+        for column, channel in enumerate(fitted_trial.trial.channels):
+            is_used = fitted_trial.used[:, column]
+            if not is_used.any():
                 continue
-            mean_square = float(np.mean(fitted.standardised[used, column] ** 2))
-            expected_mean_square = float(np.mean(fitted.expected_variance[used, column]))
+            mean_square = float(np.mean(fitted_trial.standardised[is_used, column] ** 2))
+            expected_mean_square = float(np.mean(fitted_trial.expected_variance[is_used, column]))
             if mean_square > max(
                 VETO_NOISE_DEVIATIONS**2, VETO_PREDICTIVE_DEVIATIONS**2 * expected_mean_square
             ):
                 far_records.append(
-                    FarRecord(fitted.trial.name, channel, float(np.sqrt(mean_square)))
+                    FarRecord(fitted_trial.trial.name, channel, float(np.sqrt(mean_square)))
                 )
     return sorted(far_records, key=lambda record: -record.noise_deviations)
 
@@ -155,14 +155,18 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
     """Return the sentence on a gap that only held-out trials show."""
     parts = []
     for record in far_records[:MOST_MENTIONED]:
-        trials = [fitted for fitted in residuals.trials if fitted.trial.name == record.trial]
+        trials = [
+            fitted_trial
+            for fitted_trial in residuals.trials
+            if fitted_trial.trial.name == record.trial
+        ]
         rms = rms_by_channel(replace(residuals, trials=tuple(trials)))[record.channel]
         rms_text = _value_with_unit(residuals, record.channel, rms)
         noise_text = f"{record.noise_deviations:.1f} times the noise"
         parts.append(f"{record.channel} in {record.trial!r} by {rms_text} (rms, {noise_text})")
-    remaining = len(far_records) - MOST_MENTIONED
-    if remaining > 0:
-        parts.append(f"{remaining} more records")
+    unmentioned_count = len(far_records) - MOST_MENTIONED
+    if unmentioned_count > 0:
+        parts.append(f"{unmentioned_count} more records")
     return (
         "The model explains the trials that were fitted, but not those held out: it misses "
         f"{listing(parts)}. Something is missing that the fitted trials do not show: fit trials "
@@ -188,29 +192,29 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
     deviations.
     """
     unfitted = []
-    for fitted in residuals.trials:
-        if fitted.trial.held_out or not fitted.trial.is_dynamic:
+    for fitted_trial in residuals.trials:
+        if fitted_trial.trial.held_out or not fitted_trial.trial.is_dynamic:
             continue
-        for column, channel in enumerate(fitted.trial.channels):
-            used = fitted.used[:, column]
-            if not used.any():
+        for column, channel in enumerate(fitted_trial.trial.channels):
+            is_used = fitted_trial.used[:, column]
+            if not is_used.any():
                 continue
-            rms = float(np.sqrt(np.mean(fitted.residual[used, column] ** 2)))
-            deviation = float(np.std(fitted.trial.values[used, column]))
-            noise = _noise_deviation(residuals, fitted, column)
+            rms = float(np.sqrt(np.mean(fitted_trial.residual[is_used, column] ** 2)))
+            deviation = float(np.std(fitted_trial.trial.values[is_used, column]))
+            noise = _noise_deviation(residuals, fitted_trial, column)
             if rms > max(deviation, VETO_NOISE_DEVIATIONS * noise):
-                unfitted.append(UnfittedRecord(fitted.trial.name, channel, rms, deviation))
+                unfitted.append(UnfittedRecord(fitted_trial.trial.name, channel, rms, deviation))
     return tuple(unfitted)
 
 
-def _noise_deviation(residuals: ResidualSet, fitted: FittedTrial, column: int) -> float:
+def _noise_deviation(residuals: ResidualSet, fitted_trial: FittedTrial, column: int) -> float:
     """Return the noise deviation of a column of a trial [unit of the channel].
 
     It is the recorded one, or estimated from the second differences of the readings.
     """
-    if residuals.degrees_of_freedom(fitted.trial.channels[column]) > 0.0:
-        return float(fitted.noise_deviation[column])
-    readings: FloatArray = fitted.trial.values[fitted.used[:, column], column]
+    if residuals.degrees_of_freedom(fitted_trial.trial.channels[column]) > 0.0:
+        return float(fitted_trial.noise_deviation[column])
+    readings: FloatArray = fitted_trial.trial.values[fitted_trial.used[:, column], column]
     if len(readings) < 3:
         return float("inf")
     return float(np.sqrt(np.mean(np.diff(readings, 2) ** 2) / WHITE_SECOND_DIFFERENCES))
@@ -219,9 +223,9 @@ def _noise_deviation(residuals: ResidualSet, fitted: FittedTrial, column: int) -
 def _unfitted_verdict(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> Verdict:
     """Return the verdict on a model that could not be fitted to the trials."""
     parts = [f"{record.channel} in {record.trial!r}" for record in unfitted[:MOST_MENTIONED]]
-    remaining = len(unfitted) - MOST_MENTIONED
-    if remaining > 0:
-        parts.append(f"{remaining} more records")
+    unmentioned_count = len(unfitted) - MOST_MENTIONED
+    if unmentioned_count > 0:
+        parts.append(f"{unmentioned_count} more records")
     sentence = (
         f"The model does not fit: its residuals of {listing(parts)} are larger than the variation "
         "of the readings about their mean. That is no evidence of a missing force. Check how the "

@@ -26,11 +26,11 @@ class Backbone:
     Attributes
     ----------
     mode : int
-        Number of the mode from one, by start frequency.
+        The number of the mode from one, by start frequency.
     time : (W,) ndarray
-        Centroid of the mode's energy in each window [s].
+        The centroid of the mode's energy in each window [s].
     amplitude, amplitude_error : (W,) ndarray
-        Amplitude at that time and its standard error [signal's unit].
+        The amplitude at that time and its standard error [signal's unit].
     frequency, frequency_error : (W,) ndarray
         Natural frequency |s| / 2 pi with s = -decay + i omega_d, and its standard error [Hz].
     damping_ratio, damping_ratio_error : (W,) ndarray
@@ -66,14 +66,14 @@ def backbones(
     time, signal : (N,) ndarray
         The record, evenly spaced [s], [any unit].
     frequencies : sequence of float
-        Start values of the frequencies of all modes in the signal [Hz].
+        The start values of the frequencies of all modes in the signal [Hz].
     noise_deviation : float, optional
-        Standard deviation of the noise [signal's unit]. By default, that of the residuals of each
-        window, which also contain what the cosines do not describe.
+        The standard deviation of the noise [signal's unit]. By default, that of the residuals of
+        each window, which also contain what the cosines do not describe.
     averaging_width : float
-        Interval over which each value is an average [s]; 0 for samples.
+        The interval over which each value is an average [s]; 0 for samples.
     periods : float
-        Length of a window in periods of the lowest frequency. A longer window gives smaller
+        The length of a window in periods of the lowest frequency. A longer window gives smaller
         standard errors, but averages over a larger change of amplitude: for quadratic damping with
         a ratio of 0.045, windows of three periods give 0.043.
 
@@ -96,10 +96,10 @@ def backbones(
     is_ringing = np.ones(start.size, dtype=bool)
     poles = (1j - 0.02) * start  # first guess: a damping ratio of 2 %
     points: list[list[BackbonePoint]] = [[] for _ in start]
-    for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
-        samples = slice(first, first + width)
+    for first_sample in range(0, time.size - width + 1, max(1, round(0.5 * width))):
+        samples = slice(first_sample, first_sample + width)
         window = DampedCosines(time[samples], signal[samples], averaging_width)
-        window_time = time[samples] - time[first]
+        window_time = time[samples] - time[first_sample]
         while is_ringing.any():
             solution = window.fit(poles[is_ringing])
             modes = np.flatnonzero(is_ringing).tolist()
@@ -115,7 +115,7 @@ def backbones(
         if not is_ringing.any():
             break
         for mode, point in zip(modes, points_of_window, strict=True):
-            points[mode].append(point._replace(time=float(time[first]) + point.time))
+            points[mode].append(point._replace(time=float(time[first_sample]) + point.time))
         # start values for the next window: these poles, with a damping ratio of at least 1e-4
         fitted_poles = solution.pole
         largest_real_part = -1e-4 * fitted_poles.imag
@@ -170,9 +170,9 @@ def _points_of_window(
     time : (N,) ndarray
         Times in the window [s].
     solution : DampedCosineFit
-        Fit of the window.
+        The damped cosine that was fitted in the window.
     noise_deviation : float or None
-        Standard deviation of the noise; that of the window's residuals if None.
+        The standard deviation of the noise; that of the window's residuals if None.
     """
     residual_deviation = float(solution.deviation[0])
     deviation = residual_deviation if noise_deviation is None else noise_deviation

@@ -48,9 +48,9 @@ def modal_motion(
         The motion. It is extended by its mirror images on both sides, so that the Fourier
         transform meets no jump at its ends.
     interval : float
-        Sampling interval [s].
+        The interval between successive samples [s].
     frequencies : sequence of float
-        Frequencies of the K modes [Hz], lowest first, apart by more than the resolution of the
+        The frequencies of the K modes [Hz], lowest first, apart by more than the resolution of the
         record.
 
     Returns
@@ -60,8 +60,8 @@ def modal_motion(
         w. Its modulus is the amplitude of the mode at each time.
     """
     count = len(values)
-    mirrored = np.concatenate([values[:0:-1], values, values[-2::-1]])
-    spectrum = np.fft.fft(mirrored, axis=0)
+    mirrored_motion = np.concatenate([values[:0:-1], values, values[-2::-1]])
+    spectrum = np.fft.fft(mirrored_motion, axis=0)
     ordinate_frequencies = np.fft.fftfreq(len(spectrum), interval)[:, np.newaxis]
     spectra_of_modes = []
     for low, high in mode_bands(frequencies):
@@ -72,7 +72,9 @@ def modal_motion(
 
 
 def mode_shares(
-    trials: Sequence[FittedTrial], white: Sequence[FloatArray], frequencies: Sequence[float]
+    trials: Sequence[FittedTrial],
+    white_residuals: Sequence[FloatArray],
+    frequencies: Sequence[float],
 ) -> FloatArray:
     """Return the fraction (M,) of the excess variance in the frequency band of each mode.
 
@@ -81,19 +83,19 @@ def mode_shares(
     Parameters
     ----------
     trials : sequence of FittedTrial
-        Dynamic trials.
-    white : sequence of (N, C) ndarray
-        Their white residuals.
+        The dynamic trials with their predictions and residuals.
+    white_residuals : sequence of (N, C) ndarray
+        The white residuals of each trial.
     frequencies : sequence of float
-        Frequencies of the M modes [Hz], lowest first.
+        The frequencies of the M modes [Hz], lowest first.
     """
     excess_of_modes = np.zeros(len(frequencies))
     total_excess = 0.0
-    for fitted, values in zip(trials, white, strict=True):
+    for fitted_trial, values in zip(trials, white_residuals, strict=True):
         # An ordinate of the periodogram is one on average for white noise of unit variance, and
         # stands for two terms of the sum of squares: a cosine and a sine.
         surplus = sum(2.0 * (periodogram(series) - 1.0) for series in values.T)
-        duration = len(values) * fitted.trial.interval
+        duration = len(values) * fitted_trial.trial.interval
         ordinate_frequencies = np.arange(1, np.size(surplus) + 1) / duration
         total_excess += float(np.sum(surplus))
         for mode, (low, high) in enumerate(mode_bands(frequencies)):
@@ -112,27 +114,27 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     has at least four periods in the record, because a wrong zero or a slow decay looks like a peak
     at lower frequencies.
     """
-    longest = max(trials, key=lambda fitted: len(fitted.trial.time)).trial
-    count = len(longest.time)
+    longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
+    count = len(longest_trial.time)
     power = np.zeros((count - 1) // 2)
-    for fitted in trials:
-        interval_ratio = fitted.trial.interval / longest.interval
-        if len(fitted.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
+    for fitted_trial in trials:
+        interval_ratio = fitted_trial.trial.interval / longest_trial.interval
+        if len(fitted_trial.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
-        values = fitted.prediction - fitted.prediction.mean(axis=0)
+        values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)
         # the falling half of a Hann window, because most of a ring-down is at its start
         taper = np.hanning(2 * count)[count:, np.newaxis]
-        spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted.noise_deviation**2
+        spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted_trial.noise_deviation**2
         power += spectra[1 : power.size + 1].sum(axis=1)
-    frequencies = np.arange(1, power.size + 1) / (count * longest.interval)
+    frequencies = np.arange(1, power.size + 1) / (count * longest_trial.interval)
     peaks = []
     for index in range(3, power.size - 1):  # index 3 is four periods in the record
         frequency = float(frequencies[index])
         is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
         if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
             peaks.append((float(power[index]), frequency))
-    highest = sorted(peaks, reverse=True)[:4]
-    return tuple(sorted(frequency for _, frequency in highest))
+    highest_peaks = sorted(peaks, reverse=True)[:4]
+    return tuple(sorted(frequency for _, frequency in highest_peaks))
 
 
 _HAT_COUNT = 9
@@ -149,11 +151,11 @@ class Dependence(NamedTuple):
     name : str
         What residuals depend on: "amplitude", "time", "load (not proportional)", ...
     share : float
-        Fraction of the excess variance that it explains.
+        The fraction of the excess variance that it explains.
     p_value : float
         p-value if there is no such dependence.
     coefficient_count : int
-        Number of fitted coefficients.
+        The number of fitted coefficients.
     """
 
     subject: str
@@ -168,11 +170,11 @@ def excess_over_noise(trials: Sequence[FittedTrial]) -> float:
 
     It is the sum of squares of their residuals minus its expectation if the model is right.
     """
-    total = 0.0
-    for fitted in trials:
-        expected = np.sum(fitted.expected_variance[fitted.used])
-        total = total + (np.nansum(fitted.standardised**2) - expected)
-    return float(total)
+    total_excess = 0.0
+    for fitted_trial in trials:
+        expected_sum = np.sum(fitted_trial.expected_variance[fitted_trial.used])
+        total_excess = total_excess + (np.nansum(fitted_trial.standardised**2) - expected_sum)
+    return float(total_excess)
 
 
 def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
@@ -183,12 +185,12 @@ def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
     values : (n,) ndarray
         Values at which the functions are evaluated.
     low, high : float
-        First and last knot.
+        The first and the last knot.
 
     Returns
     -------
     (n, `_HAT_COUNT`) ndarray
-        Value of each hat function; the constant 1 in a single column if the knots coincide.
+        The value of each hat function; the constant 1 in a single column if the knots coincide.
     """
     if high <= low:
         return np.ones((values.size, 1))
@@ -211,7 +213,7 @@ def explained_dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]
     """
     excess_variance = excess_over_noise(trials)
     degrees_of_freedom = sum(
-        float(np.sum(fitted.expected_variance[fitted.used])) for fitted in trials
+        float(np.sum(fitted_trial.expected_variance[fitted_trial.used])) for fitted_trial in trials
     )
     # the sum of squares has about the variance 2 x degrees of freedom: two standard deviations
     if degrees_of_freedom <= 0.0 or excess_variance <= 2.0 * np.sqrt(2.0 * degrees_of_freedom):
@@ -223,13 +225,15 @@ def explained_dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]
         modes = predicted_frequencies(trials)
     equations: dict[tuple[str, str], list[NormalEquations]] = {}
     for column in range(len(trials[0].trial.channels)):
-        with_channel = [fitted for fitted in trials if fitted.used[:, column].any()]
+        with_channel = [
+            fitted_trial for fitted_trial in trials if fitted_trial.used[:, column].any()
+        ]
         if not with_channel:
             continue
         bases = dependence_bases(with_channel, column, modes)
         if line is not None:
             bases["", line.name] = line.decaying_waves(with_channel, column)
-        rows = [(fitted, fitted.used[:, column]) for fitted in with_channel]
+        rows = [(fitted_trial, fitted_trial.used[:, column]) for fitted_trial in with_channel]
         for key, basis in bases.items():
             channel_equations = normal_equations_of(basis, rows, column)
             if channel_equations is not None:
@@ -249,11 +253,11 @@ class SpectralLine(NamedTuple):
     Attributes
     ----------
     frequency : float
-        Frequency [Hz].
+        The frequency of the line [Hz].
     decay : float
-        Decay rate [1/s].
+        The decay rate of the line [1/s].
     choice_count : int
-        Number of lines from which it was chosen.
+        The number of lines from which it was chosen.
     """
 
     frequency: float
@@ -271,9 +275,9 @@ class SpectralLine(NamedTuple):
         Parameters
         ----------
         trials : sequence of FittedTrial
-            The T trials.
+            The T trials with their predictions and residuals.
         column : int
-            Column of the channel.
+            The index of the channel's column in the arrays of the trial.
 
         Returns
         -------
@@ -281,8 +285,10 @@ class SpectralLine(NamedTuple):
             Values at the n used samples of the channel in all trials.
         """
         waves_of_trials = []
-        for fitted in trials:
-            times = fitted.trial.time[fitted.used[:, column]] - fitted.trial.time[0]
+        for fitted_trial in trials:
+            times = (
+                fitted_trial.trial.time[fitted_trial.used[:, column]] - fitted_trial.trial.time[0]
+            )
             wave = np.exp((-self.decay + 2j * np.pi * self.frequency) * times)
             waves_of_trials.append(np.column_stack([wave.real, wave.imag]))
         return np.asarray(block_diag(*waves_of_trials))
@@ -296,24 +302,26 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
     0, 1, 3, 10 and 30 e-folds within the record. It is summed over all channels. The result is None
     for records of fewer than eight samples.
     """
-    length = max(len(fitted.trial.time) for fitted in trials)
+    length = max(len(fitted_trial.trial.time) for fitted_trial in trials)
     interval = trials[0].trial.interval
     if length < 8:
         return None
     evenly_sampled = [
-        fitted for fitted in trials if abs(fitted.trial.interval / interval - 1.0) < 1e-6
+        fitted_trial
+        for fitted_trial in trials
+        if abs(fitted_trial.trial.interval / interval - 1.0) < 1e-6
     ]
     frequencies = np.fft.rfftfreq(4 * length, interval)
-    strongest: SpectralLine | None = None
+    strongest_line: SpectralLine | None = None
     greatest_power = 0.0
     choices = 0
     for folds in (0.0, 1.0, 3.0, 10.0, 30.0):
         decay = folds / (length * interval)
         power = np.zeros(frequencies.size)
-        for fitted in evenly_sampled:
-            weight = np.exp(-decay * interval * np.arange(len(fitted.trial.time)))
-            weighted = np.nan_to_num(fitted.standardised) * weight[:, np.newaxis]
-            spectra = np.abs(np.fft.rfft(weighted, 4 * length, axis=0)) ** 2
+        for fitted_trial in evenly_sampled:
+            weight = np.exp(-decay * interval * np.arange(len(fitted_trial.trial.time)))
+            weighted_residuals = np.nan_to_num(fitted_trial.standardised) * weight[:, np.newaxis]
+            spectra = np.abs(np.fft.rfft(weighted_residuals, 4 * length, axis=0)) ** 2
             # A cosine and a sine under this weight each have about half the squared norm of the
             # weight, so that the explained sum of squares is 2 |spectrum|^2 / |weight|^2.
             power += 2.0 * spectra.sum(axis=1) / (weight @ weight)
@@ -323,8 +331,8 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         # a decaying line must explain at least 5 % more than the best so far
         if power[index] > 1.05 * greatest_power:
             greatest_power = float(power[index])
-            strongest = SpectralLine(float(frequencies[index]), decay, choices)
-    return None if strongest is None else strongest._replace(choice_count=choices)
+            strongest_line = SpectralLine(float(frequencies[index]), decay, choices)
+    return None if strongest_line is None else strongest_line._replace(choice_count=choices)
 
 
 def dependence_bases(
@@ -337,9 +345,9 @@ def dependence_bases(
     trials : sequence of FittedTrial
         Trials of one kind in which the channel is used.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
     modes : sequence of float
-        Frequencies of the modes [Hz].
+        The frequencies of the modes [Hz].
 
     Returns
     -------
@@ -367,17 +375,17 @@ class _UsedSamples:
     Parameters
     ----------
     trials : sequence of FittedTrial
-        The trials.
+        The trials with their predictions and residuals.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
     """
 
     def __init__(self, trials: Sequence[FittedTrial], column: int) -> None:
         self.trials = trials
         self.column = column
-        self.rows = [fitted.used[:, column] for fitted in trials]
+        self.rows = [fitted_trial.used[:, column] for fitted_trial in trials]
         self.count = sum(int(rows.sum()) for rows in self.rows)
-        self._features = [dependence_functions(fitted, column) for fitted in trials]
+        self._features = [dependence_functions(fitted_trial, column) for fitted_trial in trials]
 
     def stack_used_samples(self, values: Callable[[FittedTrial], FloatArray]) -> FloatArray:
         """Return an array of each trial at its used samples, stacked over the trials.
@@ -392,12 +400,12 @@ class _UsedSamples:
         (n, ...) ndarray
             Its rows at the n used samples of all trials.
         """
-        return self.stack_arrays([values(fitted) for fitted in self.trials])
+        return self.stack_arrays([values(fitted_trial) for fitted_trial in self.trials])
 
     def stack_arrays(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Return arrays (N, ...) of the trials at the used samples, stacked (n, ...)."""
-        used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
-        return np.concatenate(used)
+        is_used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
+        return np.concatenate(is_used)
 
     def split_by_trial(self, functions: FloatArray) -> FloatArray:
         """Return functions with separate columns for each trial, thus separate coefficients.
@@ -428,11 +436,13 @@ class _UsedSamples:
             if name in names
         ]
         width = max(widths, default=1)
-        stacked = []
+        stacked_features = []
         for features_of_trial, rows in zip(self._features, self.rows, strict=True):
             zeros = np.zeros((int(rows.sum()), width))
-            stacked.append(np.hstack([features_of_trial.get(name, zeros) for name in names]))
-        return np.vstack(stacked)
+            stacked_features.append(
+                np.hstack([features_of_trial.get(name, zeros) for name in names])
+            )
+        return np.vstack(stacked_features)
 
 
 def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
@@ -465,21 +475,21 @@ def _dynamic_bases(
     """
     bases: dict[tuple[str, str], FloatArray] = {}
     relative_time = samples.stack_used_samples(
-        lambda fitted: np.linspace(-1.0, 1.0, len(fitted.trial.time))
+        lambda fitted_trial: np.linspace(-1.0, 1.0, len(fitted_trial.trial.time))
     )
     drift = np.asarray(np.polynomial.legendre.legvander(relative_time, 4), dtype=np.float64)
     bases["", "a drift of zero in each trial"] = samples.split_by_trial(drift)
-    if all(fitted.rates is not None for fitted in samples.trials):
+    if all(fitted_trial.rates is not None for fitted_trial in samples.trials):
         bases["", "x and v"] = samples.prediction_features("x", "v")
         bases["", "higher harmonics"] = samples.prediction_features("2nd harmonic", "3rd harmonic")
     if not modes:
         return bases
     column = samples.column
     motions = [
-        modal_motion(fitted.prediction[:, [column]], fitted.trial.interval, modes)
-        for fitted in samples.trials
+        modal_motion(fitted_trial.prediction[:, [column]], fitted_trial.trial.interval, modes)
+        for fitted_trial in samples.trials
     ]
-    time = samples.stack_used_samples(lambda fitted: fitted.trial.time)
+    time = samples.stack_used_samples(lambda fitted_trial: fitted_trial.trial.time)
     by_time = _hat_functions(time, float(time.min()), float(time.max()))
     for mode in range(len(modes)):
         motion = samples.stack_arrays([motion_of_trial[mode] for motion_of_trial in motions])

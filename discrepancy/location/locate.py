@@ -66,13 +66,13 @@ class Location:
     disagrees : bool
         Global verdict, by Holm's rule at `GLOBAL_LEVEL` over the omnibus tests.
     tests : tuple of OmnibusTest
-        Tests of variance, Ljung-Box, cumulative periodogram and Fisher g.
+        The tests of variance, Ljung-Box, cumulative periodogram and Fisher g.
     cells : tuple of Cell
         The map; cells are significant at the false discovery rate `MAP_RATE`.
     disagreements : tuple of Disagreement
-        Findings in words, largest first; empty if nothing disagrees.
+        The findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
-        Limits of these statements: a missing noise record, noise that is not white, residuals
+        The limits of these statements: a missing noise record, noise that is not white, residuals
         smaller than the noise, a model so far off that no cell can be judged.
     """
 
@@ -94,7 +94,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are left out.
     seed : int
-        Seed of the random draw that makes the residuals white; see
+        The seed of the random draw that makes the residuals white; see
         `ResidualSet.whitened_residuals`.
 
     Returns
@@ -107,46 +107,53 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     FitError
         If no trial was fitted.
     """
-    fitted = residuals.fitted
-    if fitted is None:
+    fitted_residuals = residuals.fitted
+    if fitted_residuals is None:
         raise FitError(
             "Nothing can be located: every trial is held out, and at least one fitted is needed."
         )
-    fitted = without_coloured_records(fitted)
-    white = fitted.whitened_residuals(np.random.default_rng(seed))
-    coloured = coloured_noise_remarks(fitted)
-    tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
-    rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
+    fitted_residuals = without_coloured_records(fitted_residuals)
+    white_residuals = fitted_residuals.whitened_residuals(np.random.default_rng(seed))
+    coloured_remarks = coloured_noise_remarks(fitted_residuals)
+    tests = (
+        variance_test(fitted_residuals),
+        *serial_tests(fitted_residuals, white_residuals, tuple(coloured_remarks)),
+    )
+    rejections = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(
         replace(test, rejected=is_rejected)
-        for test, is_rejected in zip(tests, rejected, strict=True)
+        for test, is_rejected in zip(tests, rejections, strict=True)
     )
-    findings = _disagreements(fitted, white) if any(rejected) else []
-    cells = residual_map(fitted, white, MAP_RATE)
-    remarks = [*coloured.values(), *_noise_remarks(fitted)]
-    has_samples = any(trial.used.any() for trial in fitted.trials)
+    findings = _disagreements(fitted_residuals, white_residuals) if any(rejections) else []
+    cells = residual_map(fitted_residuals, white_residuals, MAP_RATE)
+    remarks = [*coloured_remarks.values(), *_noise_remarks(fitted_residuals)]
+    has_samples = any(trial.used.any() for trial in fitted_residuals.trials)
     if has_samples and all(cell.axis == "frequency" for cell in cells):
         remarks.append(
             "The errors of the model are so much larger than the noise that no single cell of the "
             "map can be judged."
         )
-    return Location(any(rejected), tests, cells, tuple(findings), tuple(remarks))
+    return Location(any(rejections), tests, cells, tuple(findings), tuple(remarks))
 
 
-def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disagreement]:
+def _disagreements(
+    residuals: ResidualSet, white_residuals: Sequence[FloatArray]
+) -> list[Disagreement]:
     """Return the findings in all kinds of trials, sorted by the excess variance that they explain.
 
     Parameters
     ----------
     residuals : ResidualSet
-        The fitted trials.
-    white : sequence of (N, C) ndarray
-        White residuals of each trial.
+        The residuals of the fitted trials.
+    white_residuals : sequence of (N, C) ndarray
+        The white residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
-    for kind in group_by_kind(residuals, white):
+    for kind in group_by_kind(residuals, white_residuals):
         # the share of a finding is a fraction of the excess in its own kind of trial
-        excess_of_kind = sum(max(excess_over_noise([fitted]), 0.0) for fitted in kind.trials)
+        excess_of_kind = sum(
+            max(excess_over_noise([fitted_trial]), 0.0) for fitted_trial in kind.trials
+        )
         patterns = singular_patterns(residuals, kind)
         dependence = _main_dependence(kind, patterns)
         findings_of_kind = patterns if dependence is None else [dependence, *patterns]
@@ -159,12 +166,12 @@ def _disagreements(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     """Return the remarks on missing noise records, and on residuals smaller than the noise."""
     remarks = []
-    unknown = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
-    if unknown:
+    unrecorded_channels = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
+    if unrecorded_channels:
         remarks.append(
-            f"No noise record for {', '.join(unknown)}: nothing absolute can be said about the "
-            "size of these residuals; give pre-trigger samples, repeats or a standard deviation "
-            "with its degrees of freedom."
+            f"No noise record for {', '.join(unrecorded_channels)}: nothing absolute can be said "
+            "about the size of these residuals; give pre-trigger samples, repeats or a standard "
+            "deviation with its degrees of freedom."
         )
     for names in noise_groups(residuals).values():
         square, freedom = mean_square_ratio(residuals, names)
@@ -195,11 +202,11 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
         The remark, or nothing if there is no outlier.
     """
     counts: dict[str, int] = {}
-    for fitted in residuals.trials:
-        if not fitted.trial.is_dynamic:
+    for fitted_trial in residuals.trials:
+        if not fitted_trial.trial.is_dynamic:
             continue
-        for column, name in enumerate(fitted.trial.channels):
-            count = _count_isolated_outliers(np.abs(fitted.standardised[:, column]))
+        for column, name in enumerate(fitted_trial.trial.channels):
+            count = _count_isolated_outliers(np.abs(fitted_trial.standardised[:, column]))
             counts[name] = counts.get(name, 0) + count
     phrases = [f"{name} ({count})" for name, count in counts.items() if count]
     if not phrases:
@@ -217,7 +224,7 @@ def _count_isolated_outliers(absolute_residuals: FloatArray) -> int:
     Parameters
     ----------
     absolute_residuals : (N,) ndarray
-        Absolute residuals in units of the noise; nan in gaps.
+        The absolute residuals in units of the noise; nan in gaps.
     """
     finite = absolute_residuals[np.isfinite(absolute_residuals)]
     if not finite.size:
@@ -242,9 +249,9 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
     Parameters
     ----------
     kind : TrialsOfKind
-        The trials.
+        The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
-        Their patterns over the channels.
+        The patterns of these trials over the channels.
     """
     candidates = list(explained_dependences(kind.trials))
     significant = [
@@ -298,9 +305,9 @@ def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -
     Parameters
     ----------
     kind : TrialsOfKind
-        The trials.
+        The trials of one kind, which have the same channels.
     patterns : sequence of Disagreement
-        Their patterns over the channels.
+        The patterns of these trials over the channels.
     """
     channels = kind.trials[0].trial.channels
     for pattern in patterns:

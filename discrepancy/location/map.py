@@ -56,7 +56,7 @@ def normal_equations_of(
     rows : sequence of (FittedTrial, (N,) ndarray of bool)
         Trials, and which of their N samples are the rows of `basis`, one trial after the other.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
 
     Returns
     -------
@@ -67,17 +67,23 @@ def normal_equations_of(
     norms = np.linalg.norm(basis, axis=0)
     basis = basis[:, norms > 0.0] / norms[norms > 0.0]
     function_count = basis.shape[1]
-    residual = np.concatenate([fitted.standardised[used, column] for fitted, used in rows])
+    residual = np.concatenate(
+        [fitted_trial.standardised[is_used, column] for fitted_trial, is_used in rows]
+    )
     if not 0 < function_count < max(residual.size, 2):
         return None
     sensitivities = [
-        fitted.sensitivity[used, column] for fitted, used in rows if fitted.sensitivity is not None
+        fitted_trial.sensitivity[is_used, column]
+        for fitted_trial, is_used in rows
+        if fitted_trial.sensitivity is not None
     ]
     if len(sensitivities) == len(rows):
         absorbed = np.vstack(sensitivities).T @ basis
         return NormalEquations(basis.T @ basis, basis.T @ residual, absorbed)
     # without sensitivities the residuals count as independent, with their expected variances
-    variance = np.concatenate([fitted.expected_variance[used, column] for fitted, used in rows])
+    variance = np.concatenate(
+        [fitted_trial.expected_variance[is_used, column] for fitted_trial, is_used in rows]
+    )
     gram = (basis.T * variance) @ basis
     return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
@@ -88,9 +94,9 @@ class ExplainedSquares(NamedTuple):
     Attributes
     ----------
     sum_of_squares : float
-        Explained sum of squares, in units of the noise variance.
+        The explained sum of squares, in units of the noise variance.
     degrees_of_freedom : int
-        Number of directions that remain after the fit of the model; chi-squared has as many.
+        The number of directions that remain after the fit of the model; chi-squared has as many.
     """
 
     sum_of_squares: float
@@ -106,7 +112,7 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     Parameters
     ----------
     equations : sequence of NormalEquations
-        Normal equations of each channel; every channel has its own coefficients.
+        The normal equations of each channel; every channel has its own coefficients.
     """
     covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
     if all(channel_equations.absorbed_by_fit.shape[0] for channel_equations in equations):
@@ -119,7 +125,7 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     return ExplainedSquares(float(np.sum(squares)), int(is_remaining.sum()))
 
 
-def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
+def motion_envelope(fitted_trial: FittedTrial, column: int) -> FloatArray:
     """Return the amplitude of a channel's predicted motion at each sample of a dynamic trial.
 
     It is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the rate v,
@@ -128,19 +134,19 @@ def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
 
     Parameters
     ----------
-    fitted : FittedTrial
-        The trial, with rates.
+    fitted_trial : FittedTrial
+        The trial with its prediction, residuals, and the rates of the prediction.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
 
     Returns
     -------
     (N,) ndarray
         Amplitude [channel's unit].
     """
-    assert fitted.rates is not None
-    x = fitted.prediction[:, column] - _value_at_rest(fitted, column)
-    v = fitted.rates[:, column]
+    assert fitted_trial.rates is not None
+    x = fitted_trial.prediction[:, column] - _value_at_rest(fitted_trial, column)
+    v = fitted_trial.rates[:, column]
     rms_value = float(np.sqrt(np.mean(x**2)))
     rms_rate = float(np.sqrt(np.mean(v**2)))
     if rms_value == 0.0 or rms_rate == 0.0:
@@ -148,7 +154,7 @@ def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
     amplitude = np.hypot(x, v * rms_value / rms_rate)
     # Moving average over one period 2 pi / w. Near the ends fewer samples are in the window, so the
     # sums are divided by their numbers.
-    period = 2.0 * np.pi * rms_value / (rms_rate * fitted.trial.interval)
+    period = 2.0 * np.pi * rms_value / (rms_rate * fitted_trial.trial.interval)
     width = min(max(1, round(period)), len(x))
     kernel = np.ones(width)
     sums = np.convolve(amplitude, kernel, "same")
@@ -156,13 +162,13 @@ def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
     return np.asarray(sums / counts)
 
 
-def _value_at_rest(fitted: FittedTrial, column: int) -> float:
+def _value_at_rest(fitted_trial: FittedTrial, column: int) -> float:
     """Return the value about which a prediction oscillates: the mean of its last quarter."""
-    values = fitted.prediction[:, column]
+    values = fitted_trial.prediction[:, column]
     return float(np.mean(values[-max(len(values) // 4, 1) :]))
 
 
-def dependence_functions(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
+def dependence_functions(fitted_trial: FittedTrial, column: int) -> dict[str, FloatArray]:
     """Return the functions that the residuals of a channel may depend on, at its used samples.
 
     Here x is the predicted displacement from rest and v its rate. The nonlinear functions (x^3,
@@ -171,10 +177,10 @@ def dependence_functions(fitted: FittedTrial, column: int) -> dict[str, FloatArr
 
     Parameters
     ----------
-    fitted : FittedTrial
-        The trial.
+    fitted_trial : FittedTrial
+        The trial with its prediction and residuals.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
 
     Returns
     -------
@@ -182,39 +188,39 @@ def dependence_functions(fitted: FittedTrial, column: int) -> dict[str, FloatArr
         Values of each function, k = 1 or 2 columns, at the n used samples. The names are those of
         `Cell.statistic`.
     """
-    used = fitted.used[:, column]
-    trial = fitted.trial
-    value_at_rest = _value_at_rest(fitted, column) if trial.is_dynamic else 0.0
-    x = fitted.prediction[used, column] - value_at_rest
-    linear = {"mean": np.ones(int(used.sum())), "x": x}
-    nonlinear = {"x^3": [x**3], "|x|": [np.abs(x)], "sgn x": [np.sign(x)]}
+    is_used = fitted_trial.used[:, column]
+    trial = fitted_trial.trial
+    value_at_rest = _value_at_rest(fitted_trial, column) if trial.is_dynamic else 0.0
+    x = fitted_trial.prediction[is_used, column] - value_at_rest
+    linear_functions = {"mean": np.ones(int(is_used.sum())), "x": x}
+    nonlinear_functions = {"x^3": [x**3], "|x|": [np.abs(x)], "sgn x": [np.sign(x)]}
     # Only the mean is projected out of load, time and temperature: a dependence on them is to be
     # reported under their names even if x and v could explain part of it.
-    conditions = {"time": trial.time[used], "temperature": trial.temperature[used]}
+    conditions = {"time": trial.time[is_used], "temperature": trial.temperature[is_used]}
     if not trial.is_dynamic:
-        conditions["load"] = trial.force[used]
-        conditions["load factor"] = trial.load_factor[used]
-    elif fitted.rates is not None:
-        v = fitted.rates[used, column]
-        linear["v"] = v
-        nonlinear["sgn v"] = [np.sign(v)]
-        nonlinear["|v|v"] = [np.abs(v) * v]
-        amplitude = motion_envelope(fitted, column)[used]
+        conditions["load"] = trial.force[is_used]
+        conditions["load factor"] = trial.load_factor[is_used]
+    elif fitted_trial.rates is not None:
+        v = fitted_trial.rates[is_used, column]
+        linear_functions["v"] = v
+        nonlinear_functions["sgn v"] = [np.sign(v)]
+        nonlinear_functions["|v|v"] = [np.abs(v) * v]
+        amplitude = motion_envelope(fitted_trial, column)[is_used]
         # phase of a harmonic motion x = a cos(phase), v = -a w sin(phase)
         phase = np.angle(x / _rms_or_one(x) - 1j * v / _rms_or_one(v))
         for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
-            nonlinear[name] = [
+            nonlinear_functions[name] = [
                 amplitude * np.cos(order * phase),
                 amplitude * np.sin(order * phase),
             ]
-    scaled = [values / _rms_or_one(values) for values in linear.values()]
-    linear_basis, _ = np.linalg.qr(np.column_stack(scaled))
+    scaled_functions = [values / _rms_or_one(values) for values in linear_functions.values()]
+    linear_basis, _ = np.linalg.qr(np.column_stack(scaled_functions))
     mean_basis = linear_basis[:, :1]
     functions = {}
-    for name, values in linear.items():
+    for name, values in linear_functions.items():
         if np.any(values):
             functions[name] = values[:, np.newaxis]
-    for name, columns in nonlinear.items():
+    for name, columns in nonlinear_functions.items():
         _add_projected_function(functions, name, np.column_stack(columns), linear_basis)
     for name, values in conditions.items():
         _add_projected_function(functions, name, values[:, np.newaxis], mean_basis)
@@ -231,19 +237,19 @@ def _add_projected_function(
     Parameters
     ----------
     functions : dict of str to ndarray
-        Functions by name, changed in place.
+        The functions by name, changed in place.
     name : str
-        Name of the function.
+        The name of the function.
     columns : (n, k) ndarray
-        Values of the function.
+        The values of the k columns of the function at n samples.
     basis : (n, b) ndarray
-        Orthonormal columns that are projected out.
+        The orthonormal columns that are projected out.
     """
-    remaining = columns - basis @ (basis.T @ columns)
+    projected_columns = columns - basis @ (basis.T @ columns)
     norms = np.linalg.norm(columns, axis=0)
-    remains = np.linalg.norm(remaining, axis=0) > 1e-6 * norms
-    if np.all((norms > 0.0) & remains):
-        functions[name] = remaining
+    is_independent = np.linalg.norm(projected_columns, axis=0) > 1e-6 * norms
+    if np.all((norms > 0.0) & is_independent):
+        functions[name] = projected_columns
 
 
 def _rms_or_one(values: FloatArray) -> float:
@@ -271,14 +277,14 @@ class Cell:
     Attributes
     ----------
     trial, channel : str
-        Names of the trial and the channel.
+        The names of the trial and the channel.
     axis : str
         "whole", "time", "amplitude", "frequency" or "load".
     low, high : float
-        Ends of the bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for the
-        whole record.
+        The ends of the bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for
+        the whole record.
     count : int
-        Number of samples.
+        The number of samples.
     statistic : str
         "mean", "variance", or the function that residuals depend on: "x", "v", "sgn v", "|v|v",
         "x^3", "sgn x" (odd), "|x|" (even), "2nd harmonic", "3rd harmonic", "time", "load", "load
@@ -304,9 +310,9 @@ class Cell:
 
 
 def residual_map(
-    residuals: ResidualSet, white: tuple[FloatArray, ...], rate: float = 0.05
+    residuals: ResidualSet, white_residuals: tuple[FloatArray, ...], rate: float = 0.05
 ) -> tuple[Cell, ...]:
-    """Return the cells of all trials and channels, with the significant ones marked.
+    """Return the cells of all trials and channels, and mark those that are significant.
 
     A cell is significant if it is a discovery at the false discovery rate by the rule of Benjamini
     and Yekutieli (2001), which holds for dependent tests.
@@ -314,16 +320,16 @@ def residual_map(
     Parameters
     ----------
     residuals : ResidualSet
-        Fitted trials.
-    white : tuple of (N, C) ndarray
-        White residuals of each trial, from its method `whitened_residuals`, for the bins of
+        The residuals of the fitted trials.
+    white_residuals : tuple of (N, C) ndarray
+        The white residuals of each trial, from its method `whitened_residuals`, for the bins of
         frequency.
     rate : float
-        False discovery rate.
+        The false discovery rate that is accepted.
     """
     cells: list[Cell] = []
-    for fitted, values in zip(residuals.trials, white, strict=True):
-        cells += _cells_of_trial(residuals, fitted, values)
+    for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
+        cells += _cells_of_trial(residuals, fitted_trial, values)
     p_values = np.array([cell.p_value for cell in cells])
     are_discoveries = benjamini_yekutieli(p_values, rate)
     return tuple(
@@ -333,7 +339,7 @@ def residual_map(
 
 
 def _cells_of_trial(
-    residuals: ResidualSet, fitted: FittedTrial, white: FloatArray
+    residuals: ResidualSet, fitted_trial: FittedTrial, white_residuals: FloatArray
 ) -> Iterator[Cell]:
     """Yield the cells of a trial: its whole records, and their bins.
 
@@ -341,16 +347,16 @@ def _cells_of_trial(
     ----------
     residuals : ResidualSet
         The set, for the noise records.
-    fitted : FittedTrial
-        The trial.
-    white : (N, C) ndarray
-        White residuals of the trial.
+    fitted_trial : FittedTrial
+        The trial with its prediction and residuals.
+    white_residuals : (N, C) ndarray
+        The white residuals of the trial.
     """
-    trial = fitted.trial
+    trial = fitted_trial.trial
     for column, channel in enumerate(trial.channels):
         noise_freedom = residuals.degrees_of_freedom(channel)
-        used = fitted.used[:, column]
-        if not used.any():
+        is_used = fitted_trial.used[:, column]
+        if not is_used.any():
             continue
         template = Cell(
             trial=trial.name,
@@ -363,22 +369,24 @@ def _cells_of_trial(
             value=np.nan,
             p_value=1.0,
         )
-        for span in _spans(fitted, column):
+        for span in _spans(fitted_trial, column):
             count = int(span.used.sum())
             cell = replace(template, axis=span.axis, low=span.low, high=span.high, count=count)
             functions = {"mean": np.ones((count, 1))}
             if span.axis == "whole":
-                functions = dependence_functions(fitted, column)
+                functions = dependence_functions(fitted_trial, column)
             for name, function_values in functions.items():
                 untested_cell = replace(cell, statistic=name)
                 tested_cell = _test_dependence(
-                    fitted, column, span.used, function_values, untested_cell, noise_freedom
+                    fitted_trial, column, span.used, function_values, untested_cell, noise_freedom
                 )
                 if tested_cell is not None:
                     yield tested_cell
-            yield from _variance_cells(fitted, column, span.used, cell, noise_freedom)
-        if trial.is_dynamic and used.all():
-            yield from _frequency_cells(white[:, column], trial.interval, template, noise_freedom)
+            yield from _variance_cells(fitted_trial, column, span.used, cell, noise_freedom)
+        if trial.is_dynamic and is_used.all():
+            yield from _frequency_cells(
+                white_residuals[:, column], trial.interval, template, noise_freedom
+            )
 
 
 class _Span(NamedTuple):
@@ -391,7 +399,7 @@ class _Span(NamedTuple):
     low, high : float
         Ends; nan for the whole record.
     used : (N,) ndarray of bool
-        Used samples between the ends.
+        The used samples between the ends.
     """
 
     axis: str
@@ -400,54 +408,54 @@ class _Span(NamedTuple):
     used: BoolArray
 
 
-def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
+def _spans(fitted_trial: FittedTrial, column: int) -> Iterator[_Span]:
     """Yield the spans of a channel's record that are tested: the whole, and its bins.
 
     The bins are of time and amplitude for a dynamic trial, else of load.
     """
-    trial = fitted.trial
-    used = fitted.used[:, column]
-    yield _Span("whole", np.nan, np.nan, used)
+    trial = fitted_trial.trial
+    is_used = fitted_trial.used[:, column]
+    yield _Span("whole", np.nan, np.nan, is_used)
     if trial.is_dynamic:
         edges = np.linspace(trial.time[0], trial.time[-1], BIN_COUNT + 1)
-        yield from _spans_of_bins("time", trial.time, edges, used)
-        if fitted.rates is not None:
-            amplitude = motion_envelope(fitted, column)
+        yield from _spans_of_bins("time", trial.time, edges, is_used)
+        if fitted_trial.rates is not None:
+            amplitude = motion_envelope(fitted_trial, column)
             if amplitude.any():
-                least = max(amplitude.min(), 1e-4 * amplitude.max())
-                edges = np.geomspace(least, amplitude.max(), BIN_COUNT + 1)
-                yield from _spans_of_bins("amplitude", amplitude, edges, used)
+                least_amplitude = max(amplitude.min(), 1e-4 * amplitude.max())
+                edges = np.geomspace(least_amplitude, amplitude.max(), BIN_COUNT + 1)
+                yield from _spans_of_bins("amplitude", amplitude, edges, is_used)
     else:
         edges = np.linspace(trial.load.min(), trial.load.max(), LOAD_BIN_COUNT + 1)
-        yield from _spans_of_bins("load", trial.load, edges, used)
+        yield from _spans_of_bins("load", trial.load, edges, is_used)
 
 
 def _spans_of_bins(
-    axis: str, values: FloatArray, edges: FloatArray, used: BoolArray
+    axis: str, values: FloatArray, edges: FloatArray, is_used: BoolArray
 ) -> Iterator[_Span]:
     """Yield a span for each bin of an axis.
 
     Parameters
     ----------
     axis : str
-        Name of the axis.
+        The name of the axis.
     values : (N,) ndarray
-        Value of each sample on the axis.
+        The value of each sample on the axis.
     edges : (B + 1,) ndarray
-        Edges of the bins, ascending.
-    used : (N,) ndarray of bool
-        Used samples.
+        The edges of the bins, ascending.
+    is_used : (N,) ndarray of bool
+        Whether each sample is used.
     """
     bin_of_sample = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
     for bin_index, (low, high) in enumerate(pairwise(edges.tolist())):
         if low < high:
-            yield _Span(axis, low, high, used & (bin_of_sample == bin_index))
+            yield _Span(axis, low, high, is_used & (bin_of_sample == bin_index))
 
 
 def _test_dependence(
-    fitted: FittedTrial,
+    fitted_trial: FittedTrial,
     column: int,
-    used: BoolArray,
+    is_used: BoolArray,
     function_values: FloatArray,
     cell: Cell,
     noise_freedom: float,
@@ -456,19 +464,19 @@ def _test_dependence(
 
     Parameters
     ----------
-    fitted : FittedTrial
+    fitted_trial : FittedTrial
         The trial with the residuals of its N samples.
     column : int
-        Index of the channel.
-    used : (N,) ndarray of bool
-        Mask of the n samples that are tested.
+        The index of the channel in the trial.
+    is_used : (N,) ndarray of bool
+        Whether each sample is one of the n samples that are tested.
     function_values : (n, k) ndarray
         Values of the function at these samples. Most functions have k = 1 component; a harmonic has
         two, its cosine and its sine. A constant function tests the mean of the residuals.
     cell : Cell
         The entry of the map for the result, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if there is no record, and the noise
+        The degrees of freedom of the channel's noise record; 0 if there is no record, and the noise
         variance is then taken as exact.
 
     Returns
@@ -479,13 +487,13 @@ def _test_dependence(
         removed a component of the function from the residuals, if a component is zero everywhere,
         or if there are as many components as samples.
     """
-    equations = normal_equations_of(function_values, ((fitted, used),), column)
+    equations = normal_equations_of(function_values, ((fitted_trial, is_used),), column)
     if equations is None:
         return None
     explained_squares, component_count = explained_sum_of_squares((equations,))
     if component_count < function_values.shape[1]:
         return None
-    residual = fitted.standardised[used, column]
+    residual = fitted_trial.standardised[is_used, column]
     if cell.statistic == "mean":
         value = float(np.mean(residual))
     else:
@@ -502,7 +510,7 @@ def _test_dependence(
 
 
 def _variance_cells(
-    fitted: FittedTrial, column: int, used: BoolArray, cell: Cell, noise_freedom: float
+    fitted_trial: FittedTrial, column: int, is_used: BoolArray, cell: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
     """Yield a cell with the sum of squared residuals over its expectation.
 
@@ -511,27 +519,29 @@ def _variance_cells(
 
     Parameters
     ----------
-    fitted : FittedTrial
-        The trial.
+    fitted_trial : FittedTrial
+        The trial with its prediction and residuals.
     column : int
-        Column of the channel.
-    used : (N,) ndarray of bool
+        The index of the channel's column in the arrays of the trial.
+    is_used : (N,) ndarray of bool
         The samples of the cell.
     cell : Cell
         The cell, still without value and p-value.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if it has none.
+        The degrees of freedom of the channel's noise record; 0 if it has none.
     """
     # a bin of few samples is not tested; a whole record is, however short
     least_count = 1 if cell.axis == "whole" else _LEAST_SAMPLES_OF_CELL
     if noise_freedom <= 0.0 or cell.count < least_count:
         return
-    sensitivity = None if fitted.sensitivity is None else fitted.sensitivity[used, column]
+    sensitivity = (
+        None if fitted_trial.sensitivity is None else fitted_trial.sensitivity[is_used, column]
+    )
     expected_sum, freedom = sum_of_squares_moments(
-        [(fitted.expected_variance[used, column], sensitivity)]
+        [(fitted_trial.expected_variance[is_used, column], sensitivity)]
     )
     if freedom >= _LEAST_FREEDOM_OF_CELL:
-        value = float(np.sum(fitted.standardised[used, column] ** 2)) / expected_sum
+        value = float(np.sum(fitted_trial.standardised[is_used, column] ** 2)) / expected_sum
         p_value = variance_p_value(value, freedom, noise_freedom)
         yield replace(cell, statistic="variance", value=value, p_value=p_value)
 
@@ -548,11 +558,11 @@ def _frequency_cells(
     series : (N,) ndarray
         Residuals of a channel that are white, of variance one, if they contain noise alone.
     interval : float
-        Sampling interval [s].
+        The interval between successive samples [s].
     template : Cell
-        A cell with the names of trial and channel, from which the others are copied.
+        A cell with the names of the trial and the channel, which the yielded cells take over.
     noise_freedom : float
-        Degrees of freedom of the channel's noise record; 0 if it has none.
+        The degrees of freedom of the channel's noise record; 0 if it has none.
     """
     ordinates = periodogram(series)  # of the frequencies 1, 2, 3, ... times the resolution
     # With four ordinates in each band on average, the variance of a band can be tested.

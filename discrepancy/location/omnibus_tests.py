@@ -29,7 +29,7 @@ class OmnibusTest:
         Variance: mean square over its expectation; else the statistic of the record with the least
         p-value.
     where : str
-        Trial and channel of that record.
+        The trial and channel of that record.
     rejected : bool
         True if Holm's rule over all tests rejects it.
     """
@@ -42,7 +42,7 @@ class OmnibusTest:
 
 
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
-    """Group the channels by their noise record.
+    """Group the channels that share one noise record.
 
     Channels with equal stated noise share one record, so that their variance tests are not
     independent. A recorded noise belongs to its own channel. Channels without a noise record are
@@ -51,7 +51,7 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
     Returns
     -------
     dict of str to tuple of str
-        Names of the channels of each group, by the first of them.
+        The names of the channels of each group, by the first of them.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in residuals.recorded_channels:
@@ -125,29 +125,33 @@ def _variance_tests_of_records(
     Records whose residuals have fewer than `LEAST_FREEDOM` degrees of freedom are left out.
     """
     noise_freedom = residuals.degrees_of_freedom(channels[0])
-    for fitted in residuals.trials:
-        single_trial = replace(residuals, trials=(fitted,))
+    for fitted_trial in residuals.trials:
+        single_trial = replace(residuals, trials=(fitted_trial,))
         for name in channels:
             square, freedom = mean_square_ratio(single_trial, (name,))
             if freedom >= LEAST_FREEDOM:
                 p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
-                yield _RecordVariance(f"{fitted.trial.name}, {name}", p_value)
+                yield _RecordVariance(f"{fitted_trial.trial.name}, {name}", p_value)
 
 
 def _split_by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
     """Return the set split by the kind of its trials; nothing if there is only one kind."""
-    kinds = list(dict.fromkeys(fitted.trial.kind for fitted in residuals.trials))
+    kinds = list(dict.fromkeys(fitted_trial.trial.kind for fitted_trial in residuals.trials))
     if len(kinds) < 2:
         return ()
     subsets = []
     for kind in kinds:
-        trials = tuple(fitted for fitted in residuals.trials if fitted.trial.kind is kind)
+        trials = tuple(
+            fitted_trial for fitted_trial in residuals.trials if fitted_trial.trial.kind is kind
+        )
         subsets.append(replace(residuals, trials=trials))
     return tuple(subsets)
 
 
 def serial_tests(
-    residuals: ResidualSet, white: Sequence[FloatArray], coloured: Sequence[str] = ()
+    residuals: ResidualSet,
+    white_residuals: Sequence[FloatArray],
+    coloured_channels: Sequence[str] = (),
 ) -> tuple[OmnibusTest, ...]:
     """Test the residuals of all dynamic trials for correlation in time and for spectral lines.
 
@@ -157,17 +161,17 @@ def serial_tests(
     Parameters
     ----------
     residuals : ResidualSet
-        The set.
-    white : sequence of (N, C) ndarray
-        White residuals of each trial, from its method `whitened_residuals`.
-    coloured : sequence of str
+        The residuals of all trials, with the channels.
+    white_residuals : sequence of (N, C) ndarray
+        The white residuals of each trial, from its method `whitened_residuals`.
+    coloured_channels : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """
     portmanteau_tests: list[_RecordTest] = []
     periodogram_tests: list[_RecordTest] = []
     line_tests: list[_RecordTest] = []
-    for series in residuals.dynamic_series(white):
-        if series.channel in coloured:
+    for series in residuals.dynamic_series(white_residuals):
+        if series.channel in coloured_channels:
             continue
         trial = series.fitted_trial.trial
         record = f"{trial.name}, {series.channel}"

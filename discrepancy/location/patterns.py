@@ -16,6 +16,10 @@ PATTERN_LEVEL = 0.01
 """Largest p-value of a pattern that is reported."""
 MOST_PATTERNS = 3
 """Most patterns that are reported for a kind of trial."""
+NOISE_QUANTILES = 1000
+"""Number of quantiles of the error of the noise records over which a p-value is averaged."""
+EXACT_NOISE_FREEDOM = 1e9
+"""Degrees of freedom of a noise record that stand for an exactly known variance, or for none."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +29,20 @@ class Disagreement:
     Attributes
     ----------
     trials : str
-        Kind of the trials in which it shows.
+        The kind of the trials in which it shows.
     subject : str
         "mode 1", "channel g17", "all channels", ...; for a pattern over channels its meaning.
     dependence : str
         What the residuals depend on: "amplitude", "time", "load (not proportional)", "channels",
         ...
     share : float
-        Fraction of the excess variance of these trials that it explains.
+        The fraction of the excess variance of these trials that it explains.
     p_value : float
-        p-value of the finding.
+        The p-value of the finding.
     sentence : str
-        The finding in words.
+        The sentence that tells the finding.
     channel : str
-        Channel on which a pattern over channels is strongest.
+        The channel on which a pattern over channels is strongest.
     """
 
     trials: str
@@ -56,11 +60,11 @@ class TrialsOfKind(NamedTuple):
     Attributes
     ----------
     name : str
-        Name of the kind, for messages.
+        The name of the kind, for messages.
     trials : list of FittedTrial
-        The trials.
+        The trials with their predictions and residuals.
     white : list of (N, C) ndarray
-        Their white residuals.
+        The white residuals of each trial.
     """
 
     name: str
@@ -70,18 +74,18 @@ class TrialsOfKind(NamedTuple):
     def disagreement(
         self, subject: str, dependence: str, phrase: str, share: float, p_value: float
     ) -> Disagreement:
-        """Return a finding in these trials.
+        """Return the record of a finding on these trials, with the sentence that tells it.
 
         Parameters
         ----------
         subject, dependence : str
-            Entries of the finding.
+            The subject and the dependence that the finding states.
         phrase : str
-            Start of its sentence.
+            The beginning of the sentence that tells the finding.
         share : float
-            Fraction of the excess variance that it explains.
+            The fraction of the excess variance that it explains.
         p_value : float
-            p-value of the finding.
+            The p-value of the finding.
         """
         p_text = "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.1g}"
         sentence = (
@@ -91,25 +95,27 @@ class TrialsOfKind(NamedTuple):
         return Disagreement(self.name, subject, dependence, share, p_value, sentence)
 
 
-def group_by_kind(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[TrialsOfKind]:
+def group_by_kind(
+    residuals: ResidualSet, white_residuals: Sequence[FloatArray]
+) -> list[TrialsOfKind]:
     """Return the trials grouped by kind and channels; the residuals of a group form one matrix.
 
     Parameters
     ----------
     residuals : ResidualSet
-        The set.
-    white : sequence of (N, C) ndarray
-        White residuals of each trial.
+        The residuals of all trials, with the channels.
+    white_residuals : sequence of (N, C) ndarray
+        The white residuals of each trial.
     """
     groups: dict[tuple[str, tuple[str, ...]], TrialsOfKind] = {}
-    for fitted, values in zip(residuals.trials, white, strict=True):
-        kind = fitted.trial.kind.value.replace("ringdown", "ring-down")
-        key = (kind, fitted.trial.channels)
+    for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
+        kind = fitted_trial.trial.kind.value.replace("ringdown", "ring-down")
+        key = (kind, fitted_trial.trial.channels)
         if key not in groups:
             is_first_of_kind = all(other_kind != kind for other_kind, _ in groups)
             name = kind if is_first_of_kind else f"{kind} ({len(groups) + 1})"
             groups[key] = TrialsOfKind(name, [], [])
-        groups[key].trials.append(fitted)
+        groups[key].trials.append(fitted_trial)
         groups[key].white.append(values)
     return list(groups.values())
 
@@ -129,7 +135,7 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
     residuals : ResidualSet
         The set, for the noise records.
     kind : TrialsOfKind
-        The trials.
+        The trials of one kind, which have the same channels.
     """
     matrix = np.vstack(kind.white)
     sample_count, channel_count = matrix.shape
@@ -165,25 +171,36 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
 
 
 def _largest_noise_ratios(residuals: ResidualSet, kind: TrialsOfKind) -> FloatArray:
-    """Return how much the largest noise variance of C channels may exceed that of its record.
+    """Return quantiles of the largest ratio of true to recorded noise variance among C channels.
 
-    The estimate of a variance with n degrees of freedom is the variance times chi-squared over n.
-    The true variance over the estimate is thus n over chi-squared, and the largest of C independent
-    ones has the quantile function n / chi2.isf(q^(1/C)). All records are taken to have the degrees
-    of freedom of the shortest one.
+    A variance that is estimated from a noise record of n degrees of freedom is the true variance
+    times chi-squared / n, so that the true variance over the recorded one is n / chi-squared. The
+    largest of C such independent ratios is below q with the C-th power of the probability that one
+    of them is. Its quantile at the probability q is thus n / chi2.isf(q^(1/C)). All records are
+    taken to have the degrees of freedom of the shortest one.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The residuals, with the noise records of the channels.
+    kind : TrialsOfKind
+        The trials, which all have the same C channels.
 
     Returns
     -------
-    (1000,) ndarray
-        Quantiles of the ratio at evenly spaced probabilities.
+    (NOISE_QUANTILES,) ndarray
+        The quantiles of the largest ratio at evenly spaced probabilities.
     """
     channels = kind.trials[0].trial.channels
-    freedoms = [residuals.degrees_of_freedom(name) for name in channels]
-    freedom = min([freedom for freedom in freedoms if freedom > 0.0], default=np.inf)
-    freedom = min(freedom, 1e9)
-    probabilities = (np.arange(1000) + 0.5) / 1000
-    quantiles = stats.chi2.isf(probabilities ** (1.0 / len(channels)), freedom)
-    return np.asarray(freedom / quantiles)
+    record_freedoms = []
+    for name in channels:
+        record_freedom = residuals.degrees_of_freedom(name)
+        if record_freedom > 0.0:
+            record_freedoms.append(record_freedom)
+    least_freedom = min([*record_freedoms, EXACT_NOISE_FREEDOM])
+    probabilities = (np.arange(NOISE_QUANTILES) + 0.5) / NOISE_QUANTILES
+    quantiles = stats.chi2.isf(probabilities ** (1.0 / len(channels)), least_freedom)
+    return np.asarray(least_freedom / quantiles)
 
 
 class _PatternMeaning(NamedTuple):
@@ -194,7 +211,7 @@ class _PatternMeaning(NamedTuple):
     subject : str
         "sensor", "common", "dynamics or load" or "mixed".
     phrase : str
-        Start of a sentence about it.
+        The beginning of a sentence about the pattern.
     """
 
     subject: str
@@ -217,34 +234,35 @@ def _interpret_pattern(
     trials : sequence of FittedTrial
         The trials in which it shows.
     weights : (C,) ndarray
-        The pattern.
+        The pattern: one weight for each of the C channels.
     """
     channels = trials[0].trial.channels
-    candidates = []
+    agreements = []
     for meaning, pattern in _known_patterns(residuals, trials, weights):
         if np.any(pattern):
             norms = (weights @ weights) * (pattern @ pattern)
-            candidates.append((float((weights @ pattern) ** 2 / norms), meaning))
-    best_agreement, best = max(candidates, key=lambda candidate: candidate[0])
+            agreements.append((float((weights @ pattern) ** 2 / norms), meaning))
+    best_agreement, best_meaning = max(agreements, key=lambda candidate: candidate[0])
     if best_agreement < LEAST_AGREEMENT:
-        strongest = np.argsort(-np.abs(weights))[:3]
-        names = ", ".join(channels[index] for index in strongest)
+        strongest_channels = np.argsort(-np.abs(weights))[:3]
+        names = ", ".join(channels[index] for index in strongest_channels)
         return _PatternMeaning("mixed", f"A pattern of its own, strongest on {names},")
     competing_subjects = set()
-    for agreement, meaning in candidates:
+    for agreement, meaning in agreements:
         agrees_as_well = agreement >= max(LEAST_AGREEMENT, best_agreement - 0.05)
-        if agrees_as_well and meaning.subject != best.subject:
+        if agrees_as_well and meaning.subject != best_meaning.subject:
             competing_subjects.add(meaning.subject)
     if competing_subjects:
-        phrase = f"{best.phrase.rstrip(',')} or equally {' or '.join(sorted(competing_subjects))}"
+        subjects_text = " or ".join(sorted(competing_subjects))
+        phrase = f"{best_meaning.phrase.rstrip(',')} or equally {subjects_text}"
         return _PatternMeaning("mixed", phrase)
-    return best
+    return best_meaning
 
 
 def _known_patterns(
     residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
 ) -> Iterator[tuple[_PatternMeaning, FloatArray]]:
-    """Yield the known patterns over C channels, each with its meaning.
+    """Yield the patterns over C channels that have a known meaning, with this meaning.
 
     They are one channel alone, the same physical value in all channels, and the main pattern of the
     predicted motion, which is zero if the predictions are zero.
@@ -254,7 +272,7 @@ def _known_patterns(
     residuals : ResidualSet
         The set, for the quantities of the channels.
     trials : sequence of FittedTrial
-        The trials.
+        The trials with their predictions and residuals.
     weights : (C,) ndarray
         The pattern to interpret; its largest entry selects the single channel.
 
@@ -276,9 +294,9 @@ def _known_patterns(
         yield _PatternMeaning("common", phrase), 1.0 / noise
     # the main pattern of the predictions is their first right singular vector
     predictions = []
-    for fitted in trials:
+    for fitted_trial in trials:
         # deviations from the mean, in units of the noise
-        predictions.append((fitted.prediction - fitted.prediction.mean(axis=0)) / noise)
+        predictions.append((fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)) / noise)
     prediction = np.vstack(predictions)
     _, _, right_vectors = np.linalg.svd(prediction, full_matrices=False)
     response = right_vectors[0] if np.any(prediction) else 0.0 * right_vectors[0]

@@ -29,21 +29,21 @@ class FittedTrial:
     trial : Trial
         Readings and inputs; it took part in the fit unless `trial.held_out`.
     prediction : (N, C) ndarray
-        Mean of the posterior prediction, with gains and offsets [channel's unit].
+        The mean of the posterior prediction, with gains and offsets [channel's unit].
     residual : (N, C) ndarray
         Readings minus prediction [channel's unit]; any value where `trial.used` is False.
     noise_deviation : (C,) ndarray
         Standard deviation s0 of each channel's noise [channel's unit]; an estimate without a noise
         record.
     predictive_deviation : (N, C) ndarray
-        Standard deviation of a measured value under the posterior prediction, noise included.
+        The standard deviation of a measured value under the posterior prediction, noise included.
     leverage : (N, C) ndarray
         Leverage: if the model is right, a residual has the variance s0^2 (1 - leverage) in a fitted
         trial and s0^2 (1 + leverage) in a held-out one. It is negative in a held-out trial whose
         own nuisances (a release amplitude, an offset) were fitted to it. The sum over the used
         samples of fitted trials is the effective number of parameters.
     rates : (N, C) ndarray or None
-        Time derivatives of the prediction of a dynamic trial [channel's unit / s].
+        The time derivatives of the prediction of a dynamic trial [channel's unit / s].
     sensitivity : (N, C, P) ndarray or None
         S of the module's text for the P parameters of the whole fit (in held-out trials without
         those that were fitted to the trial itself). With it tests allow exactly for what the fit
@@ -65,14 +65,14 @@ class FittedTrial:
     sensitivity: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        used = self.trial.used
+        is_used = self.trial.used
         arrays = [self.prediction, self.residual, self.predictive_deviation, self.leverage]
         if self.rates is not None:
             arrays.append(self.rates)
-        are_finite = all(np.all(np.isfinite(array[used])) for array in arrays)
+        are_finite = all(np.all(np.isfinite(array[is_used])) for array in arrays)
         noise_is_positive = np.all(self.noise_deviation > 0.0)
-        predictive_is_positive = np.all(self.predictive_deviation[used] > 0.0)
-        variance_is_possible = np.all(self.expected_variance[used] > -1e-9)
+        predictive_is_positive = np.all(self.predictive_deviation[is_used] > 0.0)
+        variance_is_possible = np.all(self.expected_variance[is_used] > -1e-9)
         if not (
             are_finite and noise_is_positive and predictive_is_positive and variance_is_possible
         ):
@@ -83,7 +83,7 @@ class FittedTrial:
 
     @property
     def used(self) -> BoolArray:
-        """Samples that are used, (N, C)."""
+        """Whether each of the N samples of C channels is compared with the model, (N, C)."""
         return self.trial.used
 
     @cached_property
@@ -107,9 +107,9 @@ class ChannelFit(NamedTuple):
     Attributes
     ----------
     fitted_trial : FittedTrial
-        The trial.
+        The trial with its prediction and residuals.
     column : int
-        Column of the channel.
+        The index of the channel's column in the arrays of the trial.
     used : (N,) ndarray of bool
         False for samples that are left out.
     """
@@ -125,9 +125,9 @@ class DynamicSeries(NamedTuple):
     Attributes
     ----------
     fitted_trial : FittedTrial
-        The trial.
+        The trial with its prediction and residuals.
     channel : str
-        Name of the channel.
+        The name of the channel.
     values : (N,) ndarray
         The residuals, in units of the noise.
     """
@@ -152,7 +152,7 @@ class ResidualSet:
     Attributes
     ----------
     channels : mapping of str to Channel
-        Channels by name, with the noise records that residuals are compared with.
+        The channels by name, with the noise records that residuals are compared with.
     trials : tuple of FittedTrial
         Trials in the campaign's order.
 
@@ -182,14 +182,16 @@ class ResidualSet:
         return self._subset_of_role(held_out=True)
 
     def _subset_of_role(self, *, held_out: bool) -> "ResidualSet | None":
-        """Return the set of the held-out trials, or of the fitted ones; None if there are none."""
-        trials = tuple(fitted for fitted in self.trials if fitted.trial.held_out is held_out)
+        """Return only the held-out trials, or only the fitted trials; None if there are none."""
+        trials = tuple(
+            fitted_trial for fitted_trial in self.trials if fitted_trial.trial.held_out is held_out
+        )
         return replace(self, trials=trials) if trials else None
 
     @property
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels of its trials, in the order of their first occurrence."""
-        names = [name for fitted in self.trials for name in fitted.trial.channels]
+        names = [name for fitted_trial in self.trials for name in fitted_trial.trial.channels]
         return tuple(dict.fromkeys(names))
 
     @property
@@ -217,52 +219,54 @@ class ResidualSet:
         Parameters
         ----------
         generator : Generator
-            Source of the draws.
+            The source of the random draws.
 
         Returns
         -------
         tuple of (N, C) ndarray
-            White residuals of each trial.
+            The white residuals of each trial.
         """
         draw = generator.standard_normal(self._parameter_count())
         held_out_draw = self._held_out_draw(draw)
-        white = []
-        for fitted in self.trials:
-            noise = generator.standard_normal(fitted.residual.shape)
-            residual = np.nan_to_num(fitted.standardised)
-            if fitted.sensitivity is None:
-                absorbed = np.clip(1.0 - fitted.expected_variance, 0.0, 1.0)
-                restored = np.sqrt(absorbed) * generator.standard_normal(residual.shape)
-                residual = residual + restored
-                residual = residual / np.sqrt(np.maximum(fitted.expected_variance, 1.0))
-            elif fitted.trial.held_out:
-                residual = residual - fitted.sensitivity @ held_out_draw
+        white_residuals = []
+        for fitted_trial in self.trials:
+            noise = generator.standard_normal(fitted_trial.residual.shape)
+            residual = np.nan_to_num(fitted_trial.standardised)
+            if fitted_trial.sensitivity is None:
+                absorbed_variance = np.clip(1.0 - fitted_trial.expected_variance, 0.0, 1.0)
+                restored_noise = np.sqrt(absorbed_variance) * generator.standard_normal(
+                    residual.shape
+                )
+                residual = residual + restored_noise
+                residual = residual / np.sqrt(np.maximum(fitted_trial.expected_variance, 1.0))
+            elif fitted_trial.trial.held_out:
+                residual = residual - fitted_trial.sensitivity @ held_out_draw
             else:
-                residual = residual + fitted.sensitivity @ draw
-            white.append(np.where(fitted.used, residual, noise))
-        return tuple(white)
+                residual = residual + fitted_trial.sensitivity @ draw
+            white_residuals.append(np.where(fitted_trial.used, residual, noise))
+        return tuple(white_residuals)
 
     def _parameter_count(self) -> int:
         """Return the number P of parameters in the sensitivities; 0 if no trial has them."""
-        for fitted in self.trials:
-            if fitted.sensitivity is not None:
-                return int(fitted.sensitivity.shape[2])
+        for fitted_trial in self.trials:
+            if fitted_trial.sensitivity is not None:
+                return int(fitted_trial.sensitivity.shape[2])
         return 0
 
-    def dynamic_series(self, white: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
+    def dynamic_series(self, white_residuals: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
         """Yield the white residuals of each dynamic record that is long enough for serial tests.
 
         Parameters
         ----------
-        white : sequence of (N, C) ndarray
-            White residuals of each trial, from the method `whitened_residuals`.
+        white_residuals : sequence of (N, C) ndarray
+            The white residuals of each trial, from the method `whitened_residuals`.
         """
-        for fitted, values in zip(self.trials, white, strict=True):
-            if not fitted.trial.is_dynamic or len(values) < SHORTEST_SERIES:
+        for fitted_trial, values in zip(self.trials, white_residuals, strict=True):
+            if not fitted_trial.trial.is_dynamic or len(values) < SHORTEST_SERIES:
                 continue
-            for column, name in enumerate(fitted.trial.channels):
-                if fitted.used[:, column].any():
-                    yield DynamicSeries(fitted, name, values[:, column])
+            for column, name in enumerate(fitted_trial.trial.channels):
+                if fitted_trial.used[:, column].any():
+                    yield DynamicSeries(fitted_trial, name, values[:, column])
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
         """Return a draw (P,) of the error z of the parameters, given the held-out residuals.
@@ -278,11 +282,11 @@ class ResidualSet:
         """
         precision = np.eye(draw.size)
         weighted_residual = np.zeros(draw.size)
-        for fitted in self.trials:
-            if fitted.trial.held_out and fitted.sensitivity is not None:
-                sensitivity = fitted.sensitivity[fitted.used]
+        for fitted_trial in self.trials:
+            if fitted_trial.trial.held_out and fitted_trial.sensitivity is not None:
+                sensitivity = fitted_trial.sensitivity[fitted_trial.used]
                 precision += sensitivity.T @ sensitivity
-                weighted_residual += sensitivity.T @ fitted.standardised[fitted.used]
+                weighted_residual += sensitivity.T @ fitted_trial.standardised[fitted_trial.used]
         mean = np.linalg.solve(precision, weighted_residual)
         # precision = L L^T, thus L^-T times a standard normal vector has its inverse as covariance
         factor = np.linalg.cholesky(precision)
@@ -296,10 +300,12 @@ def without_coloured_records(residuals: ResidualSet) -> ResidualSet:
     """
     noise = {name: noise_model(channel, 1.0) for name, channel in residuals.channels.items()}
     trials = []
-    for fitted in residuals.trials:
-        trial = fitted.trial
+    for fitted_trial in residuals.trials:
+        trial = fitted_trial.trial
         is_white = [not noise[name].stays_coloured(trial) for name in trial.channels]
-        trials.append(replace(fitted, trial=replace(trial, used=trial.used & np.array(is_white))))
+        trials.append(
+            replace(fitted_trial, trial=replace(trial, used=trial.used & np.array(is_white)))
+        )
     return replace(residuals, trials=tuple(trials))
 
 
@@ -309,9 +315,9 @@ class SumOfSquaresMoments(NamedTuple):
     Attributes
     ----------
     expected_sum : float
-        Expected sum of squares, in units of the noise variance.
+        The expected sum of squares, in units of the noise variance.
     degrees_of_freedom : float
-        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
+        The effective degrees of freedom; 0 if the fit has absorbed all residuals.
     """
 
     expected_sum: float
@@ -321,7 +327,7 @@ class SumOfSquaresMoments(NamedTuple):
 def sum_of_squares_moments(
     records: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
 ) -> SumOfSquaresMoments:
-    """Return mean and effective degrees of freedom of a sum of squares of residuals.
+    """Return the expected sum of squares of residuals, and its effective degrees of freedom.
 
     If the residuals have the covariance A, the sum has the mean tr A and the variance 2 tr A^2. A
     multiple of a chi-squared variable with the same two moments has (tr A)^2 / tr A^2 degrees of
@@ -331,8 +337,8 @@ def sum_of_squares_moments(
     Parameters
     ----------
     records : iterable of ((n,) ndarray, (n, P) ndarray or None)
-        Expected variances of n residuals in units of the noise variance (the diagonal of A), and
-        their sensitivities S, for each trial and channel.
+        The expected variances of n residuals in units of the noise variance (the diagonal of A),
+        and their sensitivities S, for each trial and channel.
     held_out : bool
         True for residuals of held-out trials, where A = I + S S^T.
     """
@@ -371,7 +377,7 @@ class MeanSquareRatio(NamedTuple):
     ratio : float
         The ratio; 1 on average if the model is right, nan if the expectation is zero.
     degrees_of_freedom : float
-        Effective degrees of freedom of the sum; see `sum_of_squares_moments`.
+        The effective degrees of freedom of the sum; see `sum_of_squares_moments`.
     """
 
     ratio: float
@@ -386,17 +392,17 @@ def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> MeanSq
     residuals : ResidualSet
         Trials that are all fitted, or all held out.
     channels : sequence of str
-        Names of the channels.
+        The names of the channels.
     """
     sum_of_squares = 0.0
     records = []
     for name in channels:
-        for fitted, column, used in channel_fits(residuals.trials, name):
-            sum_of_squares += float(np.sum(fitted.standardised[used, column] ** 2))
+        for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
+            sum_of_squares += float(np.sum(fitted_trial.standardised[is_used, column] ** 2))
             sensitivity = None
-            if fitted.sensitivity is not None:
-                sensitivity = fitted.sensitivity[used, column]
-            records.append((fitted.expected_variance[used, column], sensitivity))
+            if fitted_trial.sensitivity is not None:
+                sensitivity = fitted_trial.sensitivity[is_used, column]
+            records.append((fitted_trial.expected_variance[is_used, column], sensitivity))
     expected_sum, freedom = sum_of_squares_moments(
         records, held_out=residuals.trials[0].trial.held_out
     )

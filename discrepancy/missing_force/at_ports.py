@@ -145,9 +145,9 @@ class MissingForces:
             processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 
-    def evaluate_model_laws(self, shared: FloatArray) -> ModelPatch:
+    def evaluate_model_laws(self, shared_values: FloatArray) -> ModelPatch:
         """Return the model's own laws at values (K,) of the shared unknowns."""
-        parameters = self.problem.shared.parameters(shared)
+        parameters = self.problem.shared.parameters(shared_values)
         return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
 
     def force_deviation(self, port: int) -> float:
@@ -198,7 +198,7 @@ class MissingForces:
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         """
         point = self.clipped_point(hypothesis)
         return Point(hypothesis.shared.copy(), point.local, hypothesis.effect.copy())
@@ -207,22 +207,24 @@ class MissingForces:
         """Return the unknowns of a hypothesis without its effects, clipped to their ranges."""
         return self.point_of_unknowns(hypothesis.shared, hypothesis.local)
 
-    def point_of_unknowns(self, shared: FloatArray, local_of_trials: Iterable[FloatArray]) -> Point:
+    def point_of_unknowns(
+        self, shared_values: FloatArray, local_of_trials: Iterable[FloatArray]
+    ) -> Point:
         """Return values of the unknowns as a point of the problem, clipped to their ranges.
 
         Parameters
         ----------
-        shared : (K,) array
-            The shared unknowns.
+        shared_values : (K,) array
+            The scaled values of the K unknowns that all trials share.
         local_of_trials : iterable of (L,) array
             The unknowns of each trial in motion.
         """
-        local = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
+        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
         for number, values in zip(self.trial_indices, local_of_trials, strict=True):
-            local[number] = values
+            local_values[number] = values
         low, high = self.problem.shared.bounds
         # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
         # within two prior standard deviations
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(shared, low, high), tuple(local), np.zeros(0))
+        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))

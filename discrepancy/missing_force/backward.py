@@ -18,12 +18,12 @@ def smoother_corrections(
     transitions: FloatArray,
     step_of_sample: IntArray,
     output_rows: FloatArray,
-    used: BoolArray,
-    whitened: FloatArray,
+    is_used: BoolArray,
+    whitened_innovations: FloatArray,
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the vector and matrix by which later readings correct the state at each sample.
+    """Return the vector and the matrix that correct the state at each sample by later readings.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
     1085-1088), which inverts no covariance. In his letters the correction is r, the information N,
@@ -37,9 +37,9 @@ def smoother_corrections(
         The step that leads to each sample.
     output_rows : (c, n) ndarray
         The readings for a unit of each state.
-    used : (N, c) ndarray of bool
-        Whether each reading counts.
-    whitened, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
+    is_used : (N, c) ndarray of bool
+        Whether each reading is compared with the model.
+    whitened_innovations, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
         The results of `filter_forward` for all samples of one column: innovations divided by their
         deviations, gains, and variances of the innovations.
 
@@ -61,10 +61,10 @@ def smoother_corrections(
         informations[k] = information
         # readings of the sample, in reverse order
         for c in range(len(output_rows) - 1, -1, -1):
-            if used[k, c]:
+            if is_used[k, c]:
                 row = output_rows[c]
                 gain = gains[k, c]
-                scaled_innovation = whitened[k, c, 0] / np.sqrt(variances[k, c])
+                scaled_innovation = whitened_innovations[k, c, 0] / np.sqrt(variances[k, c])
                 correction = correction + row * (scaled_innovation - gain @ correction)
                 information_gain = information @ gain
                 innovation_information = gain @ information_gain + 1.0 / variances[k, c]
@@ -88,7 +88,7 @@ def filter_backward(
     noise_roots: FloatArray,
     step_of_sample: IntArray,
     output_rows: FloatArray,
-    used: BoolArray,
+    is_used: BoolArray,
     columns: FloatArray,
     query_samples: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -108,7 +108,7 @@ def filter_backward(
         The roots of the covariances of their process noise: root @ root.T is the covariance.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, is_used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     query_samples : (B,) ndarray
         The samples whose information is asked for, ascending.
@@ -141,17 +141,17 @@ def filter_backward(
     next_step = -1
     steady = False
     for k in range(sample_count - 1, -1, -1):
-        reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
+        reads_like_next = k < sample_count - 1 and bool(np.all(is_used[k] == is_used[k + 1]))
         # add the information of the readings of the sample
         for channel in range(len(output_rows)):
-            if used[k, channel]:
+            if is_used[k, channel]:
                 h += np.outer(output_rows[channel], columns[k, channel])
                 c += np.outer(columns[k, channel], columns[k, channel])
         next_J = J
         if not (steady and reads_like_next):
             J_with_readings = J.copy()
             for channel in range(len(output_rows)):
-                if used[k, channel]:
+                if is_used[k, channel]:
                     J_with_readings += np.outer(output_rows[channel], output_rows[channel])
         # store the results at a queried sample
         if query >= 0 and query_samples[query] == k:

@@ -84,17 +84,18 @@ class EventSearch(EventTrials):
     def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
         """Return the information of each trial on the shared unknowns, given forces and paths."""
         return [
-            SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)
+            SwitchedRecord(self, number, forces).products(is_on)
+            for number, is_on in enumerate(paths)
         ]
 
     def fit_forces(
-        self, initial: ForcePair, paths: Sequence[BoolArray], evaluations: int
+        self, initial_forces: ForcePair, paths: Sequence[BoolArray], evaluations: int
     ) -> tuple[ForcePair, float]:
         """Return the most probable forces for given events, by a simplex search.
 
         Parameters
         ----------
-        initial : (Process, Process)
+        initial_forces : (Process, Process)
             The forces to begin with: that of events, and that throughout.
         paths : sequence of (N,) array of bool
             The events: whether the force is on at each sample, for each trial.
@@ -111,7 +112,7 @@ class EventSearch(EventTrials):
         prior_medians = np.tile((self.process.standard_deviation, self.process.correlation_time), 2)
         initial_values = [
             value
-            for force in initial
+            for force in initial_forces
             for value in (force.standard_deviation, force.correlation_time)
         ]
         initial_logarithms = np.log(np.array(initial_values) / prior_medians)
@@ -155,10 +156,10 @@ class EventSearch(EventTrials):
         """
         new_paths = list(paths)
         products = self.products(forces, paths)
-        for number, on in enumerate(paths):
+        for number, is_on in enumerate(paths):
             products_of_others = products[:number] + products[number + 1 :]
             record = SwitchedRecord(self, number, forces, products_of_others)
-            better_path: BoolArray | None = on
+            better_path: BoolArray | None = is_on
             for _ in range(2 * MOST_EVENTS):
                 if better_path is None:
                     break
@@ -208,16 +209,16 @@ class Events:
 
         A change is the moment at which the force of events begins or ends.
         """
-        on = self.paths[trial_index]
+        is_on = self.paths[trial_index]
         time = self.search.trials[trial_index].time
         # divide the intervals of a short record, so that a change may lie between samples
-        substeps = max(1, CHANGE_GRID_SIZE // len(on))
+        substeps = max(1, CHANGE_GRID_SIZE // len(is_on))
         record = self.switched_record(trial_index, substeps)
-        fine_path = np.repeat(on, substeps)[: (len(on) - 1) * substeps + 1]
-        times_of_changes = np.zeros((len(change_samples(on)), 3))
+        fine_path = np.repeat(is_on, substeps)[: (len(is_on) - 1) * substeps + 1]
+        times_of_changes = np.zeros((len(change_samples(is_on)), 3))
         for change in range(len(times_of_changes)):
             samples, log_evidence = record.evidence_of_change_samples(fine_path, change)
-            sample_times = np.interp(samples / substeps, np.arange(len(on)), time)
+            sample_times = np.interp(samples / substeps, np.arange(len(is_on)), time)
             # posterior density of the time of the change, integrated by the trapezoidal rule; its
             # quantiles are found by inverse interpolation
             density = np.exp(log_evidence - log_evidence.max())
@@ -248,8 +249,8 @@ def find_events(
     Returns
     -------
     Events
-        Events with changes if these are more probable than `least_score` and than a force that acts
-        throughout the records that have one; otherwise such a force.
+        The events with changes if these are more probable than `least_score` and than a force that
+        acts throughout the records that have one; otherwise such a force.
     """
     sample_count = sum(len(trial.time) for trial in linear_trials.trials)
     stride = ceil(sample_count / MOST_SAMPLES)
@@ -261,18 +262,20 @@ def find_events(
     steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
     event_force = Process(event_deviation, process.correlation_time, may_jump=True)
     steady_force = replace(process, standard_deviation=steady_deviation)
-    best = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
+    best_events = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
     for _ in range(MOST_ROUNDS):
-        next_events = _search_round(search, best.forces, best.paths, LATER_EVALUATIONS)
-        if next_events.score < best.score + LEAST_GAIN:
+        next_events = _search_round(
+            search, best_events.forces, best_events.paths, LATER_EVALUATIONS
+        )
+        if next_events.score < best_events.score + LEAST_GAIN:
             break
-        best = next_events
+        best_events = next_events
     if stride > 1:
-        best = _refine_to_all_samples(best, stride)
+        best_events = _refine_to_all_samples(best_events, stride)
         steady = _refine_to_all_samples(steady, stride)
-    has_changes = any(len(change_samples(on)) for on in best.paths)
-    if has_changes and best.score > max(least_score, steady.score):
-        return best
+    has_changes = any(len(change_samples(is_on)) for is_on in best_events.paths)
+    if has_changes and best_events.score > max(least_score, steady.score):
+        return best_events
     return steady
 
 
@@ -282,28 +285,30 @@ def events_throughout(linear_trials: LinearTrials, port: int, process: Process) 
     return Events(EventSearch(linear_trials, port, process), (process, process), always, -np.inf)
 
 
-def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
+def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
     """Return events that were found in every `stride`-th sample, with changes among all samples.
 
     Parameters
     ----------
-    coarse : Events
+    coarse_events : Events
         The events, with paths over the samples that were used.
     stride : int
         The step between these samples.
     """
-    search = EventSearch(coarse.search.linear_trials, coarse.search.port, coarse.search.process)
+    search = EventSearch(
+        coarse_events.search.linear_trials, coarse_events.search.port, coarse_events.search.process
+    )
     paths = [
-        np.repeat(on, stride)[: len(trial.time)]
-        for on, trial in zip(coarse.paths, search.trials, strict=True)
+        np.repeat(is_on, stride)[: len(trial.time)]
+        for is_on, trial in zip(coarse_events.paths, search.trials, strict=True)
     ]
-    events_in_all_samples = Events(search, coarse.forces, paths, -np.inf)
+    events_in_all_samples = Events(search, coarse_events.forces, paths, -np.inf)
     # `events_in_all_samples` refers to `paths`, which is changed here: the changes of each trial
     # are placed given the refined paths of the trials before it
     for trial_index in range(len(paths)):
         record = events_in_all_samples.switched_record(trial_index, 1)
         paths[trial_index] = record.place_changes(paths[trial_index])
-    log_evidence = float(search.log_evidence(search.products(coarse.forces, paths)))
+    log_evidence = float(search.log_evidence(search.products(coarse_events.forces, paths)))
     return replace(events_in_all_samples, score=log_evidence - price_of_changes(paths))
 
 
@@ -343,7 +348,7 @@ def _search_round(
     Parameters
     ----------
     search : EventSearch
-        The search.
+        The search for events, with its trials.
     forces : (Process, Process)
         The force of events, and the force throughout.
     paths : sequence of (N,) array of bool

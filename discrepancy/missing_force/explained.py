@@ -143,44 +143,49 @@ class ForceHypothesis:
 
 def fit_missing_forces(
     linear_trials: LinearTrials,
-    median: Processes,
-    initial: Processes,
+    median_processes: Processes,
+    initial_processes: Processes,
     candidate: Candidate = NO_EFFECTS,
     effect: FloatArray = NO_EFFECT_VALUES,
     *,
     skip_grid: bool = False,
     most_steps: int = MOST_STEPS,
 ) -> ForceHypothesis:
-    """Return a hypothesis with the most probable sizes and times of its missing forces.
+    """Fit a hypothesis to the trials: its missing forces, the motion, and the shared unknowns.
+
+    The standard deviation and correlation time of each missing force are the most probable ones.
 
     Parameters
     ----------
     linear_trials : LinearTrials
-        The trials, with the columns of the effects.
-    median : mapping of int to Process
+        The trials in motion as one linear model, with the columns of the effects: the changes of
+        the readings for a unit of each effect parameter.
+    median_processes : mapping of int to Process
         The prior medians of the missing forces, by the numbers of their ports.
-    initial : mapping of int to Process
-        The missing forces from which the search for the most probable ones begins.
+    initial_processes : mapping of int to Process
+        The missing forces with which the search for the most probable missing forces begins.
     candidate : Candidate
-        The effects.
+        The effects of the hypothesis, each at its place.
     effect : (E,) array
-        The scaled effect parameters about which the trials are linear.
+        The effect parameters about which the trials are linear, on the scale on which their priors
+        are standard normal.
     skip_grid : bool
-        Whether the search begins at `initial` itself, not at the best point of a grid around it.
+        Whether the search begins at `initial_processes`. Otherwise it begins at the best point of a
+        grid of standard deviations and correlation times around `initial_processes`.
     most_steps : int
-        The largest number of steps of Newton's method.
+        The largest number of steps of Newton's method in the search for the missing forces.
     """
     processes, log_evidence = linear_trials.most_probable_processes(
-        median, initial, skip_grid=skip_grid, most_steps=most_steps
+        median_processes, initial_processes, skip_grid=skip_grid, most_steps=most_steps
     )
-    smoothed = linear_trials.smooth(processes)
+    motion_estimate = linear_trials.smooth(processes)
     return ForceHypothesis(
         candidate=candidate,
         effect=effect,
         processes=processes,
         log_evidence=log_evidence,
         linear_trials=linear_trials,
-        solution=smoothed.solution,
-        local=smoothed.local,
-        motions=smoothed.motions,
+        solution=motion_estimate.solution,
+        local=motion_estimate.local,
+        motions=motion_estimate.motions,
     )

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 from .backward import smoother_corrections
 from .kalman import RecordFilter, discretise, filter_forward
@@ -116,7 +117,7 @@ class ForceFilter:
     Attributes
     ----------
     trial : PortedTrial
-        The trial.
+        The trial as a linear system with ports.
     processes : sequence of (int, Process)
         The missing forces, each with the number of its port. Several may act at one port.
     """
@@ -126,7 +127,7 @@ class ForceFilter:
 
     @cached_property
     def state_units(self) -> FloatArray:
-        """The typical size (n,) of each state of the structure, by which the filter divides it.
+        """The typical size (n,) of each state of the structure; the filter divides the state by it.
 
         Let the missing force, which the model lacks, vary at the highest natural frequency omega
         with an amplitude of one standard deviation, and let it cause the acceleration a. The size
@@ -142,7 +143,7 @@ class ForceFilter:
             np.abs(system.actions[port]).max(initial=0.0) * process.standard_deviation
             for port, process in self.processes
         ]
-        largest_acceleration = max([*accelerations, 1e-300])  # not zero, as it divides
+        largest_acceleration = max([*accelerations, LEAST_DIVISOR])
         units = np.full(state_count, largest_acceleration / highest_frequency)
         # The system does not say which states are positions. An even number of states is taken for
         # positions and then as many speeds, an odd number for speeds alone.
@@ -165,7 +166,7 @@ class ForceFilter:
 
     @cached_property
     def white_noise_scale(self) -> FloatArray:
-        """The standard deviation (C,) of each channel's noise divided by that of its white part.
+        """The standard deviation (C,) of each channel's noise over the deviation of its white part.
 
         The filter counts readings in deviations of the white part, while `PortedTrial` counts them
         in deviations of the whole noise: this is the factor between both.
@@ -300,8 +301,8 @@ class ForceFilter:
         products : (K, K) array
             The inner products of all pairs of whitened columns.
         half_log_determinant : float
-            Half the sum of the logarithms of the variances of the readings, each given those before
-            it [nat]. It is infinite if a force is so large that rounding loses the readings.
+            Half the sum of the logarithms of the variances of the readings, each given those
+            before it [nat]. It is infinite if a force is so large that rounding loses the readings.
         """
         record_filter = self.record_filter(columns)
         _, step_of_sample = self.trial.intervals
@@ -332,14 +333,14 @@ class ForceFilter:
         # calls it the state before sample k + 1.
         next_samples = np.arange(1, len(readings) + 1)
         # forwards in time
-        covariances, means, whitened, _, gains, variances = filter_forward(
+        covariances, means, whitened_innovations, _, gains, variances = filter_forward(
             transitions=record_filter.transitions,
             noises=record_filter.noises,
             step_of_sample=step_of_sample,
             output_rows=record_filter.output_rows,
-            used=record_filter.used,
+            is_used=record_filter.used,
             columns=record_filter.columns,
-            first=0,
+            first_sample=0,
             covariance=initial_state.covariance,
             mean=initial_state.mean,
             query_samples=next_samples,
@@ -350,7 +351,7 @@ class ForceFilter:
             step_of_sample,
             record_filter.output_rows,
             record_filter.used,
-            whitened,
+            whitened_innovations,
             gains,
             variances,
         )
@@ -474,14 +475,14 @@ class Regression:
     half_log_determinant: float
 
     def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
-        """Return values and evidence of a model with only some of the unknowns; others are zero.
+        """Solve the linear model for some of its unknowns, with all other unknowns at zero.
 
         Parameters
         ----------
         unknowns : sequence of int
             The numbers of these unknowns.
         precision : (len(unknowns),) array
-            Their prior precisions.
+            The prior precision of each of these unknowns.
         """
         rows = np.array([0, *(1 + k for k in unknowns)])
         products = self.products[np.ix_(rows, rows)]

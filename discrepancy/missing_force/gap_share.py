@@ -31,7 +31,7 @@ class GapShare:
     held_out : bool
         Whether the trials were held out.
     trial_count : int
-        The number of trials.
+        The number of trials that were compared.
     remaining_rms, total_rms : float
         The rms of the missing force with and without the law, at the port of the law or where most
         force is missing [N, N m or the port's flow]; or that of the gap between readings and
@@ -56,7 +56,7 @@ class GapShare:
 
     @property
     def value(self) -> float:
-        """The share over all blocks."""
+        """The share of the gap that the hypothesis explains, over all blocks together."""
         return float(
             _share_of(self.squares_before.sum(), self.squares_after.sum(), self.noise_squares.sum())
         )
@@ -78,9 +78,9 @@ class GapShare:
             times_drawn @ self.noise_squares,
         )
 
-    def is_larger_than(self, other: "GapShare") -> bool:
+    def is_larger_than(self, other_share: "GapShare") -> bool:
         """Return whether this share is significantly larger than another one (level 5 %)."""
-        difference = self.bootstrap_draws() - other.bootstrap_draws()
+        difference = self.bootstrap_draws() - other_share.bootstrap_draws()
         return bool(np.quantile(difference, 0.05) > 0.0)
 
     @property
@@ -90,22 +90,25 @@ class GapShare:
         return float(low), float(high)
 
 
-def _share_of(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
+def _share_of(
+    squares_before: FloatArray, squares_after: FloatArray, noise: FloatArray
+) -> FloatArray:
     """Return the share of a gap that a hypothesis explains, element by element.
 
-    The share is 1 - (after - noise) / (before - noise), with after - noise at least zero. It is
-    zero if `before` is not larger than `noise`, as there is then no gap that could be explained.
+    The share is 1 - (squares_after - noise) / (squares_before - noise), with a numerator of at
+    least zero. It is zero if `squares_before` is not larger than `noise`, as there is then no gap
+    that could be explained.
 
     Parameters
     ----------
-    before, after : array
+    squares_before, squares_after : array
         The sums of squares of the gap without and with the hypothesis.
     noise : array
         The sums of squares that noise alone gives.
     """
-    gap_squares = before - noise
+    gap_squares = squares_before - noise
     remaining_ratio = np.divide(
-        np.maximum(after - noise, 0.0),
+        np.maximum(squares_after - noise, 0.0),
         gap_squares,
         out=np.ones_like(gap_squares),
         where=gap_squares > 0.0,

@@ -109,7 +109,7 @@ def scale_processes(
     processes : mapping of int to Process
         The processes, by the number of the port.
     size_factor, time_factor : float
-        The factors.
+        The factors on all standard deviations and on all correlation times.
     """
     scaled_processes = {}
     for port, process in processes.items():
@@ -189,7 +189,7 @@ def law_force(
     Parameters
     ----------
     law : PortForce
-        The law.
+        The law of the force at the port.
     time, position, speed : (F,) array
         The fine stamps [s], and the motion of the port there [m or rad, and per s].
     speed_deviation : float
@@ -231,7 +231,7 @@ class ColumnBuilder:
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_indices : sequence of int
         The indices, in the problem, of the trials in motion.
     model_laws : ModelPatch
@@ -272,7 +272,7 @@ class ColumnBuilder:
         Parameters
         ----------
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions : sequence of TrialMotion
             The motion of each trial, along which parameters and the model's own laws act.
         constant_column : EffectColumn, optional
@@ -300,11 +300,11 @@ class ColumnBuilder:
         Parameters
         ----------
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions : sequence of TrialMotion
             The motion of each trial.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         values : (E,) array
             The scaled parameters of the effects.
 
@@ -337,7 +337,7 @@ class ColumnBuilder:
         Parameters
         ----------
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions : sequence of TrialMotion
             The motion of each trial.
         patch : ModelPatch
@@ -380,13 +380,13 @@ class ColumnBuilder:
         Parameters
         ----------
         trial : PortedTrial
-            The trial.
+            The trial as a linear system with ports.
         motion : TrialMotion
-            Its motion.
+            The estimated motion of the trial, with the forces at its ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         patch : ModelPatch
-            The patch.
+            The change of the model.
         acts_on : frozenset of TrialKind
             The kinds of trials that the patch changes.
         """
@@ -412,11 +412,11 @@ class ColumnBuilder:
         Parameters
         ----------
         trial : PortedTrial
-            The trial.
+            The trial as a linear system with ports.
         motion : TrialMotion
-            The motion of its ports.
+            The estimated motion of the trial's ports.
         laws : ModelPatch
-            The laws.
+            The change of the model that consists of these laws.
         """
         added_state = np.zeros_like(motion.added_state)
         readings = np.zeros_like(trial.residual)
@@ -453,20 +453,20 @@ class ColumnBuilder:
         Parameters
         ----------
         trial : PortedTrial
-            The trial.
+            The trial as a linear system with ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         patch : ModelPatch
-            The patch.
+            The change of the model.
         """
-        shared, local = self._linearisation_point(trial)
+        shared_values, local_values = self._linearisation_point(trial)
         # both responses are without the gains of the channels
-        patched, _ = self.problem.response(trial_index, shared, local, patch)
-        response, _ = self.problem.response(trial_index, shared, local, ModelPatch())
+        patched_response, _ = self.problem.response(trial_index, shared_values, local_values, patch)
+        response, _ = self.problem.response(trial_index, shared_values, local_values, ModelPatch())
         gains = 1.0 + self.problem.shared.gains(
-            shared, self.problem.trials[trial_index].trial.channels
+            shared_values, self.problem.trials[trial_index].trial.channels
         )
-        return trial.divide_by_noise(((patched - response) * gains)[:: trial.stride])
+        return trial.divide_by_noise(((patched_response - response) * gains)[:: trial.stride])
 
     def _readings_of_sensor_errors(
         self, trial: PortedTrial, motion: TrialMotion, trial_index: int, sensors: ModelPatch
@@ -480,25 +480,25 @@ class ColumnBuilder:
         Parameters
         ----------
         trial : PortedTrial
-            The trial.
+            The trial as a linear system with ports.
         motion : TrialMotion
-            Its motion.
+            The estimated motion of the trial, with the forces at its ports.
         trial_index : int
-            Its index in the problem.
+            The index of the trial in the problem.
         sensors : ModelPatch
-            The errors of sensors.
+            The change of the model that consists of errors of sensors.
         """
         problem = self.problem
         data = problem.trials[trial_index]
         # a thinned trial has some of the samples of the record
         samples = slice(None, None, trial.stride)
         recorded_trial = data.trial if trial.stride == 1 else data.trial.rows(samples)
-        shared, local = self._linearisation_point(trial)
+        shared_values, local_values = self._linearisation_point(trial)
         # the true values at the sensors, and their rates
-        response, rates = problem.response(trial_index, shared, local, ModelPatch())
+        response, rates = problem.response(trial_index, shared_values, local_values, ModelPatch())
         response = response[samples]
         rates = None if rates is None else rates[samples]
-        gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
+        gains = 1.0 + problem.shared.gains(shared_values, data.trial.channels)
         # readings are divided by the noise and contain the gains: undo both
         explained_readings = trial.readings_of_state(motion.explained_state, motion.law_forces)
         true_values = response + explained_readings * trial.deviation / gains
@@ -506,11 +506,13 @@ class ColumnBuilder:
         if rates is not None:
             true_rates = rates + _explained_rates(trial, motion) / gains
         # the readings of the sensors with their errors
-        conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
-        observed = observe_response(
+        conditions = data.unknowns.conditions(
+            data.trial, problem.shared.parameters(shared_values), local_values
+        )
+        observation = observe_response(
             problem.campaign, recorded_trial, sensors, conditions, Response(true_values, true_rates)
         )
-        change = observed.values - true_values
+        change = observation.values - true_values
         # an error of the clock shifts the readings in time: to first order by their rates
         clock_rate, clock_zero = clock_of(sensors)
         if true_rates is not None:
@@ -519,10 +521,10 @@ class ColumnBuilder:
         return trial.divide_by_noise(change * gains)
 
     def _linearisation_point(self, trial: PortedTrial) -> tuple[FloatArray, FloatArray]:
-        """Return the shared unknowns (K,) and those of a trial (L,) about which it is linear."""
+        """Return the shared (K,) and the local (L,) unknowns about which a trial is linear."""
         shared_count = self.problem.shared.unknown_count
-        shared, local = np.split(trial.linearisation_point, [shared_count])
-        return shared, local
+        shared_values, local_values = np.split(trial.linearisation_point, [shared_count])
+        return shared_values, local_values
 
 
 def _explained_rates(trial: PortedTrial, motion: TrialMotion) -> FloatArray:
@@ -531,9 +533,9 @@ def _explained_rates(trial: PortedTrial, motion: TrialMotion) -> FloatArray:
     Parameters
     ----------
     trial : PortedTrial
-        The trial.
+        The trial as a linear system with ports.
     motion : TrialMotion
-        Its motion.
+        The estimated motion of the trial, with the forces at its ports.
     """
     # s' = A s - sum_p b_p force_p, see `PortedSystem`
     state_rates = motion.explained_state @ trial.system.generator.T

@@ -105,15 +105,15 @@ def update_covariance(covariance: FloatArray, row: FloatArray, gain: FloatArray)
 
 
 @callable_when_compiled
-def predict_mean(transition: FloatArray, mean: FloatArray, predicted: FloatArray) -> None:
+def predict_mean(transition: FloatArray, mean: FloatArray, predicted_mean: FloatArray) -> None:
     """Fill the means (n, W) after a step. Zeros of the transition, which has many, are skipped."""
-    predicted[:] = 0.0
+    predicted_mean[:] = 0.0
     for i in range(len(transition)):
         for j in range(len(transition)):
             coefficient = transition[i, j]
             if coefficient != 0.0:
                 for w in range(mean.shape[1]):
-                    predicted[i, w] += coefficient * mean[j, w]
+                    predicted_mean[i, w] += coefficient * mean[j, w]
 
 
 @callable_when_compiled
@@ -141,16 +141,16 @@ def filter_forward(
     noises: FloatArray,
     step_of_sample: IntArray,
     output_rows: FloatArray,
-    used: BoolArray,
+    is_used: BoolArray,
     columns: FloatArray,
-    first: int,
+    first_sample: int,
     covariance: FloatArray,
     mean: FloatArray,
     query_samples: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the filtered state before some samples, from the readings since sample `first`.
+    """Return the filtered state before some samples, from the readings since sample `first_sample`.
 
-    The readings of the sample before a queried one are the last ones that its state contains.
+    The state at a queried sample contains the readings up to the sample before it.
 
     Parameters
     ----------
@@ -158,13 +158,13 @@ def filter_forward(
         The transitions of the different steps, and the covariances of their process noise.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, is_used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
-    first : int
+    first_sample : int
         The first sample whose readings are processed.
     covariance, mean : (n, n), (n, W) ndarray
-        The state after the sample before `first`; for the first sample of a record, the state at
-        that sample before its readings.
+        The state after the sample before `first_sample`; for the first sample of a record, the
+        state at that sample before its readings.
     query_samples : (B,) ndarray
         The samples before which the state is asked for, ascending.
 
@@ -172,11 +172,11 @@ def filter_forward(
     -------
     covariances, means : (B, n, n), (B, n, W) ndarray
         The state after the last sample before each queried one.
-    whitened : (query_samples[-1] - first, c, W) ndarray
+    whitened_innovations : (query_samples[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
     half_log_determinants : (B,) ndarray
-        Half the sum of the logarithms of the variances of the innovations; infinite if a variance
-        has been lost to rounding.
+        Half the sum of the logarithms of the variances of the innovations; infinite if a
+        variance has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
         The gains and the variances of the innovations of that last sample.
     """
@@ -185,20 +185,20 @@ def filter_forward(
     query_count = len(query_samples)
     covariances = np.zeros((query_count, n, n))
     means = np.zeros((query_count, n, column_count))
-    whitened = np.zeros((query_samples[-1] - first, channel_count, column_count))
+    whitened_innovations = np.zeros((query_samples[-1] - first_sample, channel_count, column_count))
     half_log_determinants = np.full(query_count, np.inf)
     all_gains = np.zeros((query_count, channel_count, n))
     all_variances = np.ones((query_count, channel_count))
 
     covariance = covariance.copy()
     mean = mean.copy()
-    predicted = np.zeros((n, column_count))
+    predicted_mean = np.zeros((n, column_count))
     gains = np.zeros((channel_count, n))
     variances = np.ones(channel_count)
     half_log_determinant = 0.0
     query = 0
     steady = False
-    for k in range(first, query_samples[-1] + 1):
+    for k in range(first_sample, query_samples[-1] + 1):
         # store the state before a queried sample
         while query < query_count and query_samples[query] == k:
             covariances[query] = covariance
@@ -210,21 +210,21 @@ def filter_forward(
         if query == query_count:
             break
         # a steady covariance stays so while the step and the used readings are the same
-        same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
-        is_like_previous = same_step and bool(np.all(used[k] == used[k - 1]))
+        same_step = k > first_sample + 1 and step_of_sample[k] == step_of_sample[k - 1]
+        is_like_previous = same_step and bool(np.all(is_used[k] == is_used[k - 1]))
         steady = steady and is_like_previous
         previous_covariance = covariance
         # predict
         if k > 0:
             transition = transitions[step_of_sample[k]]
-            predict_mean(transition, mean, predicted)
-            mean, predicted = predicted, mean
+            predict_mean(transition, mean, predicted_mean)
+            mean, predicted_mean = predicted_mean, mean
             if not steady:
                 covariance = transition @ covariance @ transition.T + noises[step_of_sample[k]]
                 covariance = 0.5 * (covariance + covariance.T)
         # update by the readings of the sample, one at a time
         for c in range(channel_count):
-            if not used[k, c]:
+            if not is_used[k, c]:
                 continue
             if not steady:
                 variances[c] = update_covariance(covariance, output_rows[c], gains[c])
@@ -233,19 +233,19 @@ def filter_forward(
                     return (
                         covariances,
                         means,
-                        whitened,
+                        whitened_innovations,
                         half_log_determinants,
                         all_gains,
                         all_variances,
                     )
-            innovation = whitened[k - first, c]
+            innovation = whitened_innovations[k - first_sample, c]
             innovation[:] = columns[k, c]
             subtract_prediction(output_rows[c], mean, innovation)
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
             half_log_determinant += 0.5 * np.log(variances[c])
         steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
-    return covariances, means, whitened, half_log_determinants, all_gains, all_variances
+    return covariances, means, whitened_innovations, half_log_determinants, all_gains, all_variances
 
 
 @compiled
@@ -322,7 +322,7 @@ class StateInformation(NamedTuple):
     Attributes
     ----------
     matrix : (..., n, n) ndarray
-        The information matrix J.
+        The information matrix J on the n states.
     vectors : (..., n, W) ndarray
         The information vectors h, one for each column.
     products : (..., W, W) ndarray
@@ -376,7 +376,7 @@ class RecordFilter:
     def filter_before(
         self,
         step_of_sample: IntArray,
-        first: int,
+        first_sample: int,
         state: FilterState,
         query_samples: IntArray,
     ) -> FilterState:
@@ -386,7 +386,7 @@ class RecordFilter:
         ----------
         step_of_sample : (N,) array
             The step that leads to each sample.
-        first : int
+        first_sample : int
             The first sample whose readings are processed.
         state : FilterState
             The state of the filter before that sample.
@@ -400,14 +400,14 @@ class RecordFilter:
             self.output_rows,
             self.used,
             self.columns,
-            first,
+            first_sample,
             state.covariance,
             state.mean,
             query_samples,
         )
         # products of the readings since `first`: between two queried samples, then summed up
         whitened_rows = whitened.reshape(-1, whitened.shape[-1])
-        row_of_query = len(self.output_rows) * (query_samples[:-1] - first)
+        row_of_query = len(self.output_rows) * (query_samples[:-1] - first_sample)
         products_between = [rows.T @ rows for rows in np.split(whitened_rows, row_of_query)]
         products = np.cumsum(products_between, axis=0)
         return FilterState(
@@ -448,7 +448,7 @@ def _covariance_roots(covariances: FloatArray) -> FloatArray:
 
 
 def join_filters(before: FilterState, after: StateInformation) -> tuple[FloatArray, FloatArray]:
-    """Return the products and half log determinants of whole records, from those of two parts.
+    """Return the products and half log determinants of records that were filtered in two parts.
 
     The state z at the moment between both parts is integrated out. Given the readings before, it is
     Gaussian; the readings after have the log density that `filter_backward` gives.

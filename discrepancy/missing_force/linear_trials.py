@@ -121,7 +121,7 @@ class SmoothedTrials(NamedTuple):
 
 
 def sum_of_columns(columns: Sequence[EffectColumn], factors: Sequence[float]) -> EffectColumn:
-    """Return the sum of columns, each multiplied by its factor, trial by trial."""
+    """Multiply each column by its factor, and return the sum of the products for each trial."""
     first_column, *other_columns = columns
     sum_by_trial = [
         TrialColumn(np.zeros_like(column_in_trial.readings)).plus(column_in_trial, factors[0])
@@ -142,7 +142,7 @@ class LinearTrials:
     Attributes
     ----------
     trials : sequence of PortedTrial
-        The trials in motion.
+        The trials in motion, each as a linear system with ports.
     shared_precision : (K,) ndarray
         The prior precisions of the shared unknowns.
     motions : sequence of TrialMotion
@@ -169,7 +169,7 @@ class LinearTrials:
 
     @cached_property
     def prior_precision(self) -> FloatArray:
-        """The prior precisions of all unknowns: the shared ones, then those of the effects."""
+        """The prior precisions of the shared unknowns, then those of the effect parameters."""
         return np.concatenate((self.shared_precision, self.effect_precision))
 
     @cached_property
@@ -185,9 +185,11 @@ class LinearTrials:
             for trial, motion in zip(self.trials, self.motions, strict=False)
         ]
         columns_by_trial += [{} for _ in range(len(self.trials) - len(columns_by_trial))]
-        for unknown, column in enumerate(self.effect_columns, start=len(self.shared_precision)):
+        for unknown_index, column in enumerate(
+            self.effect_columns, start=len(self.shared_precision)
+        ):
             for change, columns in zip(column, columns_by_trial, strict=True):
-                columns[unknown] = UnknownColumn(change, 0.0)
+                columns[unknown_index] = UnknownColumn(change, 0.0)
         return columns_by_trial
 
     @cached_property
@@ -212,8 +214,8 @@ class LinearTrials:
             rows[0] = trial.residual - sum(readings_without_unknown)
             rows[1 : 1 + len(trial.shared_derivatives)] = trial.shared_derivatives
             rows[first_local:] = trial.local_derivatives
-            for unknown, (change, zero_value) in self.columns_by_unknown[trial_index].items():
-                rows[1 + unknown] += change.readings
+            for unknown_index, (change, zero_value) in self.columns_by_unknown[trial_index].items():
+                rows[1 + unknown_index] += change.readings
                 # the change is proportional to (unknown - zero_value): refer the residual to an
                 # unknown of zero
                 rows[0] += zero_value * change.readings
@@ -237,8 +239,8 @@ class LinearTrials:
     @np.errstate(invalid="ignore")
     def most_probable_processes(
         self,
-        median: Processes,
-        initial: Processes,
+        median_processes: Processes,
+        initial_processes: Processes,
         *,
         skip_grid: bool = False,
         most_steps: int = MOST_STEPS,
@@ -247,22 +249,22 @@ class LinearTrials:
 
         Parameters
         ----------
-        median : mapping of int to Process
+        median_processes : mapping of int to Process
             The prior medians of size and time of each missing force, by the number of its port.
-        initial : mapping of int to Process
+        initial_processes : mapping of int to Process
             The missing forces to begin with.
         skip_grid : bool
-            Whether Newton's method begins at `initial` itself. Otherwise it begins at the best
-            point of a grid of sizes and times around `initial`.
+            Whether Newton's method begins at `initial_processes` itself. Otherwise it begins at the
+            best point of a grid of sizes and times around `initial_processes`.
         most_steps : int
             The largest number of steps of Newton's method.
         """
 
         def log_evidence(processes: Processes) -> float:
-            return self.log_evidence_with_prior(median, processes)
+            return self.log_evidence_with_prior(median_processes, processes)
 
         search = ProcessSearch.within_prior(
-            log_evidence, median, initial, self.correlation_time_range
+            log_evidence, median_processes, initial_processes, self.correlation_time_range
         )
         return search.most_probable(from_grid=not skip_grid, most_steps=most_steps)
 
@@ -273,17 +275,17 @@ class LinearTrials:
         durations = [float(trial.time[-1] - trial.time[0]) for trial in self.trials]
         return min(intervals), max(durations)
 
-    def log_evidence_with_prior(self, median: Processes, processes: Processes) -> float:
+    def log_evidence_with_prior(self, median_processes: Processes, processes: Processes) -> float:
         """Return the log of evidence times prior of missing forces [nat].
 
         Parameters
         ----------
-        median : mapping of int to Process
+        median_processes : mapping of int to Process
             The prior medians of the missing forces, by the number of the port.
         processes : mapping of int to Process
-            The missing forces.
+            The missing forces as random processes, by the numbers of their ports.
         """
-        return self.solve(processes).log_evidence + prior_log_density(median, processes)
+        return self.solve(processes).log_evidence + prior_log_density(median_processes, processes)
 
     def smooth(
         self, processes: Processes, fixed_solution: Solution | None = None
@@ -295,29 +297,35 @@ class LinearTrials:
         processes : mapping of int to Process
             The missing forces, by the number of the port.
         fixed_solution : Solution, optional
-            The values of the shared unknowns and of those of effects; by default the most probable
-            ones.
+            The values of the shared unknowns and of the effect parameters; by default the most
+            probable values.
         """
         solution = fixed_solution or self.solve(processes)
         local_of_trials = []
         motions = []
         for trial_index, force_filter in enumerate(self.force_filters(processes)):
             rows = self.regression_rows[trial_index]
-            unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
-            local = _most_probable_local_unknowns(force_filter, unexplained)
-            unexplained = unexplained - np.tensordot(local, force_filter.trial.local_derivatives, 1)
-            smoothed = force_filter.smooth(unexplained)
-            motions.append(self._trial_motion(trial_index, processes, smoothed, solution, local))
-            local_of_trials.append(local)
+            unexplained_readings = rows[0] - np.tensordot(
+                solution.mean, rows[1 : 1 + len(solution.mean)], 1
+            )
+            local_values = _most_probable_local_unknowns(force_filter, unexplained_readings)
+            unexplained_readings = unexplained_readings - np.tensordot(
+                local_values, force_filter.trial.local_derivatives, 1
+            )
+            smoothed_forces = force_filter.smooth(unexplained_readings)
+            motions.append(
+                self._trial_motion(trial_index, processes, smoothed_forces, solution, local_values)
+            )
+            local_of_trials.append(local_values)
         return SmoothedTrials(solution, local_of_trials, motions)
 
     def _trial_motion(
         self,
         trial_index: int,
         processes: Processes,
-        smoothed: SmoothedForces,
+        smoothed_forces: SmoothedForces,
         solution: Solution,
-        local: FloatArray,
+        local_values: FloatArray,
     ) -> TrialMotion:
         """Return the motion of a trial: the model's, and what forces, unknowns and laws add to it.
 
@@ -327,20 +335,20 @@ class LinearTrials:
             The index of the trial.
         processes : mapping of int to Process
             The missing forces, by the number of the port.
-        smoothed : SmoothedForces
+        smoothed_forces : SmoothedForces
             The missing forces in time, and the state that they add.
         solution : Solution
             The shared unknowns and those of effects.
-        local : (L,) array
+        local_values : (L,) array
             The unknowns of the trial alone.
         """
         trial = self.trials[trial_index]
-        missing_forces = dict(zip(processes, smoothed.forces, strict=True))
+        missing_forces = dict(zip(processes, smoothed_forces.forces, strict=True))
         # only state and forces are summed; the readings of this sum are not used
         no_readings = np.zeros_like(trial.residual)
-        hypothesis_change = TrialColumn(no_readings, smoothed.added_state, missing_forces)
-        for unknown, (change, zero_value) in self.columns_by_unknown[trial_index].items():
-            unknown_change = float(solution.mean[unknown] - zero_value)
+        hypothesis_change = TrialColumn(no_readings, smoothed_forces.added_state, missing_forces)
+        for unknown_index, (change, zero_value) in self.columns_by_unknown[trial_index].items():
+            unknown_change = float(solution.mean[unknown_index] - zero_value)
             hypothesis_change = hypothesis_change.plus(change, unknown_change)
         if self.constant_column is not None:
             hypothesis_change = hypothesis_change.plus(self.constant_column[trial_index], 1.0)
@@ -352,11 +360,14 @@ class LinearTrials:
             )
         added_state = change_with_model_laws.added_state
         assert added_state is not None
-        unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
+        unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local_values))
         positions, speeds = trial.port_motion(unknowns, added_state)
         deviations = {}
         for port, force, speed in zip(
-            processes, smoothed.force_deviations, smoothed.speed_deviations, strict=True
+            processes,
+            smoothed_forces.force_deviations,
+            smoothed_forces.speed_deviations,
+            strict=True,
         ):
             # The last samples have few later readings, so that their deviations are larger: take
             # that of the sample `INFORMING_SAMPLES` before the end for the whole record.
@@ -365,7 +376,7 @@ class LinearTrials:
             added_state=added_state,
             forces=hypothesis_change.forces,
             unexplained_forces=missing_forces,
-            explained_state=added_state - smoothed.added_state,
+            explained_state=added_state - smoothed_forces.added_state,
             positions=positions,
             speeds=speeds,
             deviations_by_port=deviations,
@@ -376,16 +387,20 @@ def _columns_along_motion(trial: PortedTrial, motion: TrialMotion) -> dict[int, 
     """Return the columns of parameters and gains along a motion, by the number of the unknown."""
     columns = {}
     # calibrated parameters change the system, and with it the added state
-    for unknown, derivative in enumerate(trial.system_derivatives):
+    for unknown_index, derivative in enumerate(trial.system_derivatives):
         if derivative is not None:
             change = trial.change_by_system_parameter(derivative, motion.added_state, motion.forces)
-            columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
+            columns[unknown_index] = UnknownColumn(
+                change, float(trial.linearisation_point[unknown_index])
+            )
     # gains change the readings of their channel
     readings = trial.readings_of_state(motion.added_state, motion.forces)
-    for unknown, channel, scale in trial.gain_unknowns:
+    for unknown_index, channel, scale in trial.gain_unknowns:
         channel_mask = np.eye(readings.shape[1])[channel]
         change = TrialColumn(readings * scale * channel_mask)
-        columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
+        columns[unknown_index] = UnknownColumn(
+            change, float(trial.linearisation_point[unknown_index])
+        )
     return columns
 
 

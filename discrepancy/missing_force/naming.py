@@ -23,6 +23,7 @@ from discrepancy.fits.candidate import (
     with_step,
 )
 from discrepancy.fits.fitting import LARGEST_EFFECT
+from reporting.arrays import LEAST_DIVISOR
 
 from .at_ports import MissingForces
 from .explained import ForceHypothesis, fit_missing_forces
@@ -120,7 +121,7 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         on_progress : callable
             The function that receives a line for the progress display: the comparison that runs,
             and how many remain.
@@ -131,17 +132,19 @@ class ForceSearch(MissingForces):
         hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.hypothesis_of_all_ports}
         beam = [self.hypothesis_of_all_ports]
         for followed_count in FOLLOWED_COUNTS[:largest_set]:
-            best = self._sort_by_score(hypotheses, effect_count)[0]
+            best_hypothesis = self._sort_by_score(hypotheses, effect_count)[0]
             extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
                 self._fit_promising_effects(
                     base, effects, followed_count, extended_hypotheses, on_progress
                 )
             hypotheses |= extended_hypotheses
-            ranked = self._sort_by_score(extended_hypotheses, effect_count)
-            if not ranked or self.score(ranked[0], effect_count) <= self.score(best, effect_count):
+            ranked_hypotheses = self._sort_by_score(extended_hypotheses, effect_count)
+            if not ranked_hypotheses or self.score(
+                ranked_hypotheses[0], effect_count
+            ) <= self.score(best_hypothesis, effect_count):
                 break
-            beam = ranked[:BEAM_WIDTH]
+            beam = ranked_hypotheses[:BEAM_WIDTH]
         return self._sort_by_score(hypotheses, effect_count)
 
     def extend_hypothesis(
@@ -158,7 +161,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         followed_count : int
             The number of effects that are fitted.
         on_progress : callable
@@ -177,14 +180,14 @@ class ForceSearch(MissingForces):
         extended_hypotheses: dict[CandidateKey, ForceHypothesis],
         on_progress: Callable[[str], None],
     ) -> None:
-        """Fit the most promising effects, each added to a base, and store the hypotheses.
+        """Add each of the most promising effects to a hypothesis, fit the result, and store it.
 
         Parameters
         ----------
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : sequence of Effect
-            The effects.
+            The effects that may be missing in the model.
         followed_count : int
             The number of effects that are fitted.
         extended_hypotheses : dict of CandidateKey to ForceHypothesis
@@ -195,12 +198,12 @@ class ForceSearch(MissingForces):
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         on_progress(f"comparing all effects{base_in_words} with the missing force")
-        promising = self.screen_effects(base, effects)[:followed_count]
-        for number, screened_effect in enumerate(promising):
+        promising_effects = self.screen_effects(base, effects)[:followed_count]
+        for number, screened_effect in enumerate(promising_effects):
             candidate = base.candidate.with_term(screened_effect.term)
             if candidate.key in extended_hypotheses:
                 continue
-            remaining_count = len(promising) - number - 1
+            remaining_count = len(promising_effects) - number - 1
             description = candidate.description
             on_progress(f"following {description} along the missing force, {remaining_count} more")
             fitted_hypotheses = []
@@ -210,8 +213,10 @@ class ForceSearch(MissingForces):
                 if hypothesis is not None:
                     fitted_hypotheses.append(hypothesis)
             if fitted_hypotheses:
-                best = max(fitted_hypotheses, key=lambda hypothesis: hypothesis.log_evidence)
-                extended_hypotheses[candidate.key] = best
+                best_hypothesis = max(
+                    fitted_hypotheses, key=lambda hypothesis: hypothesis.log_evidence
+                )
+                extended_hypotheses[candidate.key] = best_hypothesis
 
     def score(self, hypothesis: ForceHypothesis, effect_count: int) -> float:
         """Return the log of evidence times prior of a hypothesis [nat].
@@ -219,7 +224,7 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         effect_count : int
             The number of effects that are compared.
         """
@@ -251,17 +256,19 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         tried_effects = self._try_effects(base, effects)
         weighed_columns = self._weigh_columns(base, tried_effects)
         weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
         for index, (log_evidence, factor) in weighed_columns.items():
-            tried = tried_effects[index]
-            start = tried.term.multiply_magnitudes(
-                tried.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
+            tried_effect = tried_effects[index]
+            start = tried_effect.term.multiply_magnitudes(
+                tried_effect.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
             )
-            weighed_by_term.setdefault(tried.term, []).append(_WeighedStart(log_evidence, start))
+            weighed_by_term.setdefault(tried_effect.term, []).append(
+                _WeighedStart(log_evidence, start)
+            )
         screened_effects = []
         for term, weighed_starts in weighed_by_term.items():
             best_evidence = max(weighed.log_evidence for weighed in weighed_starts)
@@ -283,7 +290,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis to which an effect is added, with the motion along which effects act.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         tried_effects = []
         for term in self._terms_to_add(base, effects):
@@ -303,9 +310,9 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis.
+            The hypothesis to which an effect may be added.
         effects : iterable of Effect
-            The effects.
+            The effects that may be missing in the model.
         """
         in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
         for effect in effects:
@@ -338,7 +345,7 @@ class ForceSearch(MissingForces):
         """
         if not tried_effects:
             return {}
-        columns = [tried.column for tried in tried_effects]
+        columns = [tried_effect.column for tried_effect in tried_effects]
         with_columns = replace(
             base.linear_trials,
             motions=base.motions,
@@ -349,21 +356,24 @@ class ForceSearch(MissingForces):
             ),
         )
         base_count = len(base.linear_trials.prior_precision)
-        best: dict[int, _WeighedColumn] = {}
+        best_columns: dict[int, _WeighedColumn] = {}
         for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
             normal_equations = with_columns.regression(
                 scale_processes(base.processes, size_factor, time_factor)
             )
-            for index, tried in enumerate(tried_effects):
+            for index, tried_effect in enumerate(tried_effects):
                 # the unknowns of the base are fitted again, with this column alone
                 unknowns = [*range(base_count), base_count + index]
                 solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
                 factor = float(solution.mean[-1])
-                is_better = index not in best or best[index].log_evidence < solution.log_evidence
-                has_possible_sign = factor > 0.0 or tried.term.may_be_negative
+                is_better = (
+                    index not in best_columns
+                    or best_columns[index].log_evidence < solution.log_evidence
+                )
+                has_possible_sign = factor > 0.0 or tried_effect.term.may_be_negative
                 if is_better and np.isfinite(solution.log_evidence) and has_possible_sign:
-                    best[index] = _WeighedColumn(solution.log_evidence, factor)
-        return best
+                    best_columns[index] = _WeighedColumn(solution.log_evidence, factor)
+        return best_columns
 
     def _prior_precisions(
         self, base: ForceHypothesis, columns: Sequence[EffectColumn]
@@ -379,7 +389,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis with the gap.
         columns : sequence of EffectColumn
-            The columns.
+            The columns whose factors are unknown.
         """
         gap_of_readings = _rms([trial.residual for trial in base.linear_trials.trials])
         gap_of_forces = _rms([force for motion in base.motions for force in motion.forces.values()])
@@ -410,7 +420,7 @@ class ForceSearch(MissingForces):
         base : ForceHypothesis
             The hypothesis with the motion and the missing forces of the first step.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters to begin with.
 
@@ -479,11 +489,11 @@ class ForceSearch(MissingForces):
         Parameters
         ----------
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions : sequence of TrialMotion
             The motion of each trial along which the effects act.
         candidate : Candidate
-            The effects.
+            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters about which the effects are linear.
 
@@ -505,16 +515,18 @@ class ForceSearch(MissingForces):
             return None
         slopes = []
         for k in range(len(effect)):
-            above = self.column_builder.column_of_candidate(
+            column_above = self.column_builder.column_of_candidate(
                 linear_trials, motions, candidate, with_step(effect, k, HALF_DIFFERENCE)
             )
-            below = self.column_builder.column_of_candidate(
+            column_below = self.column_builder.column_of_candidate(
                 linear_trials, motions, candidate, with_step(effect, k, -HALF_DIFFERENCE)
             )
-            if above is None or below is None:
+            if column_above is None or column_below is None:
                 return None
             slopes.append(
-                sum_of_columns((above, below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE))
+                sum_of_columns(
+                    (column_above, column_below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE)
+                )
             )
         # a column for each parameter, and a constant one: the linear effects at zero parameters,
         # which are the effects at `effect` minus the sum of effect * slope
@@ -526,9 +538,9 @@ class ForceSearch(MissingForces):
 
 
 def _rms(series: Iterable[FloatArray]) -> float:
-    """Return the root mean square of several arrays together, at least 1e-300."""
+    """Return the root mean square of several arrays together, at least `LEAST_DIVISOR`."""
     values = np.concatenate([np.ravel(entries) for entries in series])
-    return max(float(np.sqrt(np.mean(values**2))), 1e-300)
+    return max(float(np.sqrt(np.mean(values**2))), LEAST_DIVISOR)
 
 
 def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
@@ -541,7 +553,7 @@ def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) ->
     Parameters
     ----------
     hypothesis : ForceHypothesis
-        The hypothesis.
+        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
     step : (E,) array
         The step from its effect parameters to the solution.
     """

@@ -11,6 +11,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
+from reporting.arrays import LEAST_DIVISOR
 
 from .explained import ForceHypothesis
 from .gap_share import GapShare
@@ -55,14 +56,14 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
     ]
     # each bin has its own mean, which takes one degree of freedom
     variance_within = sum(squares_by_bin) / (count - bin_count)
-    variance = max(float(np.var(force, ddof=1)), 1e-300)
+    variance = max(float(np.var(force, ddof=1)), LEAST_DIVISOR)
     return max(1.0 - variance_within / variance, 0.0)
 
 
 def ordering_variables(
     force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the variables that order a force: those of which the force is nearly a function.
+    """Return the variables that order a force: the force is nearly a function of such a variable.
 
     Parameters
     ----------
@@ -78,8 +79,8 @@ def ordering_variables(
         one.
     """
     # unit standard deviations, so that position and speed of a harmonic motion form a circle
-    scaled_position = position / max(float(np.std(position)), 1e-300)
-    scaled_speed = speed / max(float(np.std(speed)), 1e-300)
+    scaled_position = position / max(float(np.std(position)), LEAST_DIVISOR)
+    scaled_speed = speed / max(float(np.std(speed)), LEAST_DIVISOR)
     # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {
@@ -107,7 +108,7 @@ class TrialForce:
     trial : str
         The name of the trial.
     time : (N,) array
-        The stamps [s].
+        The times of the samples [s].
     position, speed : (N,) array
         The motion of the port [m or rad, and per s]; at a port of a state the speed is the state.
     force, deviation : (N,) array
@@ -160,7 +161,7 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     search : ForceSearch
         The search for the missing force.
     hypothesis : ForceHypothesis
-        The hypothesis.
+        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
 
     Returns
     -------
@@ -196,22 +197,24 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
 
 
 def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> list[TrialForce]:
-    """Return the missing force at a port in each trial.
+    """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
     Parameters
     ----------
     hypothesis : ForceHypothesis
-        The hypothesis.
+        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
     port : int
-        The number of the port.
+        The index of the port among the ports of the model.
     has_law : bool
-        Whether the hypothesis has a law at the port.
+        Whether a law of the hypothesis acts at the port. The result then also tells how much of the
+        force the law explains.
     """
     trial_forces = []
     for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
         samples = slice(None, None, trial.substeps)
         force = motion.forces[port][samples]
-        law = force - motion.unexplained_forces[port][samples] if has_law else None
+        # the force consists of the force of the law and of what no law explains
+        law_force = force - motion.unexplained_forces[port][samples] if has_law else None
         trial_forces.append(
             TrialForce(
                 trial=trial.name,
@@ -220,7 +223,7 @@ def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -
                 speed=motion.speeds[samples, port],
                 force=force,
                 deviation=motion.deviations_by_port[port].force,
-                law=law,
+                law=law_force,
             )
         )
     return trial_forces
@@ -306,7 +309,7 @@ def missing_force_of_verdict(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     search : ForceSearch or None
         The search for the missing force, if there was one.
     hypotheses : sequence of ForceHypothesis
@@ -343,8 +346,8 @@ def missing_force_of_verdict(
         held_out = None
         if shares.has_held_out:
             held_out = _remaining_force(shares.gap_share(hypothesis, held_out=True))
-        fitted = _remaining_force(shares.gap_share(hypothesis, held_out=False))
-        at_port = replace(at_port, fitted=fitted, held_out=held_out)
+        fitted_remainder = _remaining_force(shares.gap_share(hypothesis, held_out=False))
+        at_port = replace(at_port, fitted=fitted_remainder, held_out=held_out)
     return replace(force, at_port=at_port)
 
 
@@ -360,7 +363,7 @@ def _hypothesis_of_fit(
     hypotheses : sequence of ForceHypothesis
         The hypotheses that were fitted already; if none has the effects, one is fitted now.
     fit : CandidateFit
-        The fit.
+        The fit of a hypothesis to all trials.
 
     Returns
     -------

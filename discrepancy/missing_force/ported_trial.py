@@ -16,6 +16,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import shift_clock_to_first_sample
 from fe.runtime.patch import ModelPatch
+from reporting.arrays import LEAST_DIVISOR
 
 from .trial import ColouredNoise, GainUnknown, PortedTrial
 
@@ -125,7 +126,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
 
 
 def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
-    """Return the largest stride up to a wanted one with which a trial may be thinned.
+    """Return the stride with which a trial may be thinned, as close to a wanted stride as possible.
 
     The phase of the fastest mode, and that of the motion of each port, changes by at most
     `LARGEST_SUBSTEP_PHASE` in a substep of the thinned trial. A trial with uneven intervals is not
@@ -148,10 +149,10 @@ def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
     # for a sine, the rms rate of the speed over the rms speed is its angular frequency
     rms_change = np.sqrt(np.mean(np.diff(trial.port_speeds, axis=0) ** 2, axis=0)) * trial.substeps
     rms_speed = np.sqrt(np.mean(trial.port_speeds**2, axis=0))
-    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, 1e-300), initial=0.0))
+    phase_of_motion = float(np.max(rms_change / np.maximum(rms_speed, LEAST_DIVISOR), initial=0.0))
     # a thinned trial has at least `FEWEST_SUBSTEPS`
     largest_phase = LARGEST_SUBSTEP_PHASE * max(trial.substeps, FEWEST_SUBSTEPS)
-    longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, 1e-300)
+    longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, LEAST_DIVISOR)
     stride = int(min(wanted_stride, longest_stride, len(trial.time) / FEWEST_SAMPLES))
     # the substeps of a thinned trial end at fine stamps of the trial
     multiple = FEWEST_SUBSTEPS // trial.substeps if trial.substeps < FEWEST_SUBSTEPS else 1
@@ -174,7 +175,7 @@ def _residual_and_derivatives(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial in the problem.
     point : Point
@@ -210,19 +211,19 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[Ga
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial : Trial
-        The trial.
+        The trial with its readings, inputs and sample times.
     gains : (C,) array
         The gain of each channel of the trial at the point; 1 is a channel without an error.
     """
-    shared = problem.shared
+    layout = problem.shared
     unknowns = []
-    for index, channel_name in enumerate(shared.gain_channels):
+    for index, channel_name in enumerate(layout.gain_channels):
         if channel_name in trial.channels:
-            number = shared.parameter_count + index
+            number = layout.parameter_count + index
             channel = trial.channels.index(channel_name)
-            scale = float(shared.scale[number]) / float(gains[channel])
+            scale = float(layout.scale[number]) / float(gains[channel])
             unknowns.append(GainUnknown(number, channel, scale))
     return unknowns
 
@@ -246,10 +247,10 @@ def _substep_count(system: PortedSystem, time: FloatArray) -> int:
     fastest_angular_frequency = float(
         np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
     )
-    needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
+    substeps_needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
     is_long = len(time) > LONG_RECORD
     fewest = FEWEST_SUBSTEPS_OF_LONG_RECORD if is_long else FEWEST_SUBSTEPS
-    return int(np.clip(needed, fewest, MOST_SUBSTEPS))
+    return int(np.clip(substeps_needed, fewest, MOST_SUBSTEPS))
 
 
 def _port_motion(
@@ -260,7 +261,7 @@ def _port_motion(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial in the problem.
     point : Point
@@ -277,25 +278,25 @@ def _port_motion(
         `PortedTrial.linearisation_point`.
     """
     data = problem.trials[trial_index]
-    shared = problem.shared
+    layout = problem.shared
     trial_in_own_clock, _ = shift_clock_to_first_sample(data.trial, ModelPatch())
 
     def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
-        parameters = shared.parameters(shared_values)
+        parameters = layout.parameters(shared_values)
         conditions = data.unknowns.conditions(data.trial, parameters, local_values)
         return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, substeps))
 
-    local = point.local[trial_index]
-    motion_at_point = motion(point.shared, local)
+    local_at_point = point.local[trial_index]
+    motion_at_point = motion(point.shared, local_at_point)
     by_unknowns = {}
-    for k in range(shared.parameter_count):
+    for k in range(layout.parameter_count):
         by_unknowns[k] = (
-            motion(with_step(point.shared, k), local) - motion_at_point
+            motion(with_step(point.shared, k), local_at_point) - motion_at_point
         ) / PARAMETER_STEP
     # the first unknowns of a trial are the zeros of its channels, which do not move the ports
     for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
-        stepped_motion = motion(point.shared, with_step(local, k))
-        by_unknowns[shared.unknown_count + k] = (stepped_motion - motion_at_point) / PARAMETER_STEP
+        stepped_motion = motion(point.shared, with_step(local_at_point, k))
+        by_unknowns[layout.unknown_count + k] = (stepped_motion - motion_at_point) / PARAMETER_STEP
     return motion_at_point, by_unknowns
 
 
@@ -305,7 +306,7 @@ def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
 
 
 def _ported_system(
-    problem: Problem, trial: Trial, shared: FloatArray
+    problem: Problem, trial: Trial, shared_values: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
 
@@ -315,45 +316,47 @@ def _ported_system(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     trial : Trial
-        The trial.
-    shared : (K,) array
+        The trial with its readings, inputs and sample times.
+    shared_values : (K,) array
         The values of the shared unknowns.
     """
     unknowns = problem.shared
     outputs = problem.campaign.outputs(trial)
 
-    def system(u: FloatArray) -> PortedSystem:
-        return problem.model.ported_system(trial, outputs, unknowns.parameters(u))
+    def system(shared_at: FloatArray) -> PortedSystem:
+        return problem.model.ported_system(trial, outputs, unknowns.parameters(shared_at))
 
     derivatives: list[PortedSystem | None] = []
     for k in range(unknowns.parameter_count):
-        above = system(with_step(shared, k, HALF_DIFFERENCE))
-        below = system(with_step(shared, k, -HALF_DIFFERENCE))
-        derivatives.append(_system_derivative(above, below))
+        system_above = system(with_step(shared_values, k, HALF_DIFFERENCE))
+        system_below = system(with_step(shared_values, k, -HALF_DIFFERENCE))
+        derivatives.append(_system_derivative(system_above, system_below))
     derivatives += [None] * (unknowns.unknown_count - len(derivatives))
-    return system(shared), derivatives
+    return system(shared_values), derivatives
 
 
-def _system_derivative(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+def _system_derivative(
+    system_above: PortedSystem, system_below: PortedSystem
+) -> PortedSystem | None:
     """Return the derivative of a system by a parameter, a central difference; None if zero.
 
     Parameters
     ----------
-    above, below : PortedSystem
+    system_above, system_below : PortedSystem
         The system with the parameter `HALF_DIFFERENCE` above and below its value.
     """
 
-    def slope(upper: FloatArray, lower: FloatArray) -> FloatArray:
-        return np.asarray((upper - lower) / (2.0 * HALF_DIFFERENCE))
+    def slope(value_above: FloatArray, value_below: FloatArray) -> FloatArray:
+        return np.asarray((value_above - value_below) / (2.0 * HALF_DIFFERENCE))
 
     derivative = replace(
-        above,
-        generator=slope(above.generator, below.generator),
-        actions=slope(above.actions, below.actions),
-        outputs=slope(above.outputs, below.outputs),
-        through=slope(above.through, below.through),
+        system_above,
+        generator=slope(system_above.generator, system_below.generator),
+        actions=slope(system_above.actions, system_below.actions),
+        outputs=slope(system_above.outputs, system_below.outputs),
+        through=slope(system_above.through, system_below.through),
     )
     arrays = (derivative.generator, derivative.actions, derivative.outputs, derivative.through)
     return derivative if any(np.any(array) for array in arrays) else None

@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from reporting.arrays import LEAST_DIVISOR
 
 from .filtered import Process
 
@@ -34,29 +35,29 @@ MOST_STEPS = 20
 """Largest number of steps of Newton's method."""
 
 
-def prior_log_density(median: Processes, processes: Processes) -> float:
+def prior_log_density(median_processes: Processes, processes: Processes) -> float:
     """Return the log prior density of missing forces [nat], up to a constant.
 
     The size and the correlation time of a missing force are independent and log-normal.
 
     Parameters
     ----------
-    median : mapping of int to Process
+    median_processes : mapping of int to Process
         The prior medians, by the number of the port.
     processes : mapping of int to Process
-        The missing forces.
+        The missing forces as random processes, by the numbers of their ports.
     """
     log_ratios = np.log(
-        [_ratios_to_median(process, median[port]) for port, process in processes.items()]
+        [_ratios_to_median(process, median_processes[port]) for port, process in processes.items()]
     )
     return -0.5 * float(np.sum(np.square(log_ratios / PRIOR_LOG_DEVIATIONS)))
 
 
-def _ratios_to_median(process: Process, median: Process) -> tuple[float, float]:
-    """Return size and time of a process, each divided by that of the median."""
+def _ratios_to_median(process: Process, median_process: Process) -> tuple[float, float]:
+    """Return the ratios of size and correlation time between a process and its prior median."""
     return (
-        process.standard_deviation / median.standard_deviation,
-        process.correlation_time / median.correlation_time,
+        process.standard_deviation / median_process.standard_deviation,
+        process.correlation_time / median_process.correlation_time,
     )
 
 
@@ -86,8 +87,8 @@ class ProcessSearch:
     def within_prior(
         cls,
         log_evidence: Callable[[dict[int, Process]], float],
-        median: Processes,
-        initial: Processes,
+        median_processes: Processes,
+        initial_processes: Processes,
         time_range: tuple[float, float],
     ) -> "ProcessSearch":
         """Return the search within `LARGEST_DISTANCE` prior deviations of the medians.
@@ -97,20 +98,20 @@ class ProcessSearch:
         log_evidence : callable
             The function that takes processes by port, and returns the log of evidence times prior
             [nat].
-        median : mapping of int to Process
+        median_processes : mapping of int to Process
             The prior medians, by the number of the port.
-        initial : mapping of int to Process
+        initial_processes : mapping of int to Process
             The processes to begin with.
         time_range : (float, float)
             The shortest and the longest correlation time that the records can show [s].
         """
-        log_medians = logarithms({port: median[port] for port in initial})
+        log_medians = logarithms({port: median_processes[port] for port in initial_processes})
         low = log_medians - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         high = log_medians + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
-        shortest, longest = np.log(time_range)
-        low[:, 1] = np.clip(low[:, 1], shortest, longest)
-        high[:, 1] = np.clip(high[:, 1], shortest, longest)
-        return cls(log_evidence, initial, low, high)
+        log_shortest, log_longest = np.log(time_range)
+        low[:, 1] = np.clip(low[:, 1], log_shortest, log_longest)
+        high[:, 1] = np.clip(high[:, 1], log_shortest, log_longest)
+        return cls(log_evidence, initial_processes, low, high)
 
     def processes(self, logs: FloatArray) -> dict[int, Process]:
         """Return the processes whose sizes and times have logarithms (P, 2)."""
@@ -143,7 +144,7 @@ class ProcessSearch:
         return self.processes(logs), value
 
     def _best_of_grid(self, logs: FloatArray) -> FloatArray:
-        """Return the best logarithms (P, 2) of a grid about given ones (P, 2).
+        """Return the logarithms (P, 2) of the highest log posterior on a grid about a given point.
 
         The grid of each port is searched in turn, with the other ports at their best values so far.
         """
@@ -195,9 +196,9 @@ class ProcessSearch:
         Parameters
         ----------
         logs : (P, 2) array
-            The logarithms.
+            The logarithms of the size and the correlation time of each of the P missing forces.
         value : float
-            The value there [nat].
+            The log posterior density at these logarithms [nat].
         values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
@@ -220,7 +221,7 @@ class ProcessSearch:
         Parameters
         ----------
         logs : (P, 2) array
-            The logarithms.
+            The logarithms of the size and the correlation time of each of the P missing forces.
         slope : (2 P,) array
             The gradient of the value, multiplied by `DIFFERENCE` squared.
         curvature : (2 P, 2 P) array
@@ -234,7 +235,7 @@ class ProcessSearch:
         # magnitudes of the eigenvalues: the step leads uphill where the value is convex, too
         step = np.zeros(logs.size)
         step[free_axes] = eigenvectors @ (
-            eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), 1e-300)
+            eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), LEAST_DIVISOR)
         )
         length_ratio = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
         return np.asarray(step.reshape(logs.shape) / length_ratio)
@@ -250,11 +251,11 @@ class ProcessSearch:
         Parameters
         ----------
         logs : (P, 2) array
-            The logarithms.
+            The logarithms of the size and the correlation time of each of the P missing forces.
         value : float
-            The value there [nat].
+            The log posterior density at these logarithms [nat].
         step : (P, 2) array
-            The step.
+            The step of Newton's method in the logarithms.
         """
         next_logs, next_value = logs, -np.inf
         while next_value < value and np.abs(step).max() > SHORTEST_STEP:

@@ -79,9 +79,9 @@ class ForceShares:
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         held_out : bool
-            Whether the share is that of held-out trials, not of the fitted ones.
+            Whether the share is computed in the held-out trials, and not in the fitted trials.
         """
         linear_trials, motions = self.smooth_trials(hypothesis, held_out=held_out)
         _, motions_without = self._motions_without_effect(held_out)
@@ -97,11 +97,11 @@ class ForceShares:
         )
         shares = []
         for block_sums, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
-            before, after, noise = np.array(block_sums).T
+            sums_before, sums_after, noise_sums = np.array(block_sums).T
             share = GapShare(
-                squares_before=before,
-                squares_after=after,
-                noise_squares=noise,
+                squares_before=sums_before,
+                squares_after=sums_after,
+                noise_squares=noise_sums,
                 held_out=held_out,
                 trial_count=len(motions),
                 remaining_rms=remaining_rms,
@@ -132,9 +132,9 @@ class ForceShares:
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         linear_trials : LinearTrials
-            The trials.
+            The trials in motion as one linear model.
         motions, motions_without : sequence of TrialMotion
             The motion of each trial with the hypothesis, and without any effect.
 
@@ -159,9 +159,9 @@ class ForceShares:
             linear_trials.trials, motions, motions_without, filters, strict=True
         ):
             # the missing forces that are estimated from noise alone
-            smoothed = force_filter.smooth(_simulated_noise(trial))
+            smoothed_noise = force_filter.smooth(_simulated_noise(trial))
             noise_forces = {}
-            for (port, _), force in zip(force_filter.processes, smoothed.forces, strict=True):
+            for (port, _), force in zip(force_filter.processes, smoothed_noise.forces, strict=True):
                 noise_forces[port] = force
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
@@ -191,8 +191,8 @@ class ForceShares:
         if held_out not in self._without_effect:
             hypothesis = self.search.hypothesis_of_all_ports
             # an unknown with a flat prior has no bound
-            bound = np.where(hypothesis.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
-            mean = np.clip(hypothesis.solution.mean, -bound, bound)
+            bounds = np.where(hypothesis.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
+            mean = np.clip(hypothesis.solution.mean, -bounds, bounds)
             bounded_hypothesis = replace(
                 hypothesis, solution=replace(hypothesis.solution, mean=mean)
             )
@@ -212,14 +212,14 @@ class ForceShares:
         Parameters
         ----------
         hypothesis : ForceHypothesis
-            The hypothesis.
+            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
         held_out : bool
-            Whether the trials are the held-out ones, not those fitted.
+            Whether the held-out trials are returned. Otherwise the fitted trials are returned.
         """
         processes = {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
         if not held_out:
-            smoothed = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
-            return hypothesis.linear_trials, smoothed.motions
+            motion_estimate = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
+            return hypothesis.linear_trials, motion_estimate.motions
         assert self._held_out is not None
         builder = self._held_out
         linear_trials = self._held_out_trials_about_unknowns_of(hypothesis)
@@ -237,7 +237,7 @@ class ForceShares:
         return linear_trials, motions
 
     def _held_out_trials_about_unknowns_of(self, hypothesis: ForceHypothesis) -> LinearTrials:
-        """Return the held-out trials, linear about the shared unknowns as the fitted ones are.
+        """Return the held-out trials, linear about the same shared unknowns as the fitted trials.
 
         Parameters
         ----------
@@ -247,11 +247,11 @@ class ForceShares:
         assert self._held_out is not None
         problem = self._held_out.problem
         fitted_trial = hypothesis.linear_trials.trials[0]
-        shared = fitted_trial.linearisation_point[: problem.shared.unknown_count]
-        key = shared.tobytes()
+        shared_values = fitted_trial.linearisation_point[: problem.shared.unknown_count]
+        key = shared_values.tobytes()
         if key not in self._held_out_trials:
-            local = problem.prior_mean_point(NO_EFFECTS).local
-            point = Point(shared, local, np.zeros(0))
+            local_values = problem.prior_mean_point(NO_EFFECTS).local
+            point = Point(shared_values, local_values, np.zeros(0))
             self._held_out_trials[key] = self._held_out.trials_about(point)
         return self._held_out_trials[key]
 
@@ -264,7 +264,7 @@ def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
 
 
 def _weighted_squares(forces: PortForces, weights: Mapping[int, float], samples: slice) -> float:
-    """Return the sum of squares of forces over samples, each multiplied by the weight of its port.
+    """Return the weighted sum of squares of forces over all samples and ports.
 
     Parameters
     ----------

@@ -126,9 +126,9 @@ class SwitchedRecord:
         event_state = len(trial.system.generator)
         # between two samples there are `substeps` steps, at whose ends nothing is read
         lengths, step_of_sample = trial.intervals
-        used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
-        used[::substeps] = trial.used
-        columns = np.zeros((*used.shape, len(trials.columns[trial_index])))
+        is_used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
+        is_used[::substeps] = trial.used
+        columns = np.zeros((*is_used.shape, len(trials.columns[trial_index])))
         columns[::substeps] = np.moveaxis(
             trials.columns[trial_index] * force_filter.white_noise_scale, 0, -1
         )
@@ -140,25 +140,27 @@ class SwitchedRecord:
         self.length_count = len(lengths)
         transitions, noises = switched_step_matrices(state_space, event_state, lengths / substeps)
         self.record_filter = RecordFilter(
-            transitions, noises, state_space.output_rows, used, columns
+            transitions, noises, state_space.output_rows, is_used, columns
         )
-        off, on = initial_covariances(state_space, event_state)
-        self._state_with_force_off = self.record_filter.initial_state(off)
-        self._state_with_force_on = self.record_filter.initial_state(on)
+        covariance_with_force_off, covariance_with_force_on = initial_covariances(
+            state_space, event_state
+        )
+        self._state_with_force_off = self.record_filter.initial_state(covariance_with_force_off)
+        self._state_with_force_on = self.record_filter.initial_state(covariance_with_force_on)
 
-    def step_kinds(self, on: BoolArray) -> IntArray:
+    def step_kinds(self, is_on: BoolArray) -> IntArray:
         """Return the kind (N,) of the step that leads to each sample of a path (N,).
 
         It is the index in the matrices of `switched_step_matrices`.
         """
-        was_on = np.r_[False, on[:-1]]
-        return np.asarray((2 * was_on + on) * self.length_count + self.length_of_sample)
+        was_on = np.r_[False, is_on[:-1]]
+        return np.asarray((2 * was_on + is_on) * self.length_count + self.length_of_sample)
 
-    def products(self, on: BoolArray) -> TrialProducts:
+    def products(self, is_on: BoolArray) -> TrialProducts:
         """Return the information of the trial on the shared unknowns, given a path (N,)."""
-        end = np.array([len(on)])
+        end = np.array([len(is_on)])
         at_end = self.record_filter.filter_before(
-            self.step_kinds(on), 0, self._initial_state(bool(on[0])), end
+            self.step_kinds(is_on), 0, self._initial_state(bool(is_on[0])), end
         )
         products, half_log_determinant = integrate_out_last(
             at_end.products[0], at_end.half_log_determinants[0], self.local_precision
@@ -169,17 +171,19 @@ class SwitchedRecord:
         """Return the state of the filter before the first sample, with the force on or off."""
         return self._state_with_force_on if is_on else self._state_with_force_off
 
-    def evidence_of_stretches(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
+    def evidence_of_stretches(
+        self, is_on: BoolArray, starts: IntArray, ends: IntArray
+    ) -> FloatArray:
         """Return the log evidence of all trials if a path is inverted in one more stretch.
 
         Parameters
         ----------
-        on : (N,) array of bool
+        is_on : (N,) array of bool
             The path: whether the force is on at each sample.
         starts : (A,) array of int
             The first samples of the stretches in which the path is inverted.
         ends : (B,) array of int
-            The samples after the last ones of the stretches.
+            The sample after the last sample of each stretch.
 
         Returns
         -------
@@ -192,25 +196,25 @@ class SwitchedRecord:
         # an infinite determinant is an evidence of -inf, which stays if an end is not after the
         # start
         half_log_determinants = np.full((len(starts), len(ends)), np.inf)
-        kinds = self.step_kinds(on)
+        kinds = self.step_kinds(is_on)
         states_at_starts = self.record_filter.filter_before(
-            kinds, 0, self._initial_state(bool(on[0])), starts
+            kinds, 0, self._initial_state(bool(is_on[0])), starts
         )
         information_at_ends = self.record_filter.information_after(kinds, ends)
-        transitions, noises = self._steps_at_ends(on, ends)
+        transitions, noises = self._steps_at_ends(is_on, ends)
         for k, start in enumerate(starts.tolist()):
             # a stretch from the first sample on: the force begins off instead of on, or on instead
             # of off
             if start == 0:
-                state = self._initial_state(not on[0])
+                state = self._initial_state(not is_on[0])
             else:
                 state = FilterState(*(array[k] for array in states_at_starts))
             # filter the readings of the stretch, in which the path is inverted
             is_later = ends > start
-            inverted = on.copy()
-            inverted[start:] ^= True
+            inverted_path = is_on.copy()
+            inverted_path[start:] ^= True
             state_before_ends = self.record_filter.filter_before(
-                self.step_kinds(inverted), start, state, ends[is_later]
+                self.step_kinds(inverted_path), start, state, ends[is_later]
             )
             # predict over the step that ends the stretch
             transition = transitions[is_later]
@@ -229,24 +233,26 @@ class SwitchedRecord:
             [TrialProducts(products, half_log_determinants), *self.products_of_others]
         )
 
-    def _steps_at_ends(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _steps_at_ends(self, is_on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (B, n, n) of the steps that end inverted stretches.
 
         Such a step leads to the first sample at which the path is not inverted any more.
 
         Parameters
         ----------
-        on : (N,) array of bool
+        is_on : (N,) array of bool
             The path before a stretch is inverted.
         ends : (B,) array of int
-            The samples after the last ones of the stretches. No step follows the end of the
+            The sample after the last sample of each stretch. No step follows the end of the
             record: its transition is the identity, without noise.
         """
         # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
-        is_last = ends == len(on)
+        is_last = ends == len(is_on)
         end_sample = np.where(is_last, 0, ends)
-        was_on = ~on[ends - 1]
-        kind = (2 * was_on + on[end_sample]) * self.length_count + self.length_of_sample[end_sample]
+        was_on = ~is_on[ends - 1]
+        kind = (2 * was_on + is_on[end_sample]) * self.length_count + self.length_of_sample[
+            end_sample
+        ]
         identity = np.eye(len(self.record_filter.output_rows[0]))
         transitions = np.where(
             is_last[:, None, None], identity, self.record_filter.transitions[kind]
@@ -254,7 +260,7 @@ class SwitchedRecord:
         noises = np.where(is_last[:, None, None], 0.0, self.record_filter.noises[kind])
         return transitions, noises
 
-    def invert_best_stretch(self, on: BoolArray) -> BoolArray | None:
+    def invert_best_stretch(self, is_on: BoolArray) -> BoolArray | None:
         """Return the path after the most probable inversion of one stretch.
 
         An inversion turns the force on where it was off, and off where it was on. The stretch
@@ -262,7 +268,7 @@ class SwitchedRecord:
 
         Parameters
         ----------
-        on : (N,) array of bool
+        is_on : (N,) array of bool
             The path: whether the force is on at each sample.
 
         Returns
@@ -270,68 +276,70 @@ class SwitchedRecord:
         (N,) array of bool or None
             The new path; None if no stretch raises the evidence by more than its changes cost.
         """
-        sample_count = len(on)
+        sample_count = len(is_on)
         # each start needs one pass of the filter, of up to `sample_count` steps; 12 intervals are
         # the least with which a stretch is found
         interval_count = min(
             max(MOST_FILTER_STEPS // sample_count, 12), MOST_GRID_INTERVALS, sample_count
         )
         edges = np.unique(
-            np.r_[np.linspace(0, sample_count, interval_count + 1).round(), change_samples(on)]
+            np.r_[np.linspace(0, sample_count, interval_count + 1).round(), change_samples(is_on)]
         ).astype(np.int64)
         # The price of a path counts its changes. A stretch that begins or ends at an existing
         # change removes it (-1); elsewhere it adds one (+1); at the ends of the record there is no
         # change.
         prices = change_price(sample_count) * np.where(
-            np.isin(edges, change_samples(on)), -1.0, 1.0
+            np.isin(edges, change_samples(is_on)), -1.0, 1.0
         )
         prices[[0, -1]] = 0.0
         # score [k, m]: the stretch from edge k to edge m + 1; -inf if it is empty
         scores = (
-            self.evidence_of_stretches(on, edges[:-1], edges[1:])
+            self.evidence_of_stretches(is_on, edges[:-1], edges[1:])
             - prices[:-1, None]
             - prices[None, 1:]
         )
         first_edge, last_interval = np.unravel_index(np.argmax(scores), scores.shape)
-        present_evidence = self.trials.log_evidence([self.products(on), *self.products_of_others])
+        present_evidence = self.trials.log_evidence(
+            [self.products(is_on), *self.products_of_others]
+        )
         if scores[first_edge, last_interval] <= present_evidence:
             return None
-        inverted = on.copy()
-        inverted[edges[first_edge] : edges[last_interval + 1]] ^= True
-        return inverted
+        inverted_path = is_on.copy()
+        inverted_path[edges[first_edge] : edges[last_interval + 1]] ^= True
+        return inverted_path
 
-    def place_changes(self, on: BoolArray) -> BoolArray:
+    def place_changes(self, is_on: BoolArray) -> BoolArray:
         """Return a path (N,) whose changes are moved to their most probable samples.
 
         They are moved one after the other. This is repeated, three times at most, since the best
         sample of one change depends on the others.
         """
         for _ in range(3):
-            previous = on.copy()
-            for change_index, old_sample in enumerate(change_samples(on)):
-                samples, log_evidence = self.evidence_of_change_samples(on, change_index)
+            is_on_before = is_on.copy()
+            for change_index, old_sample in enumerate(change_samples(is_on)):
+                samples, log_evidence = self.evidence_of_change_samples(is_on, change_index)
                 new_sample = samples[np.argmax(log_evidence)]
-                on = on.copy()
-                # an earlier change extends the stretch after it, a later one that before it
+                is_on = is_on.copy()
+                # an earlier change extends the stretch after it; a later change, the one before it
                 if new_sample < old_sample:
-                    on[new_sample:old_sample] = on[old_sample]
+                    is_on[new_sample:old_sample] = is_on[old_sample]
                 else:
-                    on[old_sample:new_sample] = on[old_sample - 1]
-            if np.array_equal(on, previous):
+                    is_on[old_sample:new_sample] = is_on[old_sample - 1]
+            if np.array_equal(is_on, is_on_before):
                 break
-        return on
+        return is_on
 
     def evidence_of_change_samples(
-        self, on: BoolArray, change_index: int
+        self, is_on: BoolArray, change_index: int
     ) -> tuple[IntArray, FloatArray]:
         """Return samples to which a change of a path may be moved, and the log evidence of each.
 
-        The samples lie between the neighbouring changes. A coarse grid of them is refined around
-        the most probable ones, until it contains every sample there.
+        The samples lie between the neighbouring changes. A coarse grid of samples is refined around
+        the most probable samples, until it contains every sample there.
 
         Parameters
         ----------
-        on : (N,) array of bool
+        is_on : (N,) array of bool
             The path: whether the force is on at each sample.
         change_index : int
             The index of the change among the changes of the path.
@@ -339,21 +347,21 @@ class SwitchedRecord:
         Returns
         -------
         samples : (B,) array of int
-            The samples, ascending.
+            The samples at which the force may change, in ascending order.
         log_evidence : (B,) array
             The log evidence of all trials with the change at each of them [nat].
         """
-        bounds = np.r_[0, change_samples(on), len(on)]
+        bounds = np.r_[0, change_samples(is_on), len(is_on)]
         previous_change, change, next_change = bounds[change_index : change_index + 3]
         # `earliest_path` has the change where the previous one is. If it is inverted from there up
         # to a sample, the change lies at that sample.
-        earliest_path = on.copy()
-        earliest_path[previous_change:next_change] = on[change]
+        earliest_path = is_on.copy()
+        earliest_path[previous_change:next_change] = is_on[change]
         samples = np.zeros(0, dtype=np.int64)
         log_evidence = np.zeros(0)
-        first, last = previous_change + 1, next_change - 1
+        first_sample, last_sample = previous_change + 1, next_change - 1
         while True:
-            grid = np.linspace(first, last, COMPARED_SAMPLES).round().astype(np.int64)
+            grid = np.linspace(first_sample, last_sample, COMPARED_SAMPLES).round().astype(np.int64)
             new_samples = np.setdiff1d(grid, samples)
             if not len(new_samples):
                 return samples, log_evidence
@@ -366,8 +374,8 @@ class SwitchedRecord:
             samples, log_evidence = samples[order], log_evidence[order]
             # the next grid: one compared sample beyond the probable ones on either side
             probable = np.flatnonzero(log_evidence >= log_evidence.max() - EVIDENCE_RANGE)
-            first = samples[max(probable[0] - 1, 0)]
-            last = samples[min(probable[-1] + 1, len(samples) - 1)]
+            first_sample = samples[max(probable[0] - 1, 0)]
+            last_sample = samples[min(probable[-1] + 1, len(samples) - 1)]
 
 
 def switched_step_matrices(
@@ -413,25 +421,27 @@ def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray
     event : int
         The index of the force of events in the state.
     """
-    on = system.initial_covariance
+    covariance_on = system.initial_covariance
     # A settled trial begins at rest, deflected by the force. Without the force that part of the
     # covariance is absent.
-    off = on.copy()
-    off[:event, :event] -= np.outer(on[:event, event], on[:event, event])
-    return zero_state(off, event), on
+    covariance_off = covariance_on.copy()
+    covariance_off[:event, :event] -= np.outer(
+        covariance_on[:event, event], covariance_on[:event, event]
+    )
+    return zero_state(covariance_off, event), covariance_on
 
 
 def zero_state(matrix: FloatArray, index: int) -> FloatArray:
     """Return a matrix (n, n) with the row and the column of one state set to zero."""
-    changed = matrix.copy()
-    changed[index] = 0.0
-    changed[:, index] = 0.0
-    return changed
+    zeroed_matrix = matrix.copy()
+    zeroed_matrix[index] = 0.0
+    zeroed_matrix[:, index] = 0.0
+    return zeroed_matrix
 
 
-def change_samples(on: BoolArray) -> IntArray:
+def change_samples(is_on: BoolArray) -> IntArray:
     """Return the samples at which a path (N,) changes: each the first one with the new value."""
-    return np.flatnonzero(np.diff(on)) + 1
+    return np.flatnonzero(np.diff(is_on)) + 1
 
 
 def change_price(sample_count: int) -> float:
@@ -444,4 +454,4 @@ def change_price(sample_count: int) -> float:
 
 def price_of_changes(paths: Sequence[BoolArray]) -> float:
     """Return the price of all changes of paths [nat]."""
-    return sum(len(change_samples(on)) * change_price(len(on)) for on in paths)
+    return sum(len(change_samples(is_on)) * change_price(len(is_on)) for is_on in paths)

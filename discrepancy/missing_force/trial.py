@@ -117,18 +117,18 @@ class TrialColumn:
     added_state: FloatArray | None = None
     forces: Mapping[int, FloatArray] = field(default_factory=dict)
 
-    def plus(self, other: "TrialColumn", factor: float) -> "TrialColumn":
+    def plus(self, other_column: "TrialColumn", factor: float) -> "TrialColumn":
         """Return the sum of this column and another one that is multiplied by `factor`."""
         forces = dict(self.forces)
-        for port, force in other.forces.items():
+        for port, force in other_column.forces.items():
             forces[port] = forces.get(port, 0.0) + factor * force
-        if other.added_state is None:
-            added = self.added_state
+        if other_column.added_state is None:
+            added_state = self.added_state
         elif self.added_state is None:
-            added = factor * other.added_state
+            added_state = factor * other_column.added_state
         else:
-            added = self.added_state + factor * other.added_state
-        return TrialColumn(self.readings + factor * other.readings, added, forces)
+            added_state = self.added_state + factor * other_column.added_state
+        return TrialColumn(self.readings + factor * other_column.readings, added_state, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ class PortedTrial:
         The readings minus the prediction of the linear model at zero unknowns, divided by the noise
         deviations.
     used : (N, C) ndarray of bool
-        Whether each reading counts.
+        Whether each reading is compared with the model.
     deviation : (C,) ndarray
         The standard deviation of the noise of each channel [unit of the channel].
     coloured_noises : sequence of ColouredNoise
@@ -234,8 +234,8 @@ class PortedTrial:
             port_positions=at_fine_stamps(self.port_positions),
             port_speeds=at_fine_stamps(self.port_speeds),
             port_motion_derivatives={
-                unknown: at_fine_stamps(derivative)
-                for unknown, derivative in self.port_motion_derivatives.items()
+                unknown_index: at_fine_stamps(derivative)
+                for unknown_index, derivative in self.port_motion_derivatives.items()
             },
             stride=self.stride * stride,
         )
@@ -257,7 +257,7 @@ class PortedTrial:
 
     @cached_property
     def substep_matrices(self) -> SubstepMatrices:
-        """The matrices by which the state advances over a substep.
+        """The matrices that advance the state over a substep.
 
         One exponential of the system, with the input and its rate as further states, gives all of
         them (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
@@ -279,7 +279,7 @@ class PortedTrial:
 
     @cached_property
     def fine_time(self) -> FloatArray:
-        """The fine stamps (F,) [s]."""
+        """The times (F,) of the fine stamps, which are the ends of all substeps [s]."""
         return subdivide(self.time, self.substeps)
 
     def port_motion(
@@ -306,8 +306,10 @@ class PortedTrial:
         """
         # model's own response: positions first, then speeds
         motion = np.stack((self.port_positions, self.port_speeds))
-        for unknown, derivative in self.port_motion_derivatives.items():
-            motion += (unknowns[unknown] - self.linearisation_point[unknown]) * derivative
+        for unknown_index, derivative in self.port_motion_derivatives.items():
+            motion += (
+                unknowns[unknown_index] - self.linearisation_point[unknown_index]
+            ) * derivative
         response_positions, response_speeds = motion
         # motion of the ports by the added state
         added_positions = added_state @ self.system.positions.T
@@ -348,7 +350,7 @@ class PortedTrial:
         system_derivative : PortedSystem
             The derivative of the system by the parameter.
         added_state : (F, n) array
-            The added state s.
+            The state s that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
             The forces g at ports that add it, by the number of the port.
         """
@@ -415,7 +417,7 @@ class PortedTrial:
         Parameters
         ----------
         states : (F, n) array
-            The added state.
+            The state that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
             The forces at ports, which an acceleration shows directly, by the number of the port.
         """
@@ -431,7 +433,7 @@ class PortedTrial:
         system : PortedSystem
             The system of the trial, or its derivative by a parameter.
         states : (F, n) array
-            The added state.
+            The state that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
             The forces at ports, which an acceleration shows directly, by the number of the port.
         """

@@ -51,7 +51,7 @@ def gap_windows(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit of the verdict. If its law at a port, acting throughout, has more evidence than
         events, there are no windows.
@@ -62,7 +62,9 @@ def gap_windows(
         The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
         the noise that the fit has absorbed.
     """
-    dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
+    dynamic_trials = tuple(
+        fitted_trial.trial for fitted_trial in residuals.trials if fitted_trial.trial.is_dynamic
+    )
     _, own_laws = problem.model.without_laws()
     if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
         return windows_of_residuals(residuals, seed=seed)
@@ -123,7 +125,7 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     port : str
         The name of the port.
     fit : CandidateFit
-        The fit.
+        The fit of a hypothesis to all trials.
     """
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     if not laws:
@@ -147,7 +149,7 @@ def windows_of_residuals(
     Parameters
     ----------
     residuals : ResidualSet
-        The residuals.
+        The residuals of the trials to examine.
     seed : int
         The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
         the noise that the fit has absorbed.
@@ -157,14 +159,16 @@ def windows_of_residuals(
         The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
-    white = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
-    for fitted, white_residuals in zip(residuals.trials, white, strict=True):
-        trial = fitted.trial
-        extends_in_time = fitted.used.any() and np.ptp(trial.time) > 0.0
+    white_residuals_of_trials = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
+    for fitted_trial, white_residuals in zip(
+        residuals.trials, white_residuals_of_trials, strict=True
+    ):
+        trial = fitted_trial.trial
+        extends_in_time = fitted_trial.used.any() and np.ptp(trial.time) > 0.0
         if trial.kind not in kinds or not extends_in_time:
             continue
         hypothesis, pattern = strongest_pattern(
-            trial.name, trial.time, white_residuals, fitted.used
+            trial.name, trial.time, white_residuals, fitted_trial.used
         )
         if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
             continue
@@ -182,7 +186,7 @@ def windows_of_residuals(
 
 
 def add_window_sizes(
-    windows: Sequence[GapWindow], before: ResidualSet, after: ResidualSet
+    windows: Sequence[GapWindow], residuals_before: ResidualSet, residuals_after: ResidualSet
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
 
@@ -192,48 +196,57 @@ def add_window_sizes(
     ----------
     windows : sequence of GapWindow
         The windows of the unchanged model, and those of the hypothesis of the verdict.
-    before, after : ResidualSet
-        The residuals without and with the hypothesis. Both are divided by the noise of `before`, so
-        that sizes with and without the hypothesis can be compared.
+    residuals_before, residuals_after : ResidualSet
+        The residuals without and with the hypothesis. Both are divided by the noise of
+        `residuals_before`, so that sizes with and without the hypothesis can be compared.
     """
-    noise = {fitted.trial.name: fitted.noise_deviation for fitted in before.trials}
+    noise = {
+        fitted_trial.trial.name: fitted_trial.noise_deviation
+        for fitted_trial in residuals_before.trials
+    }
     windows_with_sizes = []
     for window in windows:
-        residuals = after if window.with_effect else before
-        (fitted,) = (fitted for fitted in residuals.trials if fitted.trial.name == window.trial)
-        inside = _used_in_window(window, fitted)
-        if not inside.any():
+        residuals = residuals_after if window.with_effect else residuals_before
+        (fitted_trial,) = (
+            fitted_trial
+            for fitted_trial in residuals.trials
+            if fitted_trial.trial.name == window.trial
+        )
+        is_in_window = _used_in_window(window, fitted_trial)
+        if not is_in_window.any():
             continue
-        rms_of_channels = _rms_by_channel(inside, fitted, noise[window.trial])
+        rms_of_channels = _rms_by_channel(is_in_window, fitted_trial, noise[window.trial])
         largest = float(rms_of_channels.max())
         is_shown = (rms_of_channels > 0.0) & (rms_of_channels >= LEAST_RMS_SHARE * largest)
-        channels = _select_channels(fitted.trial.channels, is_shown)
+        channels = _select_channels(fitted_trial.trial.channels, is_shown)
         windows_with_sizes.append(replace(window, size=largest, channels=channels))
     return tuple(windows_with_sizes)
 
 
-def _used_in_window(window: GapWindow, fitted: FittedTrial) -> BoolArray:
+def _used_in_window(window: GapWindow, fitted_trial: FittedTrial) -> BoolArray:
     """Return which readings (N, C) of a trial count and lie in a window."""
     begin = window.first if window.begin is None else window.begin.value
     end = window.last if window.end is None else window.end.value
-    time = fitted.trial.time
-    return np.asarray(fitted.used & ((time >= begin) & (time <= end))[:, None])
+    time = fitted_trial.trial.time
+    return np.asarray(fitted_trial.used & ((time >= begin) & (time <= end))[:, None])
 
 
-def _rms_by_channel(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
+def _rms_by_channel(
+    is_selected: BoolArray, fitted_trial: FittedTrial, noise: FloatArray
+) -> FloatArray:
     """Return the rms residual (C,) of each channel divided by its noise, over selected readings.
 
     Parameters
     ----------
-    inside : (N, C) array of bool
-        The selected readings.
-    fitted : FittedTrial
+    is_selected : (N, C) array of bool
+        Whether each reading is selected.
+    fitted_trial : FittedTrial
         The residuals of the trial.
     noise : (C,) array
         The standard deviation of the noise of each channel [unit of the channel].
     """
-    squares = np.where(inside, (fitted.residual / noise) ** 2, 0.0).sum(axis=0)
-    return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
+    squares = np.where(is_selected, (fitted_trial.residual / noise) ** 2, 0.0).sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(is_selected.sum(axis=0), 1)))
 
 
 def _select_channels(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:
@@ -255,7 +268,7 @@ def _port_or_channel_error(
     port : int
         The number of the port.
     at_port : ForceHypothesis
-        The missing force there.
+        The hypothesis of a missing force at that port.
     channels : sequence of tuple of str
         The channels of each trial.
 
@@ -374,7 +387,7 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
 
 
 def strongest_pattern(
-    name: str, time: FloatArray, series: FloatArray, used: BoolArray
+    name: str, time: FloatArray, series: FloatArray, is_used: BoolArray
 ) -> tuple[ForceHypothesis, FloatArray]:
     """Return the strongest pattern of residuals over channels, and its amplitude as a force.
 
@@ -383,11 +396,11 @@ def strongest_pattern(
     name : str
         The name of the trial.
     time : (N,) array
-        The stamps [s].
+        The times of the samples [s].
     series : (N, C) array
         The residuals, divided by their noise; white noise of variance one if there is no gap.
-    used : (N, C) array of bool
-        Whether a residual counts.
+    is_used : (N, C) array of bool
+        Whether each residual counts.
 
     Returns
     -------
@@ -396,7 +409,7 @@ def strongest_pattern(
     pattern : (C,) array
         The pattern over the channels, of norm one.
     """
-    series = np.where(used, series, 0.0)
+    series = np.where(is_used, series, 0.0)
     _, _, patterns = np.linalg.svd(series, full_matrices=False)
     pattern = patterns[:1]
     # the largest singular value of noise alone is about sqrt(N) + sqrt(C - 1): over sqrt(N) it is
@@ -418,7 +431,7 @@ def strongest_pattern(
         name=name,
         time=time,
         residual=series @ pattern.T / deviation,
-        used=np.any(used, axis=1).reshape(-1, 1),
+        used=np.any(is_used, axis=1).reshape(-1, 1),
         deviation=np.array([deviation]),
         coloured_noises=(),
         shared_derivatives=no_unknowns,
@@ -452,7 +465,7 @@ def _windows_of_events(
     Parameters
     ----------
     events : Events
-        The events.
+        The events in all trials.
     channels : sequence of tuple of str
         The channels of each trial.
     readings_by_force : sequence of (N, C) array
@@ -485,7 +498,7 @@ def _windows_in_trial(
     Parameters
     ----------
     events : Events
-        The events.
+        The events in all trials.
     trial_index : int
         The index of the trial.
     channels : sequence of str

@@ -33,9 +33,22 @@ class SensorRow(NamedTuple):
     unit: str
 
     @property
+    def is_free_gain(self) -> bool:
+        """Whether the campaign does not state this gain; it is then shown instead of its error."""
+        estimate = self.estimate
+        return estimate.kind is SensorValue.GAIN and estimate.stated_deviation == inf
+
+    @property
     def value(self) -> str:
         """The fitted value with its posterior standard deviation."""
+        if self.is_free_gain:
+            return plus_minus(1.0 + self.estimate.value, self.estimate.deviation)
         return plus_minus(self.factor * self.estimate.value, self.factor * self.estimate.deviation)
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of the value; empty for a gain itself."""
+        return "" if self.is_free_gain else self.unit
 
     @property
     def stated(self) -> str:
@@ -53,7 +66,9 @@ class SensorRow(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What was fitted: the error of the gain, or the zero in a trial."""
+        """What was fitted: the gain, its error, or the zero in a trial."""
+        if self.is_free_gain:
+            return "gain"
         if self.estimate.kind is SensorValue.GAIN:
             return "gain error"
         return f"zero in {self.estimate.trial}"
@@ -126,7 +141,7 @@ def _columns() -> list[RecordColumn[SensorRow]]:
         text_cells("channel", lambda row: row.estimate.channel),
         text_cells("fitted", lambda row: row.label),
         number_cells("value", lambda row: row.value),
-        text_cells("unit", lambda row: row.unit),
+        text_cells("unit", lambda row: row.shown_unit),
         number_cells("stated", lambda row: row.stated),
         number_cells("deviations", lambda row: row.deviations),
     ]

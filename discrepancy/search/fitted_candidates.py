@@ -25,7 +25,7 @@ class FittedCandidates:
     Attributes
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     effects : tuple of Effect
         The effects of the catalogue that can act in the campaign.
     no_effect : CandidateFit
@@ -78,7 +78,7 @@ class FittedCandidates:
         return self.score(fit) + averaged_misfit - recorded_misfit
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
-        """Return the fits by which candidates are compared, one for each candidate.
+        """Return the fits that the comparison of candidates uses, one for each candidate.
 
         They are the fits under the wider noise if there are any; otherwise the exact fit of each
         candidate, or its rough fit if it has no exact one.
@@ -86,7 +86,7 @@ class FittedCandidates:
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
     def best(self) -> CandidateFit:
-        """Return the most probable candidate."""
+        """Return the fit of the most probable candidate among the compared fits."""
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:
@@ -116,7 +116,7 @@ class FittedCandidates:
 
     @property
     def compared_no_effect(self) -> CandidateFit:
-        """The fit without effect under the noise by which candidates are compared."""
+        """The fit without effect, under the same noise as the other compared candidates."""
         return self.wide_fits.get((), self.no_effect)
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
@@ -138,7 +138,7 @@ class FittedCandidates:
         }
 
     def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
-        """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
+        """Store a fit unless an earlier fit of the same candidate has more evidence."""
         fits = self.exact_fits if exact else self.rough_fits
         key = fit.candidate.key
         if key not in fits or fits[key].log_evidence < fit.log_evidence:
@@ -156,18 +156,21 @@ class FittedCandidates:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
-    def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
+    def fit_exactly(self, rough_fit: CandidateFit) -> CandidateFit:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
         If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
         has clearly more evidence.
         """
-        key = rough.candidate.key
+        key = rough_fit.candidate.key
         if key in self.wide_fits:
             return self.wide_fits[key]
-        previous = self.exact_fits.get(key)
-        if previous is None or previous.log_evidence < rough.log_evidence - SEARCH.refit_gain:
-            exact = try_fit(self.problem, rough.candidate, rough.point)
+        previous_fit = self.exact_fits.get(key)
+        if (
+            previous_fit is None
+            or previous_fit.log_evidence < rough_fit.log_evidence - SEARCH.refit_gain
+        ):
+            exact_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
             # the rough fit may be at a point from which the model cannot be fitted further
-            self.record_fit(rough if exact is None else exact, exact=True)
+            self.record_fit(rough_fit if exact_fit is None else exact_fit, exact=True)
         return self.exact_fits[key]

@@ -17,7 +17,7 @@ from discrepancy.search_settings import SEARCH
 
 
 def canonical_relatives(
-    leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
+    leading_term: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
     """Return the hypotheses that a fit from other starting magnitudes may improve.
 
@@ -28,7 +28,7 @@ def canonical_relatives(
 
     Parameters
     ----------
-    leading : EffectTerm
+    leading_term : EffectTerm
         The leading effect at its place.
     hypotheses : iterable of ForceHypothesis
         All hypotheses: sets of effects that were fitted to the missing force.
@@ -38,8 +38,8 @@ def canonical_relatives(
         if len(hypothesis.candidate.terms) != 1:
             continue
         (term,) = hypothesis.candidate.terms
-        has_same_family = term.effect.family == leading.effect.family
-        is_related = has_same_family and term.place == leading.place
+        has_same_family = term.effect.family == leading_term.effect.family
+        is_related = has_same_family and term.place == leading_term.place
         has_magnitude = any(parameter.magnitude for parameter in term.parameters)
         if is_related and has_magnitude and not term.free_shape:
             relatives.append(hypothesis)
@@ -55,7 +55,7 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     candidate : Candidate
         The candidate of one effect.
     start : Point

@@ -25,7 +25,7 @@ from fe.runtime.patch import SENSORS
 
 T = TypeVar("T")
 OnProgress = Callable[[str], None]
-"""Takes a line that says what the search is doing."""
+"""A function to which progress is reported, as a line of text."""
 LARGEST_CONDITION = 1e8
 """Condition number of the Gram matrix above which the changes by two effects are parallel."""
 
@@ -49,15 +49,15 @@ def report_each(
     Parameters
     ----------
     on_progress : callable
-        Takes a line of progress.
+        The function to which progress is reported, as a line of text.
     items : sequence
-        The items.
+        The items to yield.
     describe : callable
         Returns a phrase on how an item is processed, such as "fitting gain".
     """
     for number, item in enumerate(items):
-        remaining = len(items) - number - 1
-        on_progress(f"{describe(item)}, {remaining} more")
+        remaining_count = len(items) - number - 1
+        on_progress(f"{describe(item)}, {remaining_count} more")
         yield item
 
 
@@ -77,12 +77,14 @@ def changes_structure(effect: Effect, setting: Setting) -> bool:
     return not all(isinstance(primitive, SENSORS) for primitive in patch)
 
 
-def are_related(first: Effect, second: Effect) -> bool:
+def are_related(effect: Effect, other_effect: Effect) -> bool:
     """Return whether one of two different effects is easily mistaken for the other."""
-    if first.identifier == second.identifier:
+    if effect.identifier == other_effect.identifier:
         return False
-    is_confusable = first.identifier in second.confusable or second.identifier in first.confusable
-    return is_confusable or first.family == second.family
+    is_confusable = (
+        effect.identifier in other_effect.confusable or other_effect.identifier in effect.confusable
+    )
+    return is_confusable or effect.family == other_effect.family
 
 
 # ---------------------------------------------------------------- starts from a screen
@@ -170,11 +172,16 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         readings.
     """
     best_by_effects: dict[tuple[str, str], ScreenedPair] = {}
-    for first, second in combinations(changes, 2):
-        effect_names = (first.term.effect.identifier, second.term.effect.identifier)
-        inner_product = float(first.vector * sign @ second.vector)
-        gram = np.array([[first.squared_size, inner_product], [inner_product, second.squared_size]])
-        overlap = np.array([first.overlap, second.overlap])
+    for first_change, second_change in combinations(changes, 2):
+        effect_names = (first_change.term.effect.identifier, second_change.term.effect.identifier)
+        inner_product = float(first_change.vector * sign @ second_change.vector)
+        gram = np.array(
+            [
+                [first_change.squared_size, inner_product],
+                [inner_product, second_change.squared_size],
+            ]
+        )
+        overlap = np.array([first_change.overlap, second_change.overlap])
         # no pair: the same effect twice, or two effects of parallel changes
         if effect_names[0] == effect_names[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
@@ -182,7 +189,7 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         best_scales = np.linalg.solve(gram, overlap)
         has_possible_sign = [
             factor >= 0.0 or change.term.may_be_negative
-            for factor, change in zip(best_scales, (first, second), strict=True)
+            for factor, change in zip(best_scales, (first_change, second_change), strict=True)
         ]
         misfit_change = -0.5 * float(overlap @ best_scales)
         is_best_of_effects = (
@@ -192,8 +199,8 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         if all(has_possible_sign) and is_best_of_effects:
             best_by_effects[effect_names] = ScreenedPair(
                 misfit_change,
-                _with_scale(first, best_scales[0]),
-                _with_scale(second, best_scales[1]),
+                _with_scale(first_change, best_scales[0]),
+                _with_scale(second_change, best_scales[1]),
             )
     return sorted(best_by_effects.values(), key=lambda pair: pair.misfit)
 
@@ -216,7 +223,7 @@ def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatA
     term : EffectTerm
         The effect at its place.
     values : (E,) array
-        Its scaled parameters.
+        The E parameters of the effect, on the scale on which their priors are standard normal.
     """
     effect = np.concatenate((base.effect, values))
     return FitStart(base.candidate.with_term(term), replace(base.point, effect=effect))
@@ -234,7 +241,7 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     base : CandidateFit
         The fit that the effect is added to.
     effect : Effect

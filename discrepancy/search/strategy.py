@@ -102,11 +102,13 @@ class Search(FittedCandidates):
         """
         effects = tuple(effects)
         setting = self.problem.setting
-        screened = effects
+        screened_effects = effects
         # with large residuals a screen is used only for errors of readings, which shift no phases
         if self._has_large_residuals(base):
-            screened = tuple(effect for effect in effects if not changes_structure(effect, setting))
-        fits = self._fit_from_screen(base, screened)
+            screened_effects = tuple(
+                effect for effect in effects if not changes_structure(effect, setting)
+            )
+        fits = self._fit_from_screen(base, screened_effects)
         # far from the truth: also from the best points of a grid
         is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
         if self._has_large_residuals(base) or (self._is_far_from_truth(base) and not is_explained):
@@ -237,7 +239,7 @@ class Search(FittedCandidates):
         ):
             fits: list[CandidateFit] = []
             for start in starts:
-                rough = try_fit(
+                rough_fit = try_fit(
                     self.problem,
                     start.candidate,
                     start.point,
@@ -245,12 +247,12 @@ class Search(FittedCandidates):
                     iterations=SEARCH.rough_fit_iterations,
                     objective_limit=objective_limit,
                 )
-                if rough is None:  # the effect is larger than the model allows
+                if rough_fit is None:  # the effect is larger than the model allows
                     continue
-                fits.append(rough)
+                fits.append(rough_fit)
                 # a fit whose objective is higher by more than this deficit cannot become the best
                 objective_limit = min(
-                    objective_limit, rough.objective + SEARCH.largest_rough_deficit
+                    objective_limit, rough_fit.objective + SEARCH.largest_rough_deficit
                 )
             if fits:
                 best_fits.append(max(fits, key=self.score))
@@ -258,24 +260,26 @@ class Search(FittedCandidates):
 
     # ---------------------------------------------------------------- exact fits
 
-    def fit_best_exactly(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
+    def fit_best_exactly(
+        self, rough_fits: Sequence[CandidateFit], floor_score: float
+    ) -> list[CandidateFit]:
         """Fit the best of some rough fits to convergence, and return them, the best first.
 
         Parameters
         ----------
-        rough : sequence of CandidateFit
+        rough_fits : sequence of CandidateFit
             The rough fits, the best first.
-        floor : float
+        floor_score : float
             The score below which no candidate is fitted to convergence.
         """
-        if not rough:
+        if not rough_fits:
             return []
-        best_score = self.score(rough[0])
+        best_score = self.score(rough_fits[0])
         # far from the truth, the scores after few steps are only roughly in order
-        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor))
-        least_score = max(best_score - margin, floor)
+        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor_score))
+        least_score = max(best_score - margin, floor_score)
         promising_fits = [
-            fit for fit in rough[: SEARCH.most_exact_fits] if self.score(fit) > least_score
+            fit for fit in rough_fits[: SEARCH.most_exact_fits] if self.score(fit) > least_score
         ]
         exact_fits = []
         for fit in report_each(
@@ -298,20 +302,21 @@ class Search(FittedCandidates):
             and time_step_error(problem, self.best()) > SEARCH.largest_step_error
         ):
             problem.refinement *= 2
-            ranked = sorted(self.exact_fits.values(), key=lambda fit: -self.score(fit))
-            for fit in ranked[: SEARCH.most_refitted]:
+            ranked_fits = sorted(self.exact_fits.values(), key=lambda fit: -self.score(fit))
+            for fit in ranked_fits[: SEARCH.most_refitted]:
                 if not fit.candidate.terms:
                     continue
-                finer = try_fit(problem, fit.candidate, fit.point)
-                if finer is not None:  # else the coarser fit stands
-                    self.exact_fits[fit.candidate.key] = finer
+                finer_fit = try_fit(problem, fit.candidate, fit.point)
+                if finer_fit is not None:  # else the coarser fit stands
+                    self.exact_fits[fit.candidate.key] = finer_fit
 
     # ---------------------------------------------------------------- the strategy
 
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
-        rough = self.fit_one_more_effect(self.no_effect, self.effects)
-        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.largest_single_deficit)
+        rough_fits = self.fit_one_more_effect(self.no_effect, self.effects)
+        floor_score = self.score(self.no_effect) - SEARCH.largest_single_deficit
+        self.fit_best_exactly(rough_fits, floor_score)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
@@ -342,16 +347,16 @@ class Search(FittedCandidates):
         self.rough_fits = {}
         self.force_hypotheses = rank_by_missing_force(force_search, self.effects, self.on_progress)
         # fit the most probable sets to the readings, each from its estimate by the missing force
-        eligible = []
+        eligible_hypotheses = []
         for hypothesis in self.force_hypotheses:
             candidate = hypothesis.candidate
             # a law of free shape together with another law could fit nearly anything
             is_family_in_set = candidate.has_free_shape and len(candidate.terms) > 1
             if candidate.terms and not is_family_in_set:
-                eligible.append(hypothesis)
+                eligible_hypotheses.append(hypothesis)
         probable_hypotheses = []
-        for hypothesis in eligible:
-            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.force_fit_range:
+        for hypothesis in eligible_hypotheses:
+            if self.score(hypothesis) > self.score(eligible_hypotheses[0]) - SEARCH.force_fit_range:
                 probable_hypotheses.append(hypothesis)
         for hypothesis in report_each(
             self.on_progress,
@@ -382,14 +387,14 @@ class Search(FittedCandidates):
         """
         if not self.is_unexplained() and not self.best().candidate.has_free_shape:
             return
-        singles = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
-        if not singles:
+        single_fits = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
+        if not single_fits:
             return
-        leading_fit = max(singles, key=self.score)
+        leading_fit = max(single_fits, key=self.score)
         if self._is_in_optimum_of_estimate(leading_fit):
             return
-        (leading,) = leading_fit.candidate.terms
-        for hypothesis in canonical_relatives(leading, self.force_hypotheses):
+        (leading_term,) = leading_fit.candidate.terms
+        for hypothesis in canonical_relatives(leading_term, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
             start = force_search.point_with_effects(hypothesis)
@@ -410,7 +415,7 @@ class Search(FittedCandidates):
         Parameters
         ----------
         fit : CandidateFit
-            The simulation.
+            The fit of the hypothesis by simulations.
         """
         if self._has_large_residuals(fit):
             return False
@@ -423,18 +428,21 @@ class Search(FittedCandidates):
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises."""
-        current = self.best()
-        while 0 < len(current.candidate.terms) < SEARCH.largest_set:
-            if len(current.candidate.terms) > 1 and self._is_far_from_truth(current):
+        current_fit = self.best()
+        while 0 < len(current_fit.candidate.terms) < SEARCH.largest_set:
+            if len(current_fit.candidate.terms) > 1 and self._is_far_from_truth(current_fit):
                 break  # a third effect is added only if two effects nearly explain the data
-            current_score = self.score(current)
-            present = {term.effect.identifier for term in current.candidate.terms}
-            others = [effect for effect in self.effects if effect.identifier not in present]
-            rough = self.fit_one_more_effect(current, others)
-            exact = self.fit_best_exactly(rough, current_score - SEARCH.largest_longer_set_deficit)
-            if not exact or self.score(exact[0]) <= current_score:
+            current_score = self.score(current_fit)
+            present_identifiers = {term.effect.identifier for term in current_fit.candidate.terms}
+            other_effects = [
+                effect for effect in self.effects if effect.identifier not in present_identifiers
+            ]
+            rough_fits = self.fit_one_more_effect(current_fit, other_effects)
+            floor_score = current_score - SEARCH.largest_longer_set_deficit
+            exact_fits = self.fit_best_exactly(rough_fits, floor_score)
+            if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
-            current = exact[0]
+            current_fit = exact_fits[0]
 
     def move_effects(self) -> None:
         """Fit the best set with one effect at another place, until the set explains the data.
@@ -442,18 +450,20 @@ class Search(FittedCandidates):
         Of each set, only the fit at one place is kept after few steps, and these may have chosen a
         wrong place.
         """
-        best = self.best()
-        while len(best.candidate.terms) > 1 and self.is_unexplained():
-            objective_limit = best.objective + SEARCH.largest_rough_deficit
-            for candidate in sets_at_other_places(best.candidate, self.problem.setting):
+        best_fit = self.best()
+        while len(best_fit.candidate.terms) > 1 and self.is_unexplained():
+            objective_limit = best_fit.objective + SEARCH.largest_rough_deficit
+            for candidate in sets_at_other_places(best_fit.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
-                fit = try_fit(self.problem, candidate, best.point, objective_limit=objective_limit)
+                fit = try_fit(
+                    self.problem, candidate, best_fit.point, objective_limit=objective_limit
+                )
                 if fit is not None:
                     self.record_fit(fit, exact=True)
-            if self.best() is best:
+            if self.best() is best_fit:
                 break
-            best = self.best()
+            best_fit = self.best()
 
     def drop_effects(self) -> None:
         """Drop one effect at a time from the best set, as long as the score rises.
@@ -461,20 +471,22 @@ class Search(FittedCandidates):
         An effect may have become superfluous: it was added before the right one was found, or while
         the right one was at a wrong place.
         """
-        best = self.best()
-        while len(best.candidate.terms) > 1:
-            objective_limit = best.objective + SEARCH.largest_rough_deficit
-            numbers = range(len(best.candidate.terms))
-            for dropped in numbers:
-                remaining = [number for number in numbers if number != dropped]
-                candidate, effect = best.candidate.subset_of_terms(remaining, best.effect)
-                start = replace(best.point, effect=effect)
+        best_fit = self.best()
+        while len(best_fit.candidate.terms) > 1:
+            objective_limit = best_fit.objective + SEARCH.largest_rough_deficit
+            numbers = range(len(best_fit.candidate.terms))
+            for dropped_number in numbers:
+                remaining_numbers = [number for number in numbers if number != dropped_number]
+                candidate, effect = best_fit.candidate.subset_of_terms(
+                    remaining_numbers, best_fit.effect
+                )
+                start = replace(best_fit.point, effect=effect)
                 fit = try_fit(self.problem, candidate, start, objective_limit=objective_limit)
                 if fit is not None:
                     self.record_fit(fit, exact=True)
-            if self.best() is best:
+            if self.best() is best_fit:
                 break
-            best = self.best()
+            best_fit = self.best()
 
     def fit_free_shapes(self) -> None:
         """Fit the best single effects with free shapes, and record those that explain the data.
@@ -545,8 +557,8 @@ class Search(FittedCandidates):
             values = np.concatenate((pair.first.best_values, pair.second.best_values))
             start = FitStart(candidate, replace(self.no_effect.point, effect=values))
             starts_by_pair.append([start])
-        rough = self._fit_from_starts(starts_by_pair, self.no_effect, 0.0)
-        for fit in rough:
+        rough_fits = self._fit_from_starts(starts_by_pair, self.no_effect, 0.0)
+        for fit in rough_fits:
             self.record_fit(fit, exact=False)
-        rough.sort(key=lambda fit: -self.score(fit))
-        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.exact_fit_range)
+        rough_fits.sort(key=lambda fit: -self.score(fit))
+        self.fit_best_exactly(rough_fits, self.score(self.best()) - SEARCH.exact_fit_range)

@@ -35,7 +35,7 @@ def search(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     effects : sequence of Effect
         The catalogue. Effects that cannot act in the campaign are left out. If an event of the
         campaign may have begun or ended an effect, the effect is also tried in that form.
@@ -56,8 +56,11 @@ def search(
     no_effect = refit_from_first_readings(
         problem, no_effect, iterations=SEARCH.no_effect_iterations
     )
-    usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
-    usable_effects = (*usable, *variants_in_events(tuple(usable), problem.setting))
+    usable_catalogue = [effect for effect in effects if effect.unavailable(problem.setting) is None]
+    usable_effects = (
+        *usable_catalogue,
+        *variants_in_events(tuple(usable_catalogue), problem.setting),
+    )
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
     _, own_laws = problem.model.without_laws()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():

@@ -21,7 +21,7 @@ import numpy as np
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import CandidateKey, ResidualProcess
-from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.fitting import MOST_FIT_STEPS, CandidateFit, try_fit
 from discrepancy.fits.gates import ResidualRecord, residual_records, whiteness_p_value
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
@@ -70,7 +70,7 @@ def estimate_residual_process(problem: Problem, fit: CandidateFit) -> ResidualPr
     problem : Problem
         The campaign and model under the recorded noise.
     fit : CandidateFit
-        The fit.
+        The fit of a hypothesis to all trials.
     """
     noise_levels = unrecorded_noise_levels(problem, fit)
     channels = []
@@ -95,7 +95,7 @@ def _channel_process(
     problem : Problem
         The campaign and model under the recorded noise.
     fit : CandidateFit
-        The fit.
+        The fit of a hypothesis to all trials.
     channel : int
         The index of the channel.
     noise_level : float
@@ -176,7 +176,7 @@ def _add_correlation_in_time(
     white_variance : (K,) array
         The variance that each estimate in `autocorrelation` would have for white residuals.
     interval : float
-        The sampling interval [s].
+        The interval between successive samples [s].
     """
     # White noise adds to the variance of the residuals, but not to their correlation. So the
     # correlation of the process is larger by the ratio of the variances.
@@ -260,13 +260,13 @@ def _recorded_colour(
     Parameters
     ----------
     problem : Problem
-        The campaign and model.
+        The campaign and the model, with the layout of their unknowns.
     name : str
         The name of the channel.
     records : sequence of ResidualRecord
         The residuals of the channel.
     interval : float
-        Their sampling interval [s].
+        The interval between successive samples [s].
     """
     unknown_colour = _RecordedColour(np.nan, 0.0, 1.0)
     record = problem.campaign.channels[name].noise
@@ -316,7 +316,7 @@ def with_wide_noise(problem: Problem, process: ResidualProcess) -> Problem:
 
 
 def refit_under_wide_noise(
-    problem: Problem, wide_problem: Problem, fit: CandidateFit, *, iterations: int = 60
+    problem: Problem, wide_problem: Problem, fit: CandidateFit, *, iterations: int = MOST_FIT_STEPS
 ) -> CandidateFit | None:
     """Return the fit of a hypothesis under a wider noise.
 
@@ -410,7 +410,7 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
 
 
 def _fit_under_wide_noise(
-    search: Search, wide_problem: Problem, chosen: Sequence[CandidateFit]
+    search: Search, wide_problem: Problem, fits: Sequence[CandidateFit]
 ) -> dict[CandidateKey, CandidateFit]:
     """Return the most promising hypotheses fitted under a wider noise.
 
@@ -420,14 +420,14 @@ def _fit_under_wide_noise(
         The search whose hypotheses they are.
     wide_problem : Problem
         The problem under the wider noise.
-    chosen : sequence of CandidateFit
+    fits : sequence of CandidateFit
         The fits to choose from.
     """
     # choose by the expected score under the wider noise
-    fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
+    fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in fits]
     fits_with_scores.sort(key=lambda fit_and_score: fit_and_score[1], reverse=True)
     least_score = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
-    promising = [
+    promising_fits = [
         fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least_score
     ]
     # fit the model without effect, and the chosen hypotheses
@@ -435,7 +435,7 @@ def _fit_under_wide_noise(
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in report_each(
         search.on_progress,
-        promising,
+        promising_fits,
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
         _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))

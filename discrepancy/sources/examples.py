@@ -50,17 +50,17 @@ class ExamplePlan:
     channels : tuple of Channel
         Channels, with the noise of their sensors; with ring-downs their noise records hold samples.
     force : float
-        Largest static force [N].
+        The largest static force [N].
     release : float
-        Largest release displacement [m].
+        The largest displacement before a release [m].
     load_factors : tuple of float
-        Load factors of the flights [1].
+        The load factors of the flights [1].
     duration, interval : float
-        Duration and sampling interval of a ring-down [s].
+        The duration and sampling interval of a ring-down [s].
     load_place : str or tuple of float
-        Point at which the force acts.
+        The point at which the force acts.
     flight_channels : tuple of str
-        Names of the channels that flights measure; all if empty.
+        The names of the channels that flights measure; all if empty.
     """
 
     channels: tuple[Channel, ...]
@@ -88,7 +88,7 @@ def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
     Parameters
     ----------
     gauges : tuple of int
-        Numbers of the gauges, from 1.
+        The numbers of the gauges, from 1.
     """
     channels = []
     for number in gauges:
@@ -145,13 +145,13 @@ def plan_from_scales(
     Parameters
     ----------
     model : Model
-        The model.
+        The model that predicts the readings.
     outputs : tuple of str
-        Outputs that are measured, each by a channel of the same name.
+        The outputs that are measured, each by a channel of the same name.
     load_place : str or tuple of float
-        Point at which the force acts.
+        The point at which the force acts.
     largest_force : float
-        Largest force that the model can take [N]; it may limit the motion.
+        The largest force that the model can take [N]; it may limit the motion.
 
     Raises
     ------
@@ -228,11 +228,11 @@ def example_campaign(
     kind : str
         "static", "ringdown", "flight", "laboratory" or "complete".
     seed : int
-        Entropy of the `SeedSequence`.
+        The entropy of the `SeedSequence` from which all random draws come.
     plan : ExamplePlan, optional
         What is measured; `wing_plan()` by default.
     patch : ModelPatch, optional
-        Effects that the structure has and the model lacks; none by default.
+        The effects that the structure has and the model lacks; none by default.
 
     Raises
     ------
@@ -249,8 +249,10 @@ def example_campaign(
         patch = ModelPatch()
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     kinds = _KINDS[kind]
-    measured = {name for trial_kind in kinds for name in plan.names(trial_kind)}
-    channels = {channel.name: channel for channel in plan.channels if channel.name in measured}
+    measured_channels = {name for trial_kind in kinds for name in plan.names(trial_kind)}
+    channels = {
+        channel.name: channel for channel in plan.channels if channel.name in measured_channels
+    }
     gains = {}
     for name, channel in channels.items():
         gains[name] = 1.0 + _finite_or_zero(channel.gain_deviation) * generator.normal()
@@ -274,11 +276,11 @@ def _with_samples_at_rest(
     Parameters
     ----------
     channel : Channel
-        The channel.
+        The channel with its quantity and noise record.
     plan : ExamplePlan
         The plan, for the sampling interval.
     generator : Generator
-        Source of the noise.
+        The source of the random noise.
     """
     if channel.noise is None:
         return channel
@@ -389,7 +391,7 @@ def _simulate_readings(
     gains: Mapping[str, float],
     generator: np.random.Generator,
 ) -> Trial:
-    """Return a trial with simulated readings.
+    """Return a trial whose readings are simulated by the model, with noise.
 
     Parameters
     ----------
@@ -398,11 +400,11 @@ def _simulate_readings(
     campaign : Campaign
         The campaign with its channels.
     trial : Trial
-        The trial without readings.
+        The trial, whose readings are still empty.
     gains : mapping of str to float
-        Gain of each channel.
+        The gain of each channel, by its name.
     generator : Generator
-        Source of the errors of release and zeros, and of noise.
+        The source of the errors of release and zeros, and of noise.
     """
     conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:

@@ -67,11 +67,11 @@ def run_campaign(
     Parameters
     ----------
     folder : path
-        Folder that `uav-twin run --out` leaves.
+        The folder that `uav-twin run --out` leaves.
     first_step, last_step : int, optional
-        Steps that are read; by default from the first of the flight to its last.
+        The steps that are read; by default from the first of the flight to its last.
     held_out_share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
 
     Returns
     -------
@@ -147,39 +147,39 @@ def _build_campaign(
     Parameters
     ----------
     folder : path
-        The run folder.
+        The folder of the run.
     run : DataTree
-        Content of `run.nc`.
+        The content of `run.nc`.
     scenario : dict
-        Content of the scenario.
+        The content of the scenario file.
     steps : slice
-        Labels of the steps.
+        The labels of the first and the last step.
     held_out_share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
     """
-    observed = run["observed"].to_dataset().sel(step=steps)
-    count = observed.sizes["step"]
+    observed_steps = run["observed"].to_dataset().sel(step=steps)
+    count = observed_steps.sizes["step"]
     if not count:
         raise CampaignDataError(_no_steps_message(folder, run, steps))
-    strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
-    used = np.isfinite(strain)
-    if not used.any():
+    strain = np.asarray(observed_steps[STRAIN].values, dtype=np.float64)
+    is_used = np.isfinite(strain)
+    if not is_used.any():
         raise CampaignDataError(
             f"No strain reached the twin in {folder}: there is nothing to compare."
         )
     noise, source_of_noise = _strain_noise(scenario)
-    channels = _strain_channels(observed["sensor"].values.tolist(), noise)
+    channels = _strain_channels(observed_steps["sensor"].values.tolist(), noise)
     temperature = _temperature_rises(run, steps)
     health_estimate = run["smoothed"].to_dataset().sel(step=steps)
     flight = records.Trial.plain(
         "steps",
         records.TrialKind.FLIGHT,
         tuple(channels),
-        _end_times(folder, observed["step"].values),
-        values=np.where(used, strain, 0.0),
-        used=used,
+        _end_times(folder, observed_steps["step"].values),
+        values=np.where(is_used, strain, 0.0),
+        used=is_used,
         temperature=np.zeros(count) if temperature is None else temperature,
-        load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
+        load_factor=np.asarray(observed_steps["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")),
         health=np.asarray(health_estimate["mean"].values, dtype=float),
         health_deviation=np.maximum(health_estimate["standard_deviation"].values, HEALTH_DEVIATION),
@@ -188,7 +188,7 @@ def _build_campaign(
     trials = [flight.rows(~is_held_out)]
     if is_held_out.any():
         trials.append(flight.rows(is_held_out, name="steps held out", held_out=True))
-    remarks = _flight_remarks(used, noise, source_of_noise)
+    remarks = _flight_remarks(is_used, noise, source_of_noise)
     return records.Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
@@ -213,40 +213,40 @@ def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, re
     return channels
 
 
-def _flight_remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
-    """Return the remarks on a flight.
+def _flight_remarks(is_used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
+    """Return the remarks on a flight: its length, its noise, and its lost readings.
 
     Parameters
     ----------
-    used : (N, C) ndarray of bool
+    is_used : (N, C) ndarray of bool
         False for readings of N steps that were lost.
     noise : float
-        Standard deviation of a gauge's noise [1].
+        The standard deviation of a gauge's noise [1].
     source_of_noise : str
         Where it is stated, as a phrase.
     """
     remarks = [
-        f"Flight of {counted(len(used), 'step')} read from a run folder; health in each step: "
+        f"Flight of {counted(len(is_used), 'step')} read from a run folder; health in each step: "
         f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
         f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source_of_noise}.",
     ]
-    lost = int(used.size - used.sum())
+    lost = int(is_used.size - is_used.sum())
     if lost:
         was = "was" if lost == 1 else "were"
-        remarks.append(f"{lost} of {used.size} readings {was} lost.")
+        remarks.append(f"{lost} of {is_used.size} readings {was} lost.")
     return tuple(remarks)
 
 
 def _no_steps_message(folder: Path, run: xr.DataTree, steps: slice) -> str:
     """Return the message that a run has none of the requested steps."""
     flown_steps = np.asarray(run["observed"]["step"].values).tolist()
-    flown = f"{flown_steps[0]} to {flown_steps[-1]}" if flown_steps else "none"
+    flown_text = f"{flown_steps[0]} to {flown_steps[-1]}" if flown_steps else "none"
     ends = []
     if steps.start is not None:
         ends.append(f"from {steps.start} on")
     if steps.stop is not None:
         ends.append(f"up to {steps.stop}")
-    return f"{folder.name} has the steps {flown}, and none {', '.join(ends)}."
+    return f"{folder.name} has the steps {flown_text}, and none {', '.join(ends)}."
 
 
 def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
@@ -258,16 +258,16 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     Parameters
     ----------
     folder : path
-        The run folder.
+        The folder of the run.
 
     Returns
     -------
     model : WingModel
-        The patched model.
+        The model of the wing with the patch.
     wing_file : Path
-        File of its calibration or design.
+        The file of its calibration or design.
     patch_file : Path or None
-        File of its patch, if there is one.
+        The file of its patch, if there is one.
 
     Raises
     ------
@@ -322,11 +322,11 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     Parameters
     ----------
     count : int
-        Number of steps.
+        The number of steps.
     block : int
-        Number of steps in a block.
+        The number of steps in a block.
     share : float
-        Fraction of the steps that is held out.
+        The fraction of the steps that is held out.
 
     Returns
     -------
@@ -389,8 +389,8 @@ def _end_times(folder: Path, steps: records.FloatArray) -> records.FloatArray:
         with CampaignFileError.instead_of(
             FmuError, before="The binding of the run cannot be read: "
         ):
-            bound = load_binding(path)
-        start, interval = bound.binding.start_time, bound.interval
+            loaded_binding = load_binding(path)
+        start, interval = loaded_binding.binding.start_time, loaded_binding.interval
     return np.asarray(start + interval * (steps + 1.0))
 
 

@@ -46,11 +46,11 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) ->
     Parameters
     ----------
     rig : str
-        One of `RIGS`.
+        The name of the rig, one of `RIGS`.
     data : Path
-        Folder of the published records.
+        The folder of the published records.
     folder : Path
-        Folder of the campaign.
+        The folder of the campaign.
     **options
         Options of the function in `RIGS`.
 
@@ -92,13 +92,13 @@ def _read_numbers(
     Parameters
     ----------
     file : Path
-        The table.
+        The path of the table.
     columns : sequence of str
-        Names of the columns, in order; an increasing "time" first if there is one.
+        The names of the columns, in order; an increasing "time" first if there is one.
     separator : str or None
-        Character between cells; None for blanks.
+        The character between cells; None for blanks.
     skipped : int
-        Lines before the numbers.
+        The number of lines before the first line of numbers.
 
     Raises
     ------
@@ -151,8 +151,8 @@ def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
             f"{file} holds no fall: its column z never stays below {LARGEST_FALLING_READING:g} "
             "m/s2."
         )
-    longest = int(np.argmax(ends - begins))
-    in_fall = slice(begins[longest], ends[longest])
+    longest_run = int(np.argmax(ends - begins))
+    in_fall = slice(begins[longest_run], ends[longest_run])
     time, acceleration = columns["time"][in_fall], columns["z"][in_fall]
     is_inside = (time >= time[0] + END_CUT) & (time <= time[-1] - END_CUT)
     return np.round(time[is_inside] - time[0], 9), acceleration[is_inside]
@@ -232,12 +232,12 @@ def _group_means(samples: FloatArray, averaged: int) -> FloatArray:
     samples : (N, C) ndarray
         Samples; an incomplete group at the end is dropped.
     averaged : int
-        Number of samples in a group.
+        The number of samples in a group.
 
     Returns
     -------
     (N // averaged, C) ndarray
-        Mean of each group.
+        The mean of each group.
     """
     count = len(samples) // averaged * averaged
     groups = samples[:count].reshape(-1, averaged, samples.shape[1])

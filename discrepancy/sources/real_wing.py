@@ -25,7 +25,7 @@ class PlotWindow(NamedTuple):
     time : (N,) ndarray
         Times since the first sample [s].
     signal : (N,) ndarray
-        Strain signal [V].
+        The signal of the strain gauge [V].
     """
 
     time: FloatArray
@@ -77,7 +77,7 @@ def real_wing(
     data : Path
         The authors' calibration folder, with `step2` and `step3`.
     begin : float
-        Start of the window after the release [s].
+        The start of the window after the release [s].
     columns : int
         Columns of the plot that are averaged into one sample.
     detrended : bool
@@ -198,7 +198,7 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
     Parameters
     ----------
     windows : sequence of PlotWindow
-        The trials.
+        The windows of the recording that become trials.
 
     Returns
     -------
@@ -244,9 +244,9 @@ def _plot_window(
     record : RingDownRecord
         The record, with a value for each column of the plot.
     zero : (N,) ndarray
-        Slow zero that is subtracted [V]; nan where it is not known.
+        The slow zero that is subtracted [V]; nan where it is not known.
     begin : float
-        Start of the window after the release [s].
+        The start of the window after the release [s].
     columns : int
         Columns that are averaged into one sample.
 

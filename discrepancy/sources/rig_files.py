@@ -11,9 +11,9 @@ class RigFiles(NamedTuple):
     Attributes
     ----------
     tables : dict of str to str
-        Texts of the tables by the names of their files.
+        The texts of the tables by the names of their files.
     campaign_keys : dict
-        Keys of `campaign.toml` in addition to the shipped ones: trials, channels and remarks.
+        The keys of `campaign.toml` in addition to the shipped ones: trials, channels and remarks.
     """
 
     tables: dict[str, str]

@@ -19,7 +19,7 @@ class Load(NamedTuple):
     direction : (N,) ndarray
         The load on the unknowns for a value of one.
     history : LoadHistory
-        Its values over time.
+        The values of the load over time.
     derivative : int
         How many times the history is differentiated in time.
     """
@@ -29,7 +29,7 @@ class Load(NamedTuple):
     derivative: int = 0
 
     def values_at(self, time: FloatArray) -> FloatArray:
-        """Return the values (T,) at times [s]."""
+        """Return the values (T,) of the load at T times [s]."""
         return self.history.values_at(time, self.derivative)
 
 
@@ -72,13 +72,13 @@ class Excitation:
     Attributes
     ----------
     time : (N,) ndarray
-        Stamps of the inputs [s].
+        The stamps of the inputs [s].
     sample_times : (S,) ndarray
         Times at which the samples show the motion [s].
     loads : sequence of Load
-        The forces and flows.
+        The forces and flows that act on the system.
     prescribed_motions : mapping of str to RecordedHistory
-        Prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
+        The prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
     begins : Start
         How the motion begins, unless it is a release.
     initial : (L,) or (R, 2) ndarray
@@ -125,7 +125,7 @@ class Excitation:
         Parameters
         ----------
         time : (T,) array
-            Times [s].
+            The times of the samples [s].
         basis : (N, B) array
             Columns that the loads are multiplied by: shapes, or the identity.
 

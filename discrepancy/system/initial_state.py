@@ -35,11 +35,11 @@ def state_at_first_stamp(
     Parameters
     ----------
     system : LinearSystem
-        The system that moves.
+        The linear system whose motion is computed.
     excitation : Excitation
         Its loads, prescribed motions and release.
     laws : PortLaws
-        Internal forces.
+        The laws of the internal forces at ports.
 
     Raises
     ------
@@ -58,10 +58,10 @@ def state_at_first_stamp(
     memory = None
     if excitation.begins is Start.UNKNOWN:
         # in this order: displacements of the modes, their speeds, states (the other speeds)
-        initial = np.zeros(mode_count + displacement_mode_count)
-        initial[: len(excitation.initial)] = excitation.initial[: len(initial)]
-        q[:displacement_mode_count] = initial[:displacement_mode_count]
-        v[:mode_count] = initial[displacement_mode_count:]
+        initial_state = np.zeros(mode_count + displacement_mode_count)
+        initial_state[: len(excitation.initial)] = excitation.initial[: len(initial_state)]
+        q[:displacement_mode_count] = initial_state[:displacement_mode_count]
+        v[:mode_count] = initial_state[displacement_mode_count:]
     else:
         largest_speeds = [
             np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
@@ -106,13 +106,13 @@ def released_state(
     Parameters
     ----------
     system : LinearSystem
-        The system that moves.
+        The linear system whose motion is computed.
     excitation : Excitation
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
     laws : PortLaws
-        Internal forces.
+        The laws of the internal forces at ports.
 
     Raises
     ------
@@ -163,12 +163,12 @@ def _held_state(
     system, point, laws
         The structure, its release point and its internal forces.
     displacements : (M,) array
-        Deviations from the static shape by mode, in units of the release displacement; the first
-        entry is the deviation of the whole shape.
+        The deviations from the static shape by mode, in units of the release displacement; the
+        first entry is the deviation of the whole shape.
     unit_amplitudes : (M,) array
-        Modal amplitudes of the release displacement.
+        The modal amplitudes of the release displacement.
     load : (1, n) array
-        Sum of the other loads [N].
+        The sum of the other loads [N].
     """
     row = point.row
     unit_force_displacement = system.apply_flexibility(row)

@@ -39,27 +39,28 @@ class Model(ABC):
     Attributes
     ----------
     name : str
-        Name for people.
+        The name of the model in messages and reports.
     parameters : tuple of ParameterPrior
         Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
         The physical quantity of each output, by name.
     ports : tuple of str
-        Names of the ports where internal forces can act on one motion; user effects act at these.
+        The names of the ports where internal forces can act on one motion; user effects act at
+        these.
     length : float or None
         Characteristic length [m], if it has any.
     stations : tuple of float, optional
         Least and largest station [m] along the structure, if it has a length.
     patch : ModelPatch
-        Primitives that act in every response: a known addition, or an effect that was found.
+        The primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
         Damage regions.
     largest_losses : mapping of str to float
         Largest stiffness loss of each damage region that the model can have.
     kinds : frozenset of TrialKind
-        Kinds of trials that it can simulate.
+        The kinds of trials that it can simulate.
     load_places : tuple of str, optional
-        Names of the places where forces can act; None: anywhere along the structure.
+        The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
         Largest force at these places that is well within the model's range [N].
     holds_inputs : bool
@@ -130,9 +131,9 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Inputs and sample times.
+            The trial, of which only the inputs and the sample times are used.
         outputs : tuple of (str, Quantity)
-            Outputs that the model has, and the quantity wanted of each.
+            The outputs that the model has, and the quantity wanted of each.
         patch : ModelPatch
             All primitives that act, those of the model too.
         conditions : Conditions
@@ -151,7 +152,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            A dynamic trial.
+            The dynamic trial.
         conditions : Conditions
             Parameters, initial state, clock and health.
         parts : int
@@ -221,17 +222,17 @@ class Model(ABC):
 
     def check_outputs(self, outputs: Outputs) -> None:
         """Refuse outputs that do not exist, or that a channel of its quantity cannot measure."""
-        for output, measured in outputs:
+        for output, measured_kind in outputs:
             quantity = self.output_quantity(output)
             if quantity is None:
                 raise ModelError(
                     f"{capital(self.quoted_name)} has no output {output!r}; it has "
                     f"{', '.join(self.outputs_with_quantities)}."
                 )
-            if not measured.can_measure(quantity):
+            if not measured_kind.can_measure(quantity):
                 raise ModelError(
                     f"The output {output!r} of {self.quoted_name} is a {quantity.value}, but a "
-                    f"channel measures {measured.value}."
+                    f"channel measures {measured_kind.value}."
                 )
 
     def _check_primitives(self, patch: ModelPatch) -> None:
@@ -254,7 +255,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Trial that names regions.
+            The trial, which names the regions of its losses.
         health : (N, K) array
             Losses of these regions that the campaign states.
         patch : ModelPatch
@@ -298,7 +299,7 @@ class Model(ABC):
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and standard deviation of each parameter.
 
-        They are those of the campaign; the model's, if the campaign does not state them.
+        The campaign states them; if it does not, they are those of the model.
         """
         campaign_parameters = campaign.parameters
         return [
@@ -340,11 +341,11 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            Inputs and sample times.
+            The trial, of which only the inputs and the sample times are used.
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         patch : ModelPatch
-            Primitives that act in addition to those of the model.
+            The primitives that act in addition to those of the model.
         conditions : Conditions
             Parameters, initial state, clock and health.
 
@@ -385,7 +386,7 @@ class Model(ABC):
         Parameters
         ----------
         trial : Trial
-            A dynamic trial.
+            The dynamic trial.
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         parameters : (P,) array
@@ -421,8 +422,8 @@ class Model(ABC):
         Parameters
         ----------
         patch : ModelPatch
-            Its sensors name channels of a campaign, or outputs of the model; they come before those
-            of a response's patch.
+            The change of the model. Its errors of sensors name channels of a campaign or outputs of
+            the model, and come before the errors of sensors in the patch of a response.
         calibrated : mapping of str to (float, float)
             Means and standard deviations of the parameters that differ from those of the model.
         """

@@ -40,9 +40,9 @@ class Modes(NamedTuple):
     angular_frequency : (M,) ndarray
         Angular frequencies [rad/s], rising; zero for rigid motions and states.
     shapes : (N, M) ndarray
-        Mass-normalised shapes.
+        The mass-normalised shapes of M modes, in N degrees of freedom.
     displacement_count : int
-        Number of the coordinates that are displacements.
+        The number of the coordinates that are displacements.
     """
 
     angular_frequency: FloatArray
@@ -55,7 +55,7 @@ class ModalFrequencies(Protocol):
 
     @property
     def frequency(self) -> FloatArray:
-        """Frequencies (M,) [Hz]."""
+        """The natural frequencies (M,) of the M modes [Hz]."""
 
 
 class SolvedStructure(Protocol):
@@ -63,11 +63,11 @@ class SolvedStructure(Protocol):
 
     @property
     def modes(self) -> ModalFrequencies:
-        """Modes with inertia."""
+        """The natural frequencies of the modes that have inertia."""
 
     @property
     def mode_shapes(self) -> FloatArray:
-        """Mass-normalised shapes (n, M) of these modes."""
+        """The mass-normalised shapes (n, M) of the M modes with inertia."""
 
     def static(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (n,) or (n, k)."""
@@ -81,7 +81,7 @@ class StaticPath(NamedTuple):
     values : (L, N) or (L, C) ndarray
         Displacements and states at each level, or rows times these.
     memory : ndarray, optional
-        Memory of the laws at the last level; None without laws.
+        The memory of the laws at the last level; None without laws.
     """
 
     values: FloatArray
@@ -110,17 +110,17 @@ class LinearSystem:
         modes that have inertia; the other modes follow without it. None: all modes have inertia,
         and nothing need hold the system.
     relaxation : float
-        Factor of the part of the damping that is proportional to the stiffness, for the modes
+        The factor of the part of the damping that is proportional to the stiffness, for the modes
         without inertia [s].
     on_modes : frozenset of str
         Ports whose position is that of the modes with inertia alone.
     state_count : int
-        Number of states, N - n.
+        The number of states, N - n.
     drives : (P, N) ndarray
         Rows that are prescribed: each of displacements alone, whose motion is prescribed, or of
         states alone.
     actions : mapping of str to (N,) ndarray
-        Directions in which laws at ports act, for all ports; empty if they are the rows of the
+        The directions in which laws at ports act, for all ports; empty if they are the rows of the
         ports.
     solved : SolvedStructure, optional
         The structure with its modes and K^-1, if they are known.
@@ -140,12 +140,12 @@ class LinearSystem:
 
     @property
     def unknown_count(self) -> int:
-        """Number N of unknowns."""
+        """The number N of unknowns: displacements, then states of first order."""
         return len(self.mass)
 
     @property
     def displacement_count(self) -> int:
-        """Number n of displacements."""
+        """The number n of the unknowns that are displacements."""
         return self.unknown_count - self.state_count
 
     @property
@@ -212,9 +212,9 @@ class LinearSystem:
         Returns
         -------
         squares : (K,) ndarray
-            Squared angular frequencies [1/s^2].
+            The squared angular frequencies of the K modes [1/s^2].
         shapes : (n, K) ndarray
-            Mode shapes with a modal mass of 1.
+            The mode shapes with a modal mass of 1.
         """
         n = self.displacement_count
         mass = self.mass[:n, :n]
@@ -256,7 +256,7 @@ class LinearSystem:
 
     @property
     def shapes(self) -> FloatArray:
-        """Mass-normalised shapes (N, M) of the modes."""
+        """The mass-normalised shapes (N, M) of the M modes in N unknowns."""
         return self.modes.shapes
 
     @property
@@ -327,7 +327,7 @@ class LinearSystem:
 
         Drives accelerate the modes by inertia: with u = modes + shapes of drives times a(t), the
         mass times these shapes and the accelerations goes to the right-hand side. The force on a
-        drive is the one that gives it the prescribed acceleration.
+        drive is the force that gives the drive its prescribed acceleration.
         """
         forces = excitation.loads_at(time, self.shapes_with_drives)
         if excitation.prescribed_motions:
@@ -347,7 +347,7 @@ class LinearSystem:
 
     @cached_property
     def _inverse_cholesky(self) -> FloatArray:
-        """L^-1 of the stiffness L L^T."""
+        """The inverse L^-1 of the Cholesky factor of the stiffness K = L L^T."""
         try:
             return np.linalg.inv(np.linalg.cholesky(self.stiffness))
         except np.linalg.LinAlgError as cause:
@@ -436,12 +436,12 @@ class LinearSystem:
         levels : (L, k) array, optional
             The value of each load at each level; by default each load is a level of its own.
         memory, previous_level : arrays, optional
-            Memory of the laws at the end of an earlier path, and the values (k,) of the loads
+            The memory of the laws at the end of an earlier path, and the values (k,) of the loads
             there; by default the laws were never loaded.
         offset : (N,) array, optional
-            Displacements that drives prescribe, which are added to those under the loads.
+            The displacements that drives prescribe, which are added to those under the loads.
         fixed_row : (N,) array, optional
-            Row of a point that is held, so that the forces of laws do not move it.
+            The row of a point that is held, so that the forces of laws do not move it.
         output_rows : (C, N) array, optional
             Rows whose values are returned instead of displacements and states.
         time : float, optional

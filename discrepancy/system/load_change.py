@@ -50,17 +50,17 @@ class LoadChange(NamedTuple):
                 )
         return change
 
-    def apply_to(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
+    def apply_to(self, values: FloatArray, recorded_values: FloatArray) -> FloatArray:
         """Return the acting load (N,) [N or N m].
 
         Parameters
         ----------
         values : (N,) array
             The recorded values, plus a constant offset of the recorder if one is fitted.
-        recorded : (N,) array
+        recorded_values : (N,) array
             The recorded values themselves; a sample that is zero gets no tare.
         """
-        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
+        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded_values != 0.0))
 
 
 def choose_load_place(

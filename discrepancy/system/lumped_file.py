@@ -242,7 +242,7 @@ class LumpedDescription(ModelDescription):
     # ------------------------------------------------------------ faults of a file
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the rules on several tables of the file together, each with its message."""
+        """Yield the rules that concern several tables of the file, each with its message."""
         yield from self._missing_matrix_faults()
         yield from self._name_faults()
         yield from self._vanishing_matrix_faults()
@@ -324,22 +324,22 @@ class LumpedDescription(ModelDescription):
         The mass and the capacity must be positive definite, and the stiffness too unless the file
         states a free structure. The parts that the parameter does not scale must be so alone.
         """
-        needed = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
+        needed_kinds = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
         for parameter in self.parameter:
             if parameter.low > 0.0:
                 continue
-            for kind in needed:
+            for kind in needed_kinds:
                 matrices = self.matrices_of(kind)
                 scales_all = kind in parameter.terms
                 unscaled = [
                     value for name, value in matrices.items() if name not in parameter.terms
                 ]
                 scales_some = scales_all or len(unscaled) < len(matrices)
-                remains = (
+                remains_nonzero = (
                     bool(unscaled) and not scales_all and _is_definite(np.sum(unscaled, axis=0))
                 )
                 yield (
-                    scales_some and not remains,
+                    scales_some and not remains_nonzero,
                     f"the parameter {parameter.name!r} has low = 0, which would leave no {kind} at "
                     "some unknown: give a low above 0",
                 )

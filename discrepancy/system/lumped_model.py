@@ -42,7 +42,7 @@ class LumpedModel(DescribedModel, SystemModel):
     Parameters
     ----------
     description : LumpedDescription
-        Content of its file.
+        The content of the model file.
     """
 
     follows_windows: ClassVar[bool] = True
@@ -116,7 +116,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
     def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws that the model itself has at ports, each times its factor."""
+        """Return the laws that the model itself has at ports, multiplied by their factors."""
         if self.linear:
             return NO_PATCH
         factors = self._term_factors(parameters.tolist())
@@ -202,19 +202,21 @@ class LumpedModel(DescribedModel, SystemModel):
     def _offset_inputs(self, case: PatchedTrial) -> dict[str, OffsetInput]:
         """Return the recorded inputs of a trial, or its force at its load place, by name."""
         trial = case.trial
-        recorded = trial.inputs
+        recorded_inputs = trial.inputs
         if trial.kind is not TrialKind.DRIVEN:
             section = self._input_at(trial.load_place)
-            recorded = (RecordedInput(section.name, section.quantity, trial.force, trial.hold),)
+            recorded_inputs = (
+                RecordedInput(section.name, section.quantity, trial.force, trial.hold),
+            )
         # the conditions may state no offsets: those that are missing are zero
-        missing_offsets = (0.0,) * len(recorded)
+        missing_offsets = (0.0,) * len(recorded_inputs)
         offsets = (*case.conditions.offset, *missing_offsets)
         offset_inputs = {}
-        for recorded_input, offset in zip(recorded, offsets, strict=False):
+        for recorded_input, offset in zip(recorded_inputs, offsets, strict=False):
             offset_inputs[recorded_input.name] = OffsetInput(recorded_input, offset)
         return offset_inputs
 
-    def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
+    def _section_of(self, trial: Trial, record: RecordedInput) -> InputSection:
         """Return the section [[input]] of the model for an input that a trial records.
 
         Raises
@@ -223,23 +225,23 @@ class LumpedModel(DescribedModel, SystemModel):
             If the model has no such input, or one of another quantity, or if a motion or state that
             is prescribed goes in steps or corners.
         """
-        section = self._inputs.get(recorded.name)
+        section = self._inputs.get(record.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {recorded.name!r}, which "
+                f"The trial {trial.name!r} records the input {record.name!r}, which "
                 f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
         motion_chain = section.quantity.motion_chain
-        if recorded.quantity is not section.quantity and recorded.quantity not in motion_chain:
+        if record.quantity is not section.quantity and record.quantity not in motion_chain:
             raise ModelError(
-                f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
-                f"but the trial {trial.name!r} records {recorded.quantity.value}."
+                f"The input {record.name!r} of {self.quoted_name} is {section.quantity.value}, "
+                f"but the trial {trial.name!r} records {record.quantity.value}."
             )
-        if section.is_prescribed and recorded.hold not in (None, Hold.SMOOTH):
+        if section.is_prescribed and record.hold not in (None, Hold.SMOOTH):
             prescribed = "state" if section.prescribes_state else "motion"
             raise ModelError(
-                f"The input {recorded.name!r} of the trial {trial.name!r} is a {prescribed} that "
-                f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
+                f"The input {record.name!r} of the trial {trial.name!r} is a {prescribed} "
+                f"that {self.name!r} prescribes, which no drive makes in steps or corners: leave "
                 "`reference` and `hold` out."
             )
         return section
@@ -322,7 +324,7 @@ class LumpedModel(DescribedModel, SystemModel):
     def _reaction_equation(
         self, section: OutputSection, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
-        """Return the equation of an output that is the force by which a motion is prescribed.
+        """Return the equation of an output that is the force that a prescribed motion needs.
 
         By the equation of motion along the drive it is K u + C u' + M u'' minus the loads, plus the
         forces of laws there.
@@ -363,8 +365,8 @@ class LumpedModel(DescribedModel, SystemModel):
             return EITHER
         units_by_unknown = self._units_by_unknown()
         units: set[tuple[str, str]] = set()
-        for unknown in np.flatnonzero(row).tolist():
-            units |= units_by_unknown.get(unknown, {MOVES, TURNS})
+        for unknown_index in np.flatnonzero(row).tolist():
+            units |= units_by_unknown.get(unknown_index, {MOVES, TURNS})
         return units.pop() if len(units) == 1 else EITHER
 
     def _units_of_state_port(self) -> tuple[str, str]:
@@ -483,8 +485,8 @@ def _prescribed_motion(
 
 def _load_history(trial: Trial, offset_input: OffsetInput, change: LoadChange) -> RecordedHistory:
     """Return a recorded load over time; to a force, the gain and tare of a patch are applied."""
-    recorded = offset_input.recorded
+    recorded_input = offset_input.recorded
     values = offset_input.values
-    if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):
-        values = change.apply_to(values, recorded.values)
-    return RecordedHistory(trial.time, values, recorded.hold)
+    if recorded_input.quantity in (Quantity.FORCE, Quantity.TORQUE):
+        values = change.apply_to(values, recorded_input.values)
+    return RecordedHistory(trial.time, values, recorded_input.hold)

@@ -66,7 +66,7 @@ class ModelDescription(Section):
 
     @classmethod
     def parse(cls, content: object, source: str = "the model") -> Self:
-        """Check the content of a file.
+        """Check the content of a model file, and return its description.
 
         Raises
         ------
@@ -94,9 +94,9 @@ class DescribedModel(Model):
     Parameters
     ----------
     description : ModelDescription
-        Content of the file.
+        The content of the file `modelDescription.xml`.
     quantities : mapping of str to Quantity
-        What each output is.
+        The physical quantity of each output, by its name.
     """
 
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:

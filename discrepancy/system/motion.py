@@ -40,24 +40,24 @@ class Motion:
     Attributes
     ----------
     system : LinearSystem
-        The system that moves.
+        The linear system whose motion is computed.
     excitation : Excitation
         Its loads, prescribed motions and release.
     laws : PortLaws
-        J internal forces.
+        The laws of the J internal forces at ports.
     time : (N,) ndarray
         Times of the motion since the release or the start of the record [s].
     q, velocity : (N, M + P) ndarray
         Modal coordinates and their rates, mass-normalised; the drives come last.
     port_forces : (N, J) ndarray
-        Internal forces.
+        The J internal forces at N samples.
     lagged_forces : (N, J) ndarray
         Internal forces after the first-order lag (time constant `system.relaxation`) with which the
         modes without inertia follow them.
     held_samples : int
-        Number of samples before the release, at which the structure is held in its shape.
+        The number of samples before the release, at which the structure is held in its shape.
     holding_force : (n,) ndarray, optional
-        Force that holds the release point until the release [N].
+        The force that holds the release point until the release [N].
     """
 
     system: LinearSystem
@@ -154,7 +154,7 @@ class Motion:
         Returns
         -------
         values, rates : (N, C) arrays
-            That part of each output, and its time derivative. The derivative of the third
+            This part of each output, and its time derivative. The derivative of the third
             derivative of the coordinates is left out of the rates.
         """
         rows_by_derivative = rows_in_coordinates(equations, self.system.shapes_with_drives)
@@ -185,11 +185,11 @@ def simulate_motion(
     Parameters
     ----------
     system : LinearSystem
-        The system that moves.
+        The linear system whose motion is computed.
     excitation : Excitation
         Its loads, prescribed motions and release.
     laws : PortLaws
-        Internal forces.
+        The laws of the internal forces at ports.
     refinement : int
         Time steps are this many times smaller than usual.
 
@@ -250,13 +250,13 @@ def _motion_from_release(
     Parameters
     ----------
     system : LinearSystem
-        The system that moves.
+        The linear system whose motion is computed.
     excitation : Excitation
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
     laws : PortLaws
-        Internal forces.
+        The laws of the internal forces at ports.
     refinement : int
         Steps are this many times smaller.
     """
@@ -302,7 +302,7 @@ def _with_held_samples(
     begin : InitialMotion
         The state at the release, which is that of the held shape.
     held_count, count : int
-        Number of samples before the release, and of all samples.
+        The number of samples before the release, and of all samples.
     """
     laws = motion.port_forces.shape[1]
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
@@ -327,7 +327,7 @@ def _integrate_from(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
-    first: float,
+    first_time: float,
     stamps: FloatArray,
     begin: InitialMotion,
     refinement: int,
@@ -338,21 +338,21 @@ def _integrate_from(
     ----------
     system, excitation, laws
         The system, its loads and prescribed motions, and the internal forces.
-    first : float
-        Time of the state `begin` [s].
+    first_time : float
+        The time of the state `begin` [s].
     stamps : (N,) array
         Times at which the motion is computed [s].
     begin : InitialMotion
-        The state at `first`.
+        The state at the first time.
     refinement : int
         Time steps are this many times smaller than usual.
     """
     tolerance = LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
-    is_late = stamps[0] - first > tolerance
+    is_late = stamps[0] - first_time > tolerance
     is_excited = excitation.loads or excitation.prescribed_motions
     # a free linear motion has a closed form, without steps
     if not is_excited and laws.linear:
-        since_begin = stamps - (first if is_late else stamps[0])
+        since_begin = stamps - (first_time if is_late else stamps[0])
         free_motion = system.modal_system.free_motion(begin.q, begin.v, since_begin)
         if free_motion is not None:
             q, v = free_motion
@@ -361,7 +361,7 @@ def _integrate_from(
     if not is_late:
         return _integrate_in_steps(system, excitation, laws, stamps, begin, refinement)
     # integrate from the earlier begin, and leave out the start itself
-    from_begin = np.append(first, stamps)
+    from_begin = np.append(first_time, stamps)
     motion = _integrate_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(
         q=motion.q[1:],
@@ -412,7 +412,7 @@ def _linear_steps(
     boundaries : Boundaries
         The K + 1 boundaries of the steps.
     port_displacements : (K + 1, J) array
-        Displacements of the laws' ports under the loads, in the modes without inertia [m].
+        The displacements of the laws' ports under the loads, in the modes without inertia [m].
     """
     time = boundaries.time
     begin_force, end_force = equivalent_ramps(

@@ -40,7 +40,9 @@ def _trial_in_names_of(trial: Trial, model: Model) -> Trial:
         load_place = places[0]
     is_stated = np.any(trial.health != 0.0, axis=0) | np.any(trial.health_deviation != 0.0, axis=0)
     stated_regions = [
-        region for region, stated in zip(trial.regions, is_stated, strict=True) if stated
+        region
+        for region, region_is_stated in zip(trial.regions, is_stated, strict=True)
+        if region_is_stated
     ]
     regions = tuple(dict.fromkeys((*model.regions, *stated_regions)))
     health = np.zeros((len(trial.health), len(regions)))

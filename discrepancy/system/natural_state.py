@@ -32,7 +32,7 @@ def natural_state_magnitudes(
     Returns
     -------
     (L,) array
-        Magnitudes of the displacements of the modes, of their speeds, then of the states.
+        The magnitudes of the displacements of the modes, of their speeds, then of the states.
     """
     system = motion.system
     mode_count = len(system.angular_frequency)

@@ -24,12 +24,12 @@ class OutputEquation:
     Attributes
     ----------
     rows : (4, N) ndarray
-        Coefficients of the unknowns z = (u, s), displacements and integrals of states, and of
+        The coefficients of the unknowns z = (u, s), displacements and integrals of states, and of
         their first three time derivatives; a state is x = s'.
     constant : float
-        Constant part of the output [SI].
+        The constant part of the output [SI].
     feedthrough : sequence of Feedthrough, optional
-        Loads that the output contains directly. None unless the output is the force of a
+        The loads that the output contains directly. None unless the output is the force of a
         prescribed motion or of a controller.
     law_direction : (N,) ndarray, optional
         For the force of a prescribed motion: the direction of that motion, in which the force
@@ -54,11 +54,11 @@ class OutputEquation:
         Parameters
         ----------
         row : (N,) array
-            Row of displacements u and states x.
+            The row of displacements u and states x.
         displacement_derivative, state_derivative : int
             How many times u, and how many times x, are differentiated.
         state_count : int
-            Number of states, at the end of the row.
+            The number of states, at the end of the row.
         """
         displacement_count = len(row) - state_count
         rows = np.zeros((4, len(row)))

@@ -16,6 +16,8 @@ With this ratio, a friction of 1 to 25 % of the acting force lies in the middle 
 does a drag of that size at the largest speed."""
 LEAST_REVERSE_SPEED = 1e-3
 """A motion reverses if the speed exceeds this fraction of its largest value in both directions."""
+LEAST_PARTICIPATION = 1e-6
+"""Share of the squared amplitudes of all modes at a port above which a mode moves the port."""
 
 
 class GlobalScales(NamedTuple):
@@ -46,7 +48,7 @@ def scales_of_moving_structure(
     largest : LargestMotion
         Largest displacement, speed and load in the trials.
     duration : float
-        Longest dynamic record [s].
+        The duration of the longest dynamic record [s].
     """
     elastic = system.angular_frequency[system.angular_frequency > 0.0]
     moves = largest.displacement > 0.0
@@ -109,29 +111,30 @@ class PortScaleEstimator:
         self.turns = np.zeros(count, bool)
         self.follows_drives = np.ones(count, bool)
 
-    def add_displacements(self, displacements: FloatArray, *, fitted: bool) -> None:
+    def add_displacements(self, displacements: FloatArray, *, is_fitted: bool) -> None:
         """Add displacements of the structure at rest, or those from which it is released.
 
         Parameters
         ----------
         displacements : (L, N) array
-            Displacements of all unknowns, one row for each load level [m].
-        fitted : bool
+            The displacements of all unknowns, one row for each load level [m].
+        is_fitted : bool
             Whether the trial is fitted (dynamic and not held out).
         """
-        largest = np.max(np.abs(displacements @ self.rows.T), axis=0)
-        self._add_largest(largest, 0.0 * largest, fitted=fitted)  # at rest all speeds are zero
+        largest_displacements = np.max(np.abs(displacements @ self.rows.T), axis=0)
+        speeds_at_rest = np.zeros_like(largest_displacements)
+        self._add_largest(largest_displacements, speeds_at_rest, is_fitted=is_fitted)
 
-    def add_motion(self, motion: Motion, measured_force: float, *, fitted: bool) -> FloatArray:
+    def add_motion(self, motion: Motion, measured_force: float, *, is_fitted: bool) -> FloatArray:
         """Add a motion of the structure, and return the loads in it.
 
         Parameters
         ----------
         motion : Motion
-            Motion in a dynamic trial of T samples.
+            The motion in a dynamic trial of T samples.
         measured_force : float
-            Largest force that a channel measured in it [N].
-        fitted : bool
+            The largest force that a channel measured in the motion [N].
+        is_fitted : bool
             Whether the trial is fitted.
 
         Returns
@@ -139,23 +142,25 @@ class PortScaleEstimator:
         (T, N) array
             The loads on all unknowns in the motion [N].
         """
-        position, speed = motion.displacements_and_speeds_at(self.rows)
-        largest_position = np.max(np.abs(position), axis=0, initial=0.0)
-        largest_speed = np.max(np.abs(speed), axis=0, initial=0.0)
-        self._add_largest(largest_position, largest_speed, fitted=fitted)
-        least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speed), axis=0)
-        self.turns |= (np.min(speed, axis=0) < -least_speed) & (np.max(speed, axis=0) > least_speed)
+        positions, speeds = motion.displacements_and_speeds_at(self.rows)
+        largest_positions = np.max(np.abs(positions), axis=0, initial=0.0)
+        largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0)
+        self._add_largest(largest_positions, largest_speeds, is_fitted=is_fitted)
+        least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speeds), axis=0)
+        self.turns |= (np.min(speeds, axis=0) < -least_speed) & (
+            np.max(speeds, axis=0) > least_speed
+        )
         # inertia, damping and loads (N unknowns)
         system = motion.system
         shapes = system.shapes
-        modes = shapes.shape[1]
+        mode_count = shapes.shape[1]
         loads = motion.excitation.loads_at(motion.time, np.eye(system.unknown_count))
-        forces = (
-            motion.acceleration[:, :modes] @ (system.mass @ shapes).T,
-            motion.velocity[:, :modes] @ (self.system.damping @ shapes).T,
+        forces_by_kind = (
+            motion.acceleration[:, :mode_count] @ (system.mass @ shapes).T,
+            motion.velocity[:, :mode_count] @ (self.system.damping @ shapes).T,
             loads,
         )
-        # The equivalent force at a port p is the one that excites the modes as the loads do, in
+        # The equivalent force at a port p excites the modes as the loads do, in
         # projection on the port: p @ shapes @ (modal forces), over the same for a unit force at
         # the port, which is |p @ shapes|^2 (mobility).
         mobility = np.sum((self.rows @ shapes) ** 2, axis=1)
@@ -163,7 +168,9 @@ class PortScaleEstimator:
         port_forces_per_load = (
             shapes @ (shapes.T @ self.rows.T) / np.where(is_free_to_move, mobility, 1.0)
         )
-        mean_squares = [np.mean((force @ port_forces_per_load) ** 2, axis=0) for force in forces]
+        mean_squares = [
+            np.mean((force @ port_forces_per_load) ** 2, axis=0) for force in forces_by_kind
+        ]
         largest_mean_square = np.max(mean_squares, axis=0)
         # a port that no mode moves is moved by drives: the divisor makes its force scale, which is
         # FORCE_PER_RMS times the rms, equal to the measured force
@@ -175,11 +182,13 @@ class PortScaleEstimator:
         self.follows_drives &= mobility == 0.0
         return loads
 
-    def _add_largest(self, displacement: FloatArray, speed: FloatArray, *, fitted: bool) -> None:
-        """Add the largest displacements and speeds (P,) of a trial."""
-        self.fitted_displacement = np.maximum(self.fitted_displacement, displacement * fitted)
-        self.largest_displacement = np.maximum(self.largest_displacement, displacement)
-        self.largest_speed = np.maximum(self.largest_speed, speed)
+    def _add_largest(
+        self, displacements: FloatArray, speeds: FloatArray, *, is_fitted: bool
+    ) -> None:
+        """Raise the largest displacements and speeds of the P ports to those (P,) of a trial."""
+        self.fitted_displacement = np.maximum(self.fitted_displacement, displacements * is_fitted)
+        self.largest_displacement = np.maximum(self.largest_displacement, displacements)
+        self.largest_speed = np.maximum(self.largest_speed, speeds)
 
     def port_scales(
         self, static_stiffness: Sequence[float], *, only_driven: bool
@@ -189,8 +198,8 @@ class PortScaleEstimator:
         Parameters
         ----------
         static_stiffness : sequence of float
-            Static stiffness of each port [N/m or N m/rad]; zero if it is not known and has to be
-            computed from the modes.
+            The static stiffness of each port [N/m or N m/rad]; zero if it is not known and has to
+            be computed from the modes.
         only_driven : bool
             Whether every trial is computed in time from recorded inputs. The computed motion is
             then complete: a port whose speed never changes its sign in it never reverses.
@@ -212,7 +221,7 @@ class PortScaleEstimator:
     def _port_scale(
         self, port_index: int, static_stiffness: float, force: float, *, only_driven: bool
     ) -> PortScale:
-        """Return the scale of one port.
+        """Return the typical force, displacement and stiffness of one port.
 
         There are three cases: a port that a mode without stiffness moves, or no mode at all, is
         scaled by the forces and motions of the trials; a port on springs that drives alone move,
@@ -221,11 +230,12 @@ class PortScaleEstimator:
         Parameters
         ----------
         port_index : int
-            Number of the port.
+            The number of the port.
         static_stiffness : float
-            Its static stiffness [N/m or N m/rad]; zero if it has to be computed from the modes.
+            The static stiffness of the port [N/m or N m/rad]; zero if it has to be computed from
+            the modes.
         force : float
-            Its force scale from the trials [N or N m]; zero if nothing acted there.
+            The scale of the force at the port [N or N m]; zero if nothing acted there.
         """
         system = self.system
         fitted_displacement = float(self.fitted_displacement[port_index])
@@ -233,15 +243,15 @@ class PortScaleEstimator:
         largest_speed = float(self.largest_speed[port_index])
         displacement = fitted_displacement or largest_displacement or 1.0
         # modes that move the port
-        frequency = system.angular_frequency[: system.displacement_mode_count]
+        angular_frequencies = system.angular_frequency[: system.displacement_mode_count]
         row = self.rows[port_index]
         # squared amplitude of the port per unit of each mode (shapes have a modal mass of one)
-        participation = (row @ system.shapes)[: system.displacement_mode_count] ** 2
-        moves = participation > 1e-6 * float(participation.sum())
-        is_free = not np.any(frequency[moves] > 0.0)
-        is_held = np.any(moves) and np.all(frequency[moves] > 0.0)
+        participations = (row @ system.shapes)[: system.displacement_mode_count] ** 2
+        moves_port = participations > LEAST_PARTICIPATION * float(participations.sum())
+        is_free = not np.any(angular_frequencies[moves_port] > 0.0)
+        is_held = np.any(moves_port) and np.all(angular_frequencies[moves_port] > 0.0)
         if not is_held:
-            is_known_not_to_turn = is_free and only_driven and np.any(moves)
+            is_known_not_to_turn = is_free and only_driven and np.any(moves_port)
             return PortScale(
                 displacement=displacement,
                 stiffness=(force or 1.0) / displacement,
@@ -252,7 +262,7 @@ class PortScaleEstimator:
                 of_state=not np.any(row[: system.displacement_count]),
             )
         # each mode adds (row @ shape)^2 / omega^2 to the static compliance of the port
-        compliance = np.sum(participation[moves] / frequency[moves] ** 2)
+        compliance = np.sum(participations[moves_port] / angular_frequencies[moves_port] ** 2)
         static_stiffness = static_stiffness or 1.0 / float(compliance)
         is_driven = only_driven and self.follows_drives[port_index]
         if is_driven and force > 0.0 and largest_speed > 0.0:
@@ -264,14 +274,14 @@ class PortScaleEstimator:
                 largest_displacement=largest_displacement or displacement,
                 driven=True,
             )
-        first_frequency = float(frequency[moves][0])
-        first_participation = float(participation[moves][0])
+        first_angular_frequency = float(angular_frequencies[moves_port][0])
+        first_participation = float(participations[moves_port][0])
         # the first mode alone has the compliance p / omega^2 at the port, so its stiffness is
         # omega^2 / p, with p its participation
         return PortScale(
             displacement=displacement,
-            stiffness=first_frequency**2 / first_participation,
-            angular_frequency=first_frequency,
+            stiffness=first_angular_frequency**2 / first_participation,
+            angular_frequency=first_angular_frequency,
             static_stiffness=static_stiffness,
             largest_displacement=largest_displacement or 1.0,
         )

@@ -22,11 +22,11 @@ def ported_system(
     Parameters
     ----------
     system : LinearSystem
-        The system.
+        The linear system of the model.
     equations : sequence of OutputEquation
         The equation of each of the C outputs.
     shapes : (N, M) array
-        Shapes of the coordinates q, the columns of u = shapes q.
+        The shapes of the coordinates q, the columns of u = shapes q.
 
     Returns
     -------
@@ -89,10 +89,10 @@ def _direct_forces(
     A force adds to the output that is the reaction of a drive, and to outputs of modes without
     inertia, which deform at once.
     """
-    direct = np.zeros((len(directions), len(equations)))
+    direct_forces = np.zeros((len(directions), len(equations)))
     for column, equation in enumerate(equations):
         if equation.law_direction is not None:
-            direct[:, column] = directions @ equation.law_direction
+            direct_forces[:, column] = directions @ equation.law_direction
         elif system.is_truncated:
-            direct[:, column] = -directions @ system.residual_displacements(equation.rows[0])
-    return direct
+            direct_forces[:, column] = -directions @ system.residual_displacements(equation.rows[0])
+    return direct_forces

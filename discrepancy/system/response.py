@@ -24,7 +24,7 @@ class Conditions:
     parameters : (P,) ndarray
         Values of `Model.parameters`, in order.
     initial : (R, 2) ndarray
-        Initial state of a ring-down by mode. At rest: column 0 is the deviation from the static
+        The initial state of a ring-down by mode. At rest: column 0 is the deviation from the static
         release shape, in units of the release displacement, with that of the whole shape in row 0
         (so the motion starts at (1 + initial[0, 0]) times the static shape plus initial[r, 0] of
         mode r); column 1 is zero. Not at rest: displacement and velocity / w_r of mode r, in units
@@ -34,7 +34,8 @@ class Conditions:
     health : (N, 2) ndarray
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
     offset : tuple of float
-        Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
+        The constants that the recorded inputs of a driven trial lack, in their order [SI]; empty:
+        none.
     refinement : int
         Time steps are this many times smaller than usual, to check the integration.
     """
@@ -52,7 +53,7 @@ class Conditions:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """All conditions as a hashable value."""
+        """All conditions as one hashable value, under which a response is kept in a cache."""
         return (
             self.parameters.tobytes(),
             self.initial.tobytes(),
@@ -69,9 +70,9 @@ class Response(NamedTuple):
     Attributes
     ----------
     values : (N, C) ndarray
-        Value of each output [SI].
+        The value of each output [SI].
     rates : (N, C) ndarray or None
-        Time derivatives of the values, for dynamic trials.
+        The time derivatives of the values, for dynamic trials.
     """
 
     values: FloatArray
@@ -89,15 +90,15 @@ class PortedSystem:
     Attributes
     ----------
     generator : (n, n) ndarray
-        A [1/s].
+        The matrix A of the state equation [1/s].
     ports : tuple of str
-        Names of the P ports.
+        The names of the P ports.
     actions : (P, n) ndarray
         b of each port: a unit force there lowers the rate of the state by b.
     positions, speeds : (P, n) ndarray
         Rows of the ports' positions and speeds. A port of a state has the state as its speed.
     outputs : (C, n) ndarray
-        Rows of the outputs.
+        The rows that give the C outputs from the n states.
     through : (P, C) ndarray
         e of each port: a unit force there lowers the outputs by e at once.
     """

@@ -35,7 +35,7 @@ class OffsetInput(NamedTuple):
 
     @property
     def values(self) -> FloatArray:
-        """The values (N,) that truly acted."""
+        """The values (N,) that truly acted: the recorded values plus the constant [SI]."""
         return self.recorded.values + self.offset
 
 
@@ -48,13 +48,13 @@ class ControlLoop:
     section : ControllerSection
         The controller in the file.
     proportional, derivative, integral : float
-        Gains.
+        The gains on the error, on its rate and on its integral.
     measured : (4, N) ndarray
         Rows of the measured quantity, in the form of `OutputEquation.rows`.
     direction : (N,) ndarray
-        Load for a controller output of one.
+        The load for a controller output of one.
     error_integral : (N,) ndarray
-        Row of the unknown that is the integral of the error; zero without an integral gain.
+        The row of the unknown that is the integral of the error; zero without an integral gain.
     """
 
     section: ControllerSection
@@ -90,14 +90,14 @@ class ControlLoop:
         if section.reference is None or section.reference not in inputs:
             return []
         reference = inputs[section.reference]
-        recorded = reference.recorded
-        if recorded.quantity is not section.quantity:
+        recorded_input = reference.recorded
+        if recorded_input.quantity is not section.quantity:
             raise ModelError(
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
-                f"{trial.name!r} records its reference {recorded.name!r} as "
-                f"{recorded.quantity.value}."
+                f"{trial.name!r} records its reference {recorded_input.name!r} as "
+                f"{recorded_input.quantity.value}."
             )
-        history = RecordedHistory(trial.time, reference.values, recorded.hold)
+        history = RecordedHistory(trial.time, reference.values, recorded_input.hold)
         loads = [Load(self.proportional * self.direction + self.error_integral, history)]
         if self.derivative != 0.0 and section.derivative_of == "error":
             if history.hold is Hold.ZERO_ORDER:
@@ -118,11 +118,11 @@ class Rig:
     Attributes
     ----------
     factors : mapping of str to float
-        Factors of the terms by name.
+        The factors of the terms by name.
     matrices : mapping of str to (N, N) ndarray
         Matrices by kind, and their parts by name.
     loops : mapping of str to ControlLoop
-        Controllers by name.
+        The controllers by their names.
     """
 
     factors: Mapping[str, float]
@@ -160,13 +160,13 @@ def build_rig(
     Parameters
     ----------
     description : LumpedDescription
-        The file's content.
+        The content of the model file.
     factors : mapping of str to float
-        Factors of the terms by name, from the values of the parameters.
+        The factors of the terms by name, from the values of the parameters.
     state : SystemState
         The structural patch and the temperature.
     places : sequence of PlaceSection
-        Places of masses in the order of their stations.
+        The places of masses in the order of their stations.
 
     Raises
     ------
@@ -212,11 +212,11 @@ def _apply_patch(
     Parameters
     ----------
     patch : ModelPatch
-        Structural primitives.
+        The change of the structure.
     description : LumpedDescription
         The file's content, for the lever of the root.
     places : sequence of PlaceSection
-        Places of masses in the order of their stations.
+        The places of masses in the order of their stations.
     mass, stiffness : (n, n) arrays
         Matrices that are changed in place.
     """
@@ -269,14 +269,14 @@ def _control_loops(
     for section in description.controller:
         gains = []
         for gain in GAINS:
-            scaled = factors.get(f"{section.name}.{gain}", 1.0) * getattr(section, gain)
-            gains.append(factors.get(section.name, 1.0) * scaled)
+            scaled_gain = factors.get(f"{section.name}.{gain}", 1.0) * getattr(section, gain)
+            gains.append(factors.get(section.name, 1.0) * scaled_gain)
         proportional, derivative, integral = gains
         error_integral = np.zeros(unknown_count)
         if section.integral:
             error_integral[next_integral] = 1.0
             next_integral += 1
-        measured = OutputEquation.from_row(
+        measured_output = OutputEquation.from_row(
             description.pad_to_all_unknowns(section.vector),
             displacement_derivative=section.quantity.order,
             state_count=unknown_count - displacement_count,
@@ -286,7 +286,7 @@ def _control_loops(
             proportional=proportional,
             derivative=derivative,
             integral=integral,
-            measured=measured.rows,
+            measured=measured_output.rows,
             direction=description.pad_to_all_unknowns(section.acts),
             error_integral=error_integral,
         )

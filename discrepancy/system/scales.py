@@ -11,9 +11,9 @@ class ForceShare(NamedTuple):
     Attributes
     ----------
     weight : float
-        Fraction of the force that acts there.
+        The fraction of the force that acts there.
     relative_motion : float
-        Ratio of the motion of the place to the weighted mean motion, that of the port.
+        The ratio of the motion of the place to the weighted mean motion, that of the port.
     """
 
     weight: float
@@ -88,7 +88,7 @@ class Scales:
     tip_stiffness : float
         Static stiffness at the load point [N/m].
     modal_mass : float
-        Mass of the first mode referred to the load point [kg].
+        The mass of the first mode referred to the load point [kg].
     angular_frequency : float
         w1 [rad/s].
     force, load_factor : float
@@ -96,7 +96,7 @@ class Scales:
     duration : float
         Longest dynamic record [s]; 1 without one.
     campaign_time : float
-        Time from the first to the last sample of the campaign [s]; 1 if unknown.
+        The time from the first to the last sample of the campaign [s]; 1 if unknown.
     ports : mapping of str to PortScale
         By port name: those of `Model.ports`, and the places of forces that are distributed over the
         structure.

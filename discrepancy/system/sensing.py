@@ -58,7 +58,7 @@ def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial,
     Parameters
     ----------
     trial : Trial
-        Trial with the stamps that its user gave.
+        The trial with the stamps that its user gave.
     patch : ModelPatch
         Patch whose time windows are given in these stamps; the windows are shifted too.
     """
@@ -90,12 +90,12 @@ def observe(
     Parameters
     ----------
     model : Model
-        Model that responds to the structure, force and load primitives of the patch. Sensors that
-        it has built in act before those of the patch.
+        The model that responds to the structure, force and load primitives of the patch. Sensors
+        that it has built in act before those of the patch.
     campaign : Campaign
-        Campaign with the channels that the trial names.
+        The campaign with the channels that the trial names.
     trial : Trial
-        Inputs and sample times.
+        The trial, of which only the inputs and the sample times are used.
     patch : ModelPatch
         Clocks are added to `conditions.clock`; other sensor primitives act on the response
         (`fe.runtime.sensors`).
@@ -169,7 +169,7 @@ def _response_in_clocks(
     conditions: Conditions,
     gauges: TurnedGauges,
 ) -> Response:
-    """Return the response of all outputs, each sampled by the clock of its own logger.
+    """Return the response of all outputs at the sample times of their own loggers.
 
     The recorded inputs are first brought to their true times. All clocks are right at the first
     stamp; the model is run once for each distinct clock rate.

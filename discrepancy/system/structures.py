@@ -60,15 +60,15 @@ class StructureWithMatrices(SolvedStructure, Protocol):
 
     @property
     def mass(self) -> FloatArray:
-        """Mass matrix (n, n)."""
+        """The mass matrix (n, n) of the structure."""
 
     @property
     def stiffness(self) -> FloatArray:
-        """Stiffness matrix (n, n)."""
+        """The stiffness matrix (n, n) of the structure."""
 
     @property
     def mode_count(self) -> int:
-        """Number of modes with inertia."""
+        """The number of modes that have inertia."""
 
     @property
     def rigid_ports(self) -> frozenset[str]:
@@ -212,7 +212,7 @@ class StructureModel(SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (n,) of 1 N of a force; without forces, that of load factor 1.
+        """Return the load (n,) of a force of 1 N, or of load factor 1 if there are no forces.
 
         Raises
         ------
@@ -229,8 +229,10 @@ class StructureModel(SystemModel):
     def excitation(self, case: PatchedTrial) -> Excitation:
         """Return the excitation of a trial, with the constant loads and unrecorded controls."""
         excitation = super().excitation(case)
-        recorded = [name for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls]
-        constant_load = self._load_of_controls(case.state, dict.fromkeys(recorded, 0.0))
+        recorded_controls = [
+            name for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls
+        ]
+        constant_load = self._load_of_controls(case.state, dict.fromkeys(recorded_controls, 0.0))
         if not constant_load.any():
             return excitation
         always = RecordedHistory(excitation.time, np.ones(len(excitation.time)))
@@ -250,18 +252,18 @@ class StructureModel(SystemModel):
 
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     """Return the priors of parameters and free masses: nominal means, deviations of `DEVIATION`."""
-    nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
+    nominal_values = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
     priors = []
     for name, unit in units.items():
         low, high = model.validity[name]
         deviation = DEVIATION * (high - low)
-        priors.append(ParameterPrior(name, unit, nominal[name], deviation, low, high))
+        priors.append(ParameterPrior(name, unit, nominal_values[name], deviation, low, high))
     return tuple(priors)
 
 
 def _is_at_port(name: str) -> bool:
-    """Return whether a control or a displacement is that of a port of the structure file."""
+    """Return whether a control or a displacement acts at a port of the structure file."""
     return name.startswith(PORT_PREFIX)
 
 
@@ -281,7 +283,7 @@ def _linear_system(
     rayleigh: Iterable[float],
     ports: Mapping[str, FloatArray],
 ) -> LinearSystem:
-    """Return a structure as a linear system.
+    """Return the linear system of a structure in a given state.
 
     Parameters
     ----------
@@ -290,7 +292,7 @@ def _linear_system(
     rayleigh : iterable of float
         Rayleigh damping: alpha [1/s] and beta [s].
     ports : mapping of str to (n,) array
-        Rows of its ports.
+        The rows that give the displacement of each port from the n states.
     """
     alpha, beta = rayleigh
     return LinearSystem(
@@ -316,11 +318,11 @@ class WingModel(SystemModel):
     Parameters
     ----------
     arrays : PatchArrays
-        The wing for patches.
+        The arrays of the wing from which patches are computed.
     name : str
-        For people.
+        The name of the model in messages and reports.
     prior : mapping of str to (float, float)
-        Mean and standard deviation of the calibrated parameters, by the names of
+        The mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
     design : WingDesign, optional
         The design from which the arrays were made.

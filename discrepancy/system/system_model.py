@@ -1,7 +1,7 @@
 """Models that are given by matrices (a wing, a structure, a lumped rig), at rest and in motion."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from itertools import groupby
@@ -53,7 +53,7 @@ class SystemModel(Model):
         Load place whose stiffness and modal mass are the natural ones; None: that of the first
         trial.
     cache_size : int
-        Number of systems that are kept; one of a wing takes 2 MB.
+        The number of systems that are kept; one of a wing takes 2 MB.
     """
 
     port_rows: Mapping[str, FloatArray]
@@ -87,11 +87,11 @@ class SystemModel(Model):
         Parameters
         ----------
         place : str or (float, float)
-            Load place.
+            The place at which the load acts.
         state : SystemState
-            State of the system.
+            The state of the system.
         change : ModelPatch
-            Load primitives that move the place.
+            The load primitives that move the place.
         """
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
@@ -158,7 +158,7 @@ class SystemModel(Model):
     # ------------------------------------------------------------ trials
 
     def laws_at_ports(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
-        """Return the laws at the ports, those of the model and those of a patch."""
+        """Return all laws that act at the ports: the model's own laws and the laws of a patch."""
         forces = self.forces_at_ports(self.built_in_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 
@@ -170,11 +170,11 @@ class SystemModel(Model):
         Parameters
         ----------
         trial : Trial
-            Any trial.
+            A trial of any kind.
         conditions : Conditions
             Parameters, initial state, clock and health.
         patch : ModelPatch
-            All primitives that act.
+            The change of the model, with all primitives that act.
         """
         temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
@@ -188,7 +188,7 @@ class SystemModel(Model):
     def excitation(self, case: PatchedTrial) -> Excitation:
         """Return the excitation of a trial: its loads and prescribed motions, or its release."""
         trial = case.trial
-        initial = case.conditions.initial
+        initial_state = case.conditions.initial
         excitation = Excitation(
             trial.time, case.conditions.motion_times(trial.time), begins=trial.begins
         )
@@ -200,14 +200,14 @@ class SystemModel(Model):
                 )
             row = self.force_row(trial.load_place, case.state)
             return replace(
-                excitation, release=ReleasePoint(row, require_release(trial)), initial=initial
+                excitation, release=ReleasePoint(row, require_release(trial)), initial=initial_state
             )
         loads, prescribed_motions = self.loads_and_motions(case)
         return replace(
             excitation,
             loads=loads,
             prescribed_motions=prescribed_motions,
-            initial=initial.ravel(),
+            initial=initial_state.ravel(),
         )
 
     def excited_system(self, case: PatchedTrial) -> ExcitedSystem:
@@ -217,7 +217,7 @@ class SystemModel(Model):
         return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
 
     def simulate_motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
-        """Return the motion in a dynamic trial.
+        """Simulate a dynamic trial, and return its motion.
 
         Raises
         ------
@@ -248,9 +248,16 @@ class SystemModel(Model):
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
     def _outputs_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
-        """Return the outputs (N, C) in the N rows of a static trial, in the order of its loading.
+        """Return the C outputs in the N rows of a static trial, an (N, C) array.
 
-        The order matters: dry friction remembers how the present load was reached.
+        The rows are computed in the order of the loading, because dry friction remembers how the
+        present load was reached.
+
+        Raises
+        ------
+        ModelError
+            If a law or a force depends on time, if a channel measures a rate, or if there is no
+            equilibrium.
         """
         trial = case.trial
         if laws.active_spans or len(case.patch.of(PortLoad)):
@@ -258,40 +265,27 @@ class SystemModel(Model):
                 f"The trial {trial.name!r} has no time, which a law or force in time asks for."
             )
         values = np.empty((len(trial.force), len(outputs)))
+        # what the laws remember of the loading, and the last load level, from one block to the next
         memory = None
         previous_level = None
         for rows, state in self._rows_by_state(case):
-            rows_case = case._replace(state=state)
-            equations = self.output_equations(rows_case, outputs, None)
-            directions, all_levels = self.excitation(rows_case).load_levels
-            levels = all_levels[rows]
+            case_in_state = case._replace(state=state)
+            equations = self.output_equations(case_in_state, outputs, None)
+            directions, levels_of_trial = self.excitation(case_in_state).load_levels
             system = self.system_in_state(state)
-            n = system.displacement_count
-            for (_, quantity), equation in zip(outputs, equations, strict=True):
-                shows_state_rate = np.any(equation.rows[2:, n:])
-                shows_speed = quantity.order > 0 and np.any(equation.rows[1:, :n])
-                if shows_state_rate or shows_speed:
-                    raise ModelError(
-                        f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
-                        "acceleration."
-                    )
-            # at rest an output shows displacements (row 0) and the values of states (row 1)
-            output_rows = [
-                np.append(output_equation.rows[0, :n], output_equation.rows[1, n:])
-                for output_equation in equations
-            ]
+            output_rows = _output_rows_at_rest(trial, outputs, equations, system.displacement_count)
             trial_text = f"The trial {trial.name!r} is at rest, but "
             with ModelError.instead_of(ModelError, FiniteElementError, before=trial_text):
                 values[rows], memory = system.static_path(
                     directions,
                     laws,
-                    levels=levels,
+                    levels=levels_of_trial[rows],
                     memory=memory,
                     previous_level=previous_level,
-                    output_rows=np.array(output_rows),
+                    output_rows=output_rows,
                 )
             values[rows] += [equation.constant for equation in equations]
-            previous_level = all_levels[rows.stop - 1]
+            previous_level = levels_of_trial[rows.stop - 1]
         return values
 
     def _rows_by_state(self, case: PatchedTrial) -> Iterator[RowsAtRest]:
@@ -356,7 +350,7 @@ class SystemModel(Model):
         )
 
     def _rows_of_ports(self, names: tuple[str, ...]) -> FloatArray:
-        """Return the rows (P, N) of ports."""
+        """Return the rows (P, N) that give the displacements of P ports from N unknowns."""
         return np.array([self.port_rows[name] for name in names])
 
     # ------------------------------------------------------------ natural sizes and scales
@@ -390,7 +384,7 @@ class SystemModel(Model):
         )
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)
         estimator = PortScaleEstimator(uncontrolled, port_rows)
-        largest = self._add_trials(estimator, campaign, is_held=is_held)
+        largest_motion = self._add_trials(estimator, campaign, is_held=is_held)
         # scales of the whole structure
         campaign_sizes = campaign.largest_magnitudes
         if is_held:
@@ -400,7 +394,9 @@ class SystemModel(Model):
                 1.0 / float(row @ system.equilibrium_under(row[None])[0]) for row in port_rows
             ]
         else:
-            global_scales = scales_of_moving_structure(system, largest, campaign_sizes["duration"])
+            global_scales = scales_of_moving_structure(
+                system, largest_motion, campaign_sizes["duration"]
+            )
             first_shape = np.zeros(0)
             static_stiffness = [0.0] * len(self.ports)
         only_driven = all(_is_moved_by_inputs(trial) for trial in trials)
@@ -412,7 +408,7 @@ class SystemModel(Model):
             tip_stiffness=global_scales.stiffness,
             modal_mass=global_scales.mass,
             angular_frequency=global_scales.angular_frequency,
-            force=campaign_sizes["force"] or largest.load,
+            force=campaign_sizes["force"] or largest_motion.load,
             load_factor=campaign_sizes["load_factor"],
             duration=campaign_sizes["duration"],
             campaign_time=campaign_sizes["campaign_time"],
@@ -427,32 +423,32 @@ class SystemModel(Model):
         Parameters
         ----------
         estimator : PortScaleEstimator
-            Collects the motions of the ports; changed in place.
+            The object that collects the motions of the ports; it is changed in place.
         campaign : Campaign
-            The campaign.
+            The campaign: its trials, channels and noise records.
         is_held : bool
             Whether springs hold the structure. Only then static trials and ring-downs are added, by
             their displacements at rest.
         """
         parameters = self.prior_mean(campaign)
-        largest = LargestMotion(0.0, 0.0, 0.0)
+        largest_motion = LargestMotion(0.0, 0.0, 0.0)
         for trial in campaign.trials:
             is_fitted = trial.is_dynamic and not trial.held_out
             if _is_moved_by_inputs(trial):
                 motion = self._motion_under_inputs(campaign, trial)
                 measured_force = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                loads = estimator.add_motion(motion, measured_force, is_fitted=is_fitted)
                 # from modal coordinates (N, M + P) to the displacements of the structure
                 shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
-                largest = LargestMotion(
-                    displacement=larger_magnitude(largest.displacement, motion.q @ shapes),
-                    speed=larger_magnitude(largest.speed, motion.velocity @ shapes),
-                    load=larger_magnitude(largest.load, loads),
+                largest_motion = LargestMotion(
+                    displacement=larger_magnitude(largest_motion.displacement, motion.q @ shapes),
+                    speed=larger_magnitude(largest_motion.speed, motion.velocity @ shapes),
+                    load=larger_magnitude(largest_motion.load, loads),
                 )
             elif is_held:
                 case = self.patched_trial(trial, Conditions(parameters))
-                estimator.add_displacements(self._static_displacements(case), fitted=is_fitted)
-        return largest
+                estimator.add_displacements(self._static_displacements(case), is_fitted=is_fitted)
+        return largest_motion
 
     def _scales_of_held_structure(
         self, system: LinearSystem, state: SystemState, campaign: Campaign
@@ -506,6 +502,48 @@ class SystemModel(Model):
         shape = system.equilibrium_under(row[None])
         displacement = excitation.release.release.displacement
         return np.asarray(displacement / float(row @ shape[0]) * shape)
+
+
+def _output_rows_at_rest(
+    trial: Trial,
+    outputs: Outputs,
+    equations: Sequence[OutputEquation],
+    displacement_count: int,
+) -> FloatArray:
+    """Return the rows (C, N) that give the C outputs of a structure at rest from its N unknowns.
+
+    At rest an output depends on displacements, by row 0 of its equation, and on the values of
+    states of first order, which are the rates of their unknowns, by row 1.
+
+    Parameters
+    ----------
+    trial : Trial
+        The static trial, for messages.
+    outputs : sequence of (str, Quantity)
+        The name of each output, and the quantity that a channel measures there.
+    equations : sequence of OutputEquation
+        The equation of each output.
+    displacement_count : int
+        The number of the unknowns that are displacements; the others are states of first order.
+
+    Raises
+    ------
+    ModelError
+        If an output is a velocity, an acceleration or the rate of a state.
+    """
+    output_rows = []
+    for (_, quantity), equation in zip(outputs, equations, strict=True):
+        shows_state_rate = np.any(equation.rows[2:, displacement_count:])
+        shows_speed = quantity.order > 0 and np.any(equation.rows[1:, :displacement_count])
+        if shows_state_rate or shows_speed:
+            raise ModelError(
+                f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
+                "acceleration."
+            )
+        displacement_row = equation.rows[0, :displacement_count]
+        state_row = equation.rows[1, displacement_count:]
+        output_rows.append(np.append(displacement_row, state_row))
+    return np.array(output_rows)
 
 
 def _depends_on_temperature(patch: ModelPatch) -> bool:

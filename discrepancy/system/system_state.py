@@ -20,15 +20,15 @@ class SystemState(NamedTuple):
     parameters : tuple of float
         Values (P,) of the model's parameters.
     losses : tuple of float
-        Stiffness losses of the damage regions.
+        The stiffness losses of the damage regions.
     structure : ModelPatch
         The primitives of a patch that change the structure.
     temperature_rise : float
-        Temperature above the reference [K], zero if the structure does not depend on it.
+        The temperature above the reference [K], zero if the structure does not depend on it.
     drives : tuple of str
         Inputs whose motion is prescribed.
     controlled : bool
-        Whether the controllers act.
+        Whether the controllers of the rig act.
     """
 
     parameters: tuple[float, ...]

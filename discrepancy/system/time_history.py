@@ -22,7 +22,7 @@ class LoadHistory(Protocol):
 
     @property
     def hold(self) -> Hold | None:
-        """How the load is interpolated between samples."""
+        """The way in which the load is interpolated between its samples."""
 
     @property
     def jump_times(self) -> FloatArray:
@@ -39,7 +39,7 @@ class RecordedHistory:
     Attributes
     ----------
     time, values : (N,) ndarray
-        The samples [s], [SI].
+        The times of the samples [s], and the values at these times [SI].
     hold : Hold, optional
         The course between the samples, linear by default. A load keeps its first value before the
         first sample and its last value after the last one.
@@ -64,10 +64,10 @@ class RecordedHistory:
     @cached_property
     def _spline(self) -> PPoly:
         """The spline through the load, or through the displacement of a prescribed motion."""
-        recorded: PPoly = CubicSpline(self.time, self.values)
+        spline: PPoly = CubicSpline(self.time, self.values)
         if self.motion_order:
-            return recorded.antiderivative(self.motion_order)
-        return recorded
+            return spline.antiderivative(self.motion_order)
+        return spline
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times [s], or a time derivative of them.
@@ -77,15 +77,15 @@ class RecordedHistory:
         Parameters
         ----------
         time : (N,) ndarray
-            Times [s].
+            The times of the samples [s].
         derivative : int
-            Order of the time derivative. Without a smooth course it is 0 or 1.
+            The order of the time derivative. Without a smooth course it is 0 or 1.
         """
         if self.hold is Hold.SMOOTH:
             # a load keeps its first and last value outside of the record; a motion goes on
             is_load = self.motion_order is None
-            inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
-            return np.asarray(self._spline(inside, derivative))
+            is_inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
+            return np.asarray(self._spline(is_inside, derivative))
         if self.hold is not Hold.ZERO_ORDER and derivative == 0:
             return np.asarray(np.interp(time, self.time, self.values))
         if derivative == 0:
@@ -126,8 +126,8 @@ class FormulaHistory:
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times; a formula is never differentiated."""
         spans = self.spans or ((-inf, inf),)
-        inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
-        return np.where(inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
+        is_inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
+        return np.where(is_inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
 
 
 def equivalent_ramps(

@@ -303,10 +303,10 @@ class ElementKind:
 
         # Seen from outside, the corners of a face turn clockwise in Abaqus, so that the tangent to
         # the last corner is the first one.
-        first = corner_positions(0)
-        to_last = corner_positions(-1) - first
-        to_second = corner_positions(1) - first
-        return FaceFrames(corner=first, tangents=np.stack((to_last, to_second), axis=1))
+        first_corner = corner_positions(0)
+        to_last = corner_positions(-1) - first_corner
+        to_second = corner_positions(1) - first_corner
+        return FaceFrames(corner=first_corner, tangents=np.stack((to_last, to_second), axis=1))
 
     def face_rule(self, face: int) -> Rule:
         """Return an integration rule on a face, exact for products of two shape functions."""

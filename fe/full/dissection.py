@@ -62,9 +62,9 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
     edges : (2, m) array of int
         The two vertices of each edge, both in one part.
     """
-    total = np.asarray(np.bincount(part, weights=weight), dtype=np.float64)
-    weight_before = np.cumsum(total) - total
-    lowest_cost = np.full(len(total), np.inf)
+    total_weight = np.asarray(np.bincount(part, weights=weight), dtype=np.float64)
+    weight_before = np.cumsum(total_weight) - total_weight
+    lowest_cost = np.full(len(total_weight), np.inf)
     separator = np.zeros(len(part), dtype=bool)
     side = np.zeros(len(part), dtype=bool)
     for coordinate in _coordinates(part, edges):
@@ -72,7 +72,7 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
         cumulative = np.cumsum(weight[order])
         for fraction in CUT_FRACTIONS:
             # cut each part where this fraction of its weight is reached
-            cut_node = order[np.searchsorted(cumulative, weight_before + fraction * total)]
+            cut_node = order[np.searchsorted(cumulative, weight_before + fraction * total_weight)]
             is_above = coordinate > coordinate[cut_node][part]
             first_is_above, second_is_above = is_above[edges]
             crossing_edges = edges[:, first_is_above != second_is_above]
@@ -80,7 +80,7 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
                 is_in_half = is_above[crossing_edges] == half
                 on_cut = np.zeros(len(part), dtype=bool)
                 on_cut[crossing_edges[is_in_half]] = True
-                cost = _cut_costs(part, weight, total, on_cut, is_above)
+                cost = _cut_costs(part, weight, total_weight, on_cut, is_above)
                 # keep the cuts that cost less than the best cuts before
                 is_better = cost < lowest_cost
                 lowest_cost[is_better] = cost[is_better]

@@ -53,8 +53,8 @@ def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
         The fronts in the order of elimination.
     """
     # unknowns with equal rows, such as those of a node, are ordered as one group
-    first, group_of_unknown = _groups_of_equal_rows(matrix)
-    graph = matrix[first][:, first]
+    representatives, group_of_unknown = _groups_of_equal_rows(matrix)
+    graph = matrix[representatives][:, representatives]
     sizes = np.bincount(group_of_unknown)
     block = elimination_blocks(graph, sizes.astype(np.float64), LEAF_UNKNOWNS)
     order = np.argsort(block, kind="stable")
@@ -84,15 +84,15 @@ def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]
 
     Returns
     -------
-    first : (g,) array of int
+    representatives : (g,) array of int
         The first unknown of each group.
     group : (n,) array of int
         The group of each unknown.
     """
     keys = np.random.default_rng(1973).integers(2**63, size=matrix.shape[0], dtype=np.int64)
     sums = np.add.reduceat(keys[matrix.indices], matrix.indptr[:-1])
-    _, first, group = np.unique(sums, return_index=True, return_inverse=True)
-    return first.astype(np.int64), group.astype(np.int64)
+    _, representatives, group = np.unique(sums, return_index=True, return_inverse=True)
+    return representatives.astype(np.int64), group.astype(np.int64)
 
 
 def _fronts_of_groups(

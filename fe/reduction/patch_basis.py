@@ -310,8 +310,8 @@ def _kept_directions(arrays: PatchArrays) -> FloatArray:
         snapshots = np.concatenate((solutions, modes), axis=1)
         weight = UNCHANGED_WEIGHT**2 if is_unchanged else 1.0
         outer_products += snapshots @ snapshots.T * weight
-    first = max(0, wing.size - BASIS_VECTORS)
-    _, directions = eigh(outer_products, subset_by_index=[first, wing.size - 1])
+    first_kept = max(0, wing.size - BASIS_VECTORS)
+    _, directions = eigh(outer_products, subset_by_index=[first_kept, wing.size - 1])
     return np.asarray(directions[:, ::-1])
 
 

@@ -9,7 +9,7 @@ from .arrays import FloatArray
 
 
 def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
+    """Return the sum of T dense terms (T, n, m), each times a coefficient."""
     flat_terms = terms.reshape(len(terms), -1)
     return np.asarray((coefficients @ flat_terms).reshape(terms.shape[1:]))
 

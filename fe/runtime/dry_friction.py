@@ -76,15 +76,15 @@ def port_acceleration(
     time : float
         Time, for a stiffness that drifts [s].
     """
-    total = 0.0
+    acceleration = 0.0
     for m in range(len(q)):
         modal = applied[m] - steps.stiffness[m] * (1.0 + ports.stiffness_rate * time) * q[m]
         for n in range(len(q)):
             modal -= steps.damping[m, n] * v[n]
         for i in range(len(forces)):
             modal -= ports.force_rows[i, m] * forces[i]
-        total += ports.motion_rows[j, m] * modal
-    return total
+        acceleration += ports.motion_rows[j, m] * modal
+    return acceleration
 
 
 def correct_reversal(

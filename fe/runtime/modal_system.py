@@ -72,16 +72,20 @@ def rayleigh_coefficients(
     ValueError
         If the two frequencies are equal or not positive.
     """
-    first, second = (2.0 * math.pi * f for f in frequency)
-    if not (first > 0.0 and second > 0.0) or first == second:
+    omega_1, omega_2 = (2.0 * math.pi * f for f in frequency)
+    if not (omega_1 > 0.0 and omega_2 > 0.0) or omega_1 == omega_2:
         raise ValueError(
             "Two different positive frequencies are needed for two Rayleigh coefficients, but "
             f"{frequency} Hz were given."
         )
-    difference = second**2 - first**2
-    beta = 2.0 * (damping_ratio[1] * second - damping_ratio[0] * first) / difference
+    difference = omega_2**2 - omega_1**2
+    beta = 2.0 * (damping_ratio[1] * omega_2 - damping_ratio[0] * omega_1) / difference
     alpha = (
-        2.0 * first * second * (damping_ratio[0] * second - damping_ratio[1] * first) / difference
+        2.0
+        * omega_1
+        * omega_2
+        * (damping_ratio[0] * omega_2 - damping_ratio[1] * omega_1)
+        / difference
     )
     return alpha, beta
 
@@ -135,7 +139,7 @@ class ModalSystem:
 
     @cached_property
     def full_stiffness(self) -> FloatArray:
-        """S (M, M), also where the stiffness couples no coordinates."""
+        """The stiffness matrix S (M, M), also if the stiffness couples no coordinates."""
         return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
 
     @cached_property

@@ -240,7 +240,7 @@ class PatchedWing(WingRows):
     def _add_local_losses(
         self, stiffness: FloatArray, patch: ModelPatch, theta: FloatArray
     ) -> None:
-        """Take the local losses of a patch, smeared over strips, from a stiffness (n, n) in place.
+        """Subtract a patch's local losses, averaged over strips, from a stiffness (n, n), in place.
 
         `theta` (K + 2,) are the coefficients of the stiffness terms.
         """

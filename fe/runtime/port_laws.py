@@ -136,7 +136,7 @@ class PortLaws:
         return tuple(filter(isfinite, times))
 
     def active_at(self, time: float) -> BoolArray:
-        """Return whether each of the laws (J,) acts at a time [s]."""
+        """Return whether each of the J laws acts at a time [s]."""
         active = np.ones(len(self), dtype=bool)
         for j, spans in enumerate(self.active_spans):
             if spans:
@@ -159,7 +159,7 @@ class PortLaws:
         )
 
     def unloaded_memory(self) -> FloatArray:
-        """Return the memory (J, 5 + E) of laws that have never been loaded, E at least 1."""
+        """Return the memory (J, 5 + E) of J laws that were never loaded, with E >= 1 elements."""
         elements = self.parameters.shape[1] - PARAMETERS
         return np.zeros((len(self), FIRST_ELEMENT + max(1, elements)))
 

@@ -101,8 +101,8 @@ class ReducedModel(ReducedArrays):
     @cached_property
     def _loss_inputs(self) -> slice:
         """The losses of the regions among the inputs."""
-        first = len(self.parameters)
-        return slice(first, first + len(self.regions))
+        first_loss = len(self.parameters)
+        return slice(first_loss, first_loss + len(self.regions))
 
     def vector(
         self, values: InputValues | None = None, stiffness_loss: LossValues = (), **named: float
@@ -236,17 +236,17 @@ class ReducedModel(ReducedArrays):
         return np.asarray(values[..., first] * values[..., second])
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., T) of the stiffness terms at inputs (..., V)."""
+        """Return the coefficients of the T stiffness terms at values of the V inputs: (..., T)."""
         return self._products(vectors, self._stiffness_factor_columns)
 
     def load_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., L) of the loads at inputs (..., V)."""
+        """Return the coefficients of the L loads at values of the V inputs: (..., L)."""
         return self._products(vectors, self._load_factor_columns)
 
     def mass_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (1 + P,) of the mass terms at inputs (V,)."""
-        first = self._loss_inputs.stop
-        return np.concatenate(([1.0], vector[first : first + len(self.masses)]))
+        """Return the coefficients of structure and P free masses at V inputs: (1 + P,)."""
+        first_mass = self._loss_inputs.stop
+        return np.concatenate(([1.0], vector[first_mass : first_mass + len(self.masses)]))
 
     # ------------------------------------------------------------ motion
 

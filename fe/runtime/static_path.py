@@ -62,7 +62,7 @@ def static_path(
     """
     ports = PortArrays(*port_fields)
     count = len(start)
-    previous = start.copy()
+    previous_level = start.copy()
     x = memory[:, POSITION].copy()
     x_forces = np.zeros(count)
     for level in range(len(linear_positions)):
@@ -70,18 +70,19 @@ def static_path(
         fraction_done = 0.0
         part = 1.0
         while fraction_done < 1.0:
-            goal = previous + (linear_positions[level] - previous) * min(fraction_done + part, 1.0)
+            fraction = min(fraction_done + part, 1.0)
+            goal = previous_level + (linear_positions[level] - previous_level) * fraction
             solved, solution, x_forces = solve_static_position(goal, x, ports, memory, compliance)
             if solved:
                 x = solution
                 update_memory(ports, memory, x, x_forces)
-                fraction_done = min(fraction_done + part, 1.0)
+                fraction_done = fraction
                 part *= 2.0
             else:
                 part *= 0.5
                 if part < _SMALLEST_PART:
                     return level
-        previous = linear_positions[level]
+        previous_level = linear_positions[level]
         for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
             positions[level, j] = x[j]
             forces[level, j] = x_forces[j]
@@ -205,18 +206,18 @@ def solve_port_position(
     h : float
         Duration of the step [s]; if it is zero, the forces of laws of speed keep their values.
     """
-    last = memory[port, POSITION]
+    last_position = memory[port, POSITION]
     start, friction, tolerance = forces_at_last_position(port, ports, memory, h)
-    displacement = y - last - r * start
+    displacement = y - last_position - r * start
     if friction > 0.0 and abs(displacement) <= r * friction:
         share_friction(port, ports, memory, displacement / r, friction, h)
-        return float(last)
+        return float(last_position)
     # For a stable structure the residual increases with x, so that the root lies on the side of
     # the last position to which the free displacement points.
     sign = 1.0 if displacement > 0.0 else -1.0
-    low = last
-    high = last + sign * _UNKNOWN_END  # until an iterate lies beyond the root
-    x = last + sign * max(abs(displacement) - r * friction, 0.0)
+    low = last_position
+    high = last_position + sign * _UNKNOWN_END  # until an iterate lies beyond the root
+    x = last_position + sign * max(abs(displacement) - r * friction, 0.0)
     evaluated = x
     residual = 0.0
     steepest = port
@@ -265,7 +266,7 @@ def forces_at_last_position(
     tolerance : float
         Relative accuracy to which the position must be solved.
     """
-    last = memory[port, POSITION]
+    last_position = memory[port, POSITION]
     force = 0.0
     friction = 0.0
     tolerance = 1e-12
@@ -279,7 +280,7 @@ def forces_at_last_position(
         memory[j, FORCE] = 0.0
         if speed.is_dry_friction(ports.parameters[j]):
             largest, _ = laws.force_and_slope(
-                ports.law_number[j], ports.parameters[j], memory[j], last, h
+                ports.law_number[j], ports.parameters[j], memory[j], last_position, h
             )
             friction += largest
     return force, friction, tolerance
@@ -304,12 +305,12 @@ def share_friction(
     friction : float
         Sum of the largest forces.
     """
-    last = memory[port, POSITION]
+    last_position = memory[port, POSITION]
     for j in range(len(ports.law_number)):
         is_of_port = ports.leader[j] == port and ports.depends_on_speed[j] == 1
         if is_of_port and speed.is_dry_friction(ports.parameters[j]):
             largest, _ = laws.force_and_slope(
-                ports.law_number[j], ports.parameters[j], memory[j], last, h
+                ports.law_number[j], ports.parameters[j], memory[j], last_position, h
             )
             memory[j, FORCE] = force * largest / friction
 
@@ -340,14 +341,14 @@ def port_forces(
 
     Returns
     -------
-    total : float
+    total_force : float
         Sum of the forces.
     slope : float
         1 + r times the sum of their derivatives by `x`.
     steepest : int
         The law whose force rises most steeply.
     """
-    total = 0.0
+    total_force = 0.0
     slope = 1.0
     largest_slope = -1.0
     for j in range(len(ports.law_number)):
@@ -364,5 +365,5 @@ def port_forces(
             if force_slope > largest_slope:
                 steepest = j
                 largest_slope = force_slope
-        total += memory[j, FORCE]
-    return total, slope, steepest
+        total_force += memory[j, FORCE]
+    return total_force, slope, steepest

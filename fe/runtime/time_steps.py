@@ -57,9 +57,9 @@ class Boundaries:
         if np.ptp(self.lengths) <= LENGTH_TOLERANCE * usual:
             return DistinctLengths(self.lengths[:1], np.zeros(len(self.lengths), dtype=np.int64))
         rounded = np.round(self.lengths / (LENGTH_TOLERANCE * usual))
-        _, first, number = np.unique(rounded, return_index=True, return_inverse=True)
+        _, first_of_length, number = np.unique(rounded, return_index=True, return_inverse=True)
         return DistinctLengths(
-            length=np.ascontiguousarray(self.lengths[first]),
+            length=np.ascontiguousarray(self.lengths[first_of_length]),
             length_of_step=np.asarray(number, dtype=np.int64).ravel(),
         )
 

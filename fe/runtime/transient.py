@@ -109,7 +109,7 @@ class ModalIntegrator:
     # ------------------------------------------------------------ states at rest
 
     def equilibrium(
-        self, load: npt.ArrayLike, previous: TransientState | None = None
+        self, load: npt.ArrayLike, previous_state: TransientState | None = None
     ) -> TransientState:
         """Return the equilibrium under loads, as a state without motion.
 
@@ -117,7 +117,7 @@ class ModalIntegrator:
         ----------
         load : (L,) array_like
             Coefficients of the loads.
-        previous : TransientState, optional
+        previous_state : TransientState, optional
             The equilibrium from which the loads are reached, by default that without loads.
 
         Raises
@@ -130,15 +130,15 @@ class ModalIntegrator:
         if not self._law_count:
             return TransientState(no_motion, no_motion, loads)
         assert self._laws is not None
-        if previous is None:
+        if previous_state is None:
             unloaded = np.zeros(self._responses.load_count)
             memory = self._laws.unloaded_memory()
-            previous = TransientState(no_motion, no_motion, unloaded, memory)
+            previous_state = TransientState(no_motion, no_motion, unloaded, memory)
         _, memory = self._law_forces_at_rest(
             linear_positions=self._responses.port_positions_by_loads @ loads,
             compliance=self._responses.port_compliance,
-            memory=previous.memory,
-            start=self._responses.port_positions_by_loads @ previous.load,
+            memory=previous_state.memory,
+            start=self._responses.port_positions_by_loads @ previous_state.load,
         )
         return TransientState(no_motion, no_motion, loads, memory)
 
@@ -407,7 +407,9 @@ class ModalIntegrator:
 
     # ------------------------------------------------------------ change of health
 
-    def take_over(self, state: TransientState, previous: "ModalIntegrator") -> TransientState:
+    def take_over(
+        self, state: TransientState, previous_integrator: "ModalIntegrator"
+    ) -> TransientState:
         """Return the state of another integrator in the modes of this one, if health changes.
 
         Displacement and velocity of the structure stay what they were; they are projected on the
@@ -419,12 +421,12 @@ class ModalIntegrator:
         ----------
         state : TransientState
             A state of the other integrator.
-        previous : ModalIntegrator
+        previous_integrator : ModalIntegrator
             The other integrator, of the same model.
         """
         load = state.load
         memory = state.memory
-        if self._laws is not None and not _has_same_laws(self._laws, previous._laws):
+        if self._laws is not None and not _has_same_laws(self._laws, previous_integrator._laws):
             memory = self._laws.unloaded_memory()
             if not state.moves:  # the equilibrium is reached from no load
                 load = np.zeros_like(load)
@@ -433,9 +435,9 @@ class ModalIntegrator:
         if self.structure.holding_load is not None:
             load = load.copy()
             load[self.structure.holding_load] = 0.0
-        residual = previous._responses.residual_displacements[:, : len(load)] @ load
-        displacement = previous.structure.mode_shapes @ state.displacement + residual
-        velocity = previous.structure.mode_shapes @ state.velocity
+        residual = previous_integrator._responses.residual_displacements[:, : len(load)] @ load
+        displacement = previous_integrator.structure.mode_shapes @ state.displacement + residual
+        velocity = previous_integrator.structure.mode_shapes @ state.velocity
         projection = self.structure.modal_projection
         return TransientState(projection @ displacement, projection @ velocity, load, memory)
 

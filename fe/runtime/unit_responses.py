@@ -44,7 +44,7 @@ class UnitResponses:
 
     @cached_property
     def participation(self) -> FloatArray:
-        """Modal forces (M, L + J) of the unit loads."""
+        """Modal forces (M, L + J) of the unit loads: L loads, and forces at the ports of J laws."""
         return np.asarray(self.structure.mode_shapes.T @ self.structure.unit_loads)
 
     @cached_property

@@ -327,7 +327,7 @@ class WingRows:
         return np.asarray((1.0 - ratio) / (1.0 - soft_skin[0]))
 
     def _strain_under_lift(self, theta: FloatArray) -> FloatArray:
-        """Return gauge strains (G,) under lift, for coefficients (K + 2,) of the stiffness."""
+        """Return the strains of the G gauges under lift, given a coefficient of each stiffness."""
         stiffness = np.tensordot(theta, self.arrays.stiffness, 1)
         displacement = np.linalg.solve(stiffness, self.arrays.load_lift)
         return np.asarray(self.arrays.strain_rows[0] @ displacement)

@@ -218,11 +218,11 @@ class AffineStructure:
         """
         control_value = self._nominal_control(name) if value is None else value
         kilograms = _values_with_changes(self.masses, masses, "free mass")
-        total: FloatArray = np.zeros(self.unknowns)
+        total_load: FloatArray = np.zeros(self.unknowns)
         for term in self.load_terms:
             if term.load == name:
-                total = total + control_value * kilograms[term.mass] * term.vector
-        return total
+                total_load = total_load + control_value * kilograms[term.mass] * term.vector
+        return total_load
 
     def system_at(self, values: Values) -> SystemMatrices:
         """Return stiffness, mass and the sum of all loads at values by name.

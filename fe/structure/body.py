@@ -105,10 +105,10 @@ class Body(Generic[Mesh]):
     @property
     def nodal_mass(self) -> FloatArray:
         """Mass (nodes,) [kg] of cells and nominal point masses that each node carries."""
-        total: FloatArray = np.asarray(self.cell_mass.sum(axis=1))
+        nodal_masses: FloatArray = np.asarray(self.cell_mass.sum(axis=1))
         for point_mass in self.masses:
-            total = total + point_mass.mass * point_mass.weights.sum(axis=0)
-        return total
+            nodal_masses = nodal_masses + point_mass.mass * point_mass.weights.sum(axis=0)
+        return nodal_masses
 
     def affine_fields(
         self, design: StructureDesign, loads: Iterable[FloatArray], outputs: OutputRows

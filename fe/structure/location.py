@@ -124,8 +124,8 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     coincides = np.linalg.norm(nearest_points.residual, axis=1) <= 1e-9 * mesh.size
     is_inside = mesh.kind.contains(nearest_points.local, _INSIDE) & coincides
     if is_inside.any():
-        first = int(is_inside.argmax())
-        return int(cells[first]), nearest_points.local[first]
+        first_inside = int(is_inside.argmax())
+        return int(cells[first_inside]), nearest_points.local[first_inside]
     # outside: the nearest point of the surface, if it is near enough
     surface_point = on_surface(mesh, point, where)
     return int(surface_point.cell[0]), surface_point.local[0]
@@ -176,9 +176,9 @@ def _nearest_points(
             # Outside its cell the map may fold. Then there is no solution, wherever the step leads.
             metric[np.linalg.det(metric) == 0.0] = np.eye(3)
         change = np.linalg.solve(metric, edges @ residual[..., None]).squeeze(axis=-1)
-        previous = coordinates
+        previous_coordinates = coordinates
         coordinates = restrict(coordinates + change, metric)
-        largest_change = float(np.abs(coordinates - previous).max(initial=0.0))
+        largest_change = float(np.abs(coordinates - previous_coordinates).max(initial=0.0))
     return _NearestPoints(local_positions, residual, edges)
 
 
@@ -208,24 +208,25 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     along_first, along_second = np.moveaxis(nearest_points.edges, 1, 0)
     normal = unit_vector(np.cross(along_first, along_second))
     distance = np.linalg.norm(nearest_points.residual, axis=1)
-    best = int(distance.argmin())
-    size = float(spheres.radius[faces[best]])
-    if distance[best] > FARTHEST * size:
-        side = ", inside" if float(nearest_points.residual[best] @ normal[best]) < 0.0 else ""
+    nearest_face = int(distance.argmin())
+    size = float(spheres.radius[faces[nearest_face]])
+    if distance[nearest_face] > FARTHEST * size:
+        height = float(nearest_points.residual[nearest_face] @ normal[nearest_face])
+        side = ", inside" if height < 0.0 else ""
         raise InvalidDesignError(
-            f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
-            f"{mesh.source}{side}; the nearest point of the surface is "
-            f"{mesh.place(point - nearest_points.residual[best])}."
+            f"{where} lies {distance[nearest_face] / mesh.unit:.3g} {mesh.unit_name} off the "
+            f"surface of {mesh.source}{side}; the nearest point of the surface is "
+            f"{mesh.place(point - nearest_points.residual[nearest_face])}."
         )
     # all faces of one smooth surface that meet there
-    meets = distance <= distance[best] + _SAME_PLACE * size
-    is_same_side = normal @ normal[best] > _SAME_SIDE
+    meets = distance <= distance[nearest_face] + _SAME_PLACE * size
+    is_same_side = normal @ normal[nearest_face] > _SAME_SIDE
     meeting_faces = meets & is_same_side
     return SurfacePoint(
         cell=cells[meeting_faces],
         local=nearest_points.local[meeting_faces],
         normal=unit_vector(normal[meeting_faces].mean(axis=0)),
-        distance=float(distance[best]),
+        distance=float(distance[nearest_face]),
     )
 
 

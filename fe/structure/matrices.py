@@ -187,8 +187,10 @@ def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str) 
     if isinstance(output, Extension):
         assert output.nodes is not None
         assert output.length is not None
-        first, last = (files.direction_at(node, (x, y, z), where) for node in output.nodes)
-        return scale * (last - first) / output.length
+        first_direction, last_direction = (
+            files.direction_at(node, (x, y, z), where) for node in output.nodes
+        )
+        return scale * (last_direction - first_direction) / output.length
     assert output.node is not None
     return files.direction_at(output.node, (x, y, z), where)
 
@@ -354,9 +356,9 @@ def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
     count = int(is_faulty.sum())
     if not count:
         return
-    first = place_in_words(places[int(is_faulty.argmax())])
+    first_row = place_in_words(places[int(is_faulty.argmax())])
     count_text = f" ({count} rows are like it)" if count > 1 else ""
-    raise MeshError(f"{first} has {fault}{count_text}.")
+    raise MeshError(f"{first_row} has {fault}{count_text}.")
 
 
 def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:

@@ -157,7 +157,9 @@ def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
     return interval, (position - start) / (lines[interval + 1] - start)
 
 
-def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
+def straight_edged(
+    distance_aft: FloatArray, chord: FloatArray, thickness_ratio: float
+) -> FloatArray:
     """Return half thicknesses at mesh lines, so that straight edges fit the airfoil best.
 
     Straight edges between points of the airfoil would make the section too thin, the more so the
@@ -168,7 +170,7 @@ def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float
 
     Parameters
     ----------
-    behind : (nx + 1, ny + 1) array
+    distance_aft : (nx + 1, ny + 1) array
         Distances of the mesh lines from the leading edge at each station [m].
     chord : (ny + 1,) array
         Chord at the stations [m].
@@ -180,10 +182,10 @@ def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float
     (nx + 1, ny + 1) array
         The half thickness [m].
     """
-    width = np.diff(behind, axis=0)
-    on_airfoil = _half_thickness(behind, chord, thickness_ratio)
+    width = np.diff(distance_aft, axis=0)
+    on_airfoil = _half_thickness(distance_aft, chord, thickness_ratio)
     gram = _hat_function_gram(width)
-    moment = _airfoil_moments(behind, chord, thickness_ratio)
+    moment = _airfoil_moments(distance_aft, chord, thickness_ratio)
     # lines that bound a narrow cell belong to one group, which moves as one
     root_width = width.T[0]
     is_wide = root_width > _NARROW * root_width.max()

@@ -89,15 +89,15 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
     lines: list[MeshLine] = []
     for line in sorted(required, key=lambda line: (line.at(chords)[0], line.label)):
         if lines:
-            previous = lines[-1]
-            gaps = line.at(chords) - previous.at(chords)
+            previous_line = lines[-1]
+            gaps = line.at(chords) - previous_line.at(chords)
             if np.abs(gaps).max() <= _SAME:
                 continue
             if gaps.min() < SMALLEST_GAP:
                 raise MeshError(
-                    f"{line.label} and {previous.label} come closer than {SMALLEST_GAP * 1e3:g} mm "
-                    f"or cross between root and tip, at {line.at(chords)[0]:.5f} m; move one of "
-                    "them or put them on the same line."
+                    f"{line.label} and {previous_line.label} come closer than "
+                    f"{SMALLEST_GAP * 1e3:g} mm or cross between root and tip, at "
+                    f"{line.at(chords)[0]:.5f} m; move one of them or put them on the same line."
                 )
         lines.append(line)
     return lines

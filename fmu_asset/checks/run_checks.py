@@ -286,7 +286,9 @@ class RunChecks:
                         try:
                             self._step_with(asset, role, name, value)
                         except FmuError as error:
-                            limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
+                            # the unit of a plain number, "1", is not printed
+                            unit = "" if input_binding.unit == "1" else f" {input_binding.unit}"
+                            limit = f"{input_binding.variable} = {value:g}{unit}"
                             failures.append(f"{limit}: {one_line(error)}")
         if failures:
             text = (
@@ -372,9 +374,11 @@ def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
     return np.array(rows)
 
 
-def _first_difference(first: Float, second: Float) -> str:
+def _first_difference(first_run: Float, second_run: Float) -> str:
     """Return the first values that differ between two arrays of equal shape, for a message."""
     # Compare bits, since 0.0 and -0.0 are equal numbers.
-    differs = first.ravel().view(np.uint64) != second.ravel().view(np.uint64)
+    differs = first_run.ravel().view(np.uint64) != second_run.ravel().view(np.uint64)
     position = np.flatnonzero(differs)[0]
-    return f"first ({float(first.flat[position])!r}), then ({float(second.flat[position])!r})"
+    return (
+        f"first ({float(first_run.flat[position])!r}), then ({float(second_run.flat[position])!r})"
+    )

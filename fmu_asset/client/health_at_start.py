@@ -72,8 +72,8 @@ class _CheckedHistory(NamedTuple):
     def first_value(self, begin: int) -> npt.ArrayLike:
         """Return the value of a step, as the caller gave it."""
         if self.varies:
-            first: npt.ArrayLike = np.asarray(self.values)[begin]
-            return first
+            value: npt.ArrayLike = np.asarray(self.values)[begin]
+            return value
         return self.values
 
 

@@ -133,8 +133,8 @@ def _slice_or_index(
 ) -> "slice | np.ndarray[tuple[int], np.dtype[np.intp]]":
     """Return positions as a slice if they follow one another, which is faster, else as an array."""
     index = np.array(positions, dtype=np.intp)
-    first = int(index[0]) if len(index) else 0
-    end = first + len(index)
-    if np.array_equal(index, np.arange(first, end)):
-        return slice(first, end)
+    begin = int(index[0]) if len(index) else 0
+    end = begin + len(index)
+    if np.array_equal(index, np.arange(begin, end)):
+        return slice(begin, end)
     return index

@@ -248,9 +248,9 @@ class SteppedFmu(OpenedFmu):
             How the FMU ended its simulation, if it did.
         """
         length = max(1, _BLOCK_BYTES // max(requests[0].nbytes, replies[0].nbytes))
-        total = len(requests)
-        with reporter(progress).stage("Simulating", total=total, unit="steps") as stage:
-            for first in range(0, total, length):
+        step_count = len(requests)
+        with reporter(progress).stage("Simulating", total=step_count, unit="steps") as stage:
+            for first in range(0, step_count, length):
                 block = slice(first, first + length)
                 early_end = self._run_block(requests[block], replies[block], stage)
                 if early_end is not None:

@@ -169,15 +169,15 @@ def pythonfmu_version() -> str:
         If pythonfmu is not installed, or its version is not `PYTHONFMU_VERSION`.
     """
     try:
-        installed = version("pythonfmu")
+        installed_version = version("pythonfmu")
     except PackageNotFoundError:
-        installed = "none"
-    if installed != PYTHONFMU_VERSION:
+        installed_version = "none"
+    if installed_version != PYTHONFMU_VERSION:
         raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed; "
-            "install the project's requirements."
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed_version} is "
+            "installed; install the project's requirements."
         )
-    return installed
+    return installed_version
 
 
 def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[str, bytes]:

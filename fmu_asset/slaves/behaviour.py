@@ -380,12 +380,12 @@ class StructureBehaviour:
     def _take_effects(self, effects: SwitchableEffects) -> bool:
         """Apply the variables of the effects; return whether the effects have changed."""
         values = effects.values(self._tuned)
-        previous = self._active
-        if previous is not None and previous.values == values:
+        previous_effects = self._active
+        if previous_effects is not None and previous_effects.values == values:
             return False
         self._active = effects.active(values)
         # Other filters cannot continue with the memory of these.
-        if previous is None or previous.filters != self._active.filters:
+        if previous_effects is None or previous_effects.filters != self._active.filters:
             self._filters = None
         return True
 

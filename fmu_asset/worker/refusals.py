@@ -74,12 +74,12 @@ class RefusalReport:
         if not self.counts:
             return "The sandbox refused nothing."
         phrases = []
-        for kind, (count, first) in self.counts.items():
+        for kind, (count, first_refusal) in self.counts.items():
             singular, plural = _KINDS[kind]
             if count == 1:
-                phrases.append(f"1 {singular} ({first})")
+                phrases.append(f"1 {singular} ({first_refusal})")
             else:
-                phrases.append(f"{count} {plural} (first {first})")
+                phrases.append(f"{count} {plural} (first {first_refusal})")
         return f"The sandbox refused {', '.join(phrases)}."
 
 

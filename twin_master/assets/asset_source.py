@@ -483,11 +483,11 @@ class PairedSource(AssetSource):
         return self._believed.draws(seed)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted observations (E, S, U, G) of the believed model."""
+        """Return the believed model's observations (draws, states, controls, sensors)."""
         return self._believed.observation_table(draws, model)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return the values at the sensors (E, S, U, G) of the believed model."""
+        """Return the believed model's values at sensors (draws, states, controls, sensors)."""
         return self._believed.structural_table(draws, model)
 
     def write_field(

@@ -274,7 +274,7 @@ def scaled_likelihood(
 
 
 def _scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return likelihoods divided by the largest of each step, from their logarithms (B, T, S)."""
+    """Return likelihoods (twins, steps, states) over the largest of each step, from logs."""
     largest = log_likelihood.max(axis=2, keepdims=True)
     return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
 

@@ -388,8 +388,8 @@ class _FleetFlight:
         """
         stored_rows = set()
         for record, *_ in records(self._journal.path):
-            first, end = record["rows"]
-            stored_rows |= {(record["group"], row) for row in range(first, end)}
+            first_row, end_row = record["rows"]
+            stored_rows |= {(record["group"], row) for row in range(first_row, end_row)}
         remaining = []
         for shard in shards:
             rows = {(shard.group_number, member.row) for member in shard.members}
@@ -430,16 +430,16 @@ class _FleetFlight:
     def _store(self, group_number: int, members: Sequence[Member], result: ShardResult) -> None:
         """Write the result of successive members into the store, and then into the journal."""
         group = self._fleet.groups[group_number]
-        first = members[0].row
+        first_row = members[0].row
         end = members[-1].row + 1
         with explained_write_errors(self._folder / STORE_NAME):
             store = self._store_of(group.name)
             for path, values in result.variables.items():
-                store[path][first:end] = values
+                store[path][first_row:end] = values
         self._journal.append(
             {
                 "group": group_number,
-                "rows": [first, end],
+                "rows": [first_row, end],
                 "failures": _with_group_name(group, result.failures),
                 "ended": _with_group_name(group, result.ended),
             }

@@ -502,7 +502,7 @@ def _evidence_of_noise(
     Twins whose observations no course of states explains are left out.
     """
     probability = _with_all_transitions_possible(family.assumed)
-    total = 0.0
+    total_log_evidence = 0.0
     for knowledge, observed_rows, control in observations:
         if nodes is None:
             model = with_noise_factor(knowledge.sensor_model, factor)
@@ -513,12 +513,12 @@ def _evidence_of_noise(
             model = with_noise_factor(knowledge.sensor_model, factor, nodes.predicted)
             at_nodes = parameter_evidence(family, probability, model, observed_rows, control)
             log_evidence = _average_over_nodes(at_nodes, nodes.prior)
-        total += float(log_evidence[np.isfinite(log_evidence)].sum())
-    return total
+        total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
+    return total_log_evidence
 
 
 def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
-    """Return the log evidence (B,) averaged over nodes with a prior (E,), from (B, E) at nodes."""
+    """Return the log evidence of B twins averaged over E nodes, whose prior is given."""
     largest = log_evidence.max(axis=1, keepdims=True)  # keeps the exponential from underflowing
     return np.asarray(largest[:, 0] + np.log(np.exp(log_evidence - largest) @ prior))
 

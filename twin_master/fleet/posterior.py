@@ -95,14 +95,14 @@ class Distribution:
         # Leave out the tails, whose logarithms would make the spline swing, but keep the four
         # points that a cubic spline needs.
         relevant = np.flatnonzero(self.weight > NEGLIGIBLE_WEIGHT * self.weight.max())
-        first = max(0, min(relevant[0], len(self.x) - 4))
+        begin = max(0, min(relevant[0], len(self.x) - 4))
         end = max(4, relevant[-1] + 1)
-        x = self.x[first:end]
+        x = self.x[begin:end]
         fine_x = np.linspace(x[0], x[-1], FINE_POINTS)
         # The weights at both ends are those of half an interval: double them for the density.
         density = self.weight.copy()
         density[[0, -1]] *= 2.0
-        log_density = np.log(np.maximum(density[first:end], NEGLIGIBLE_WEIGHT * density.max()))
+        log_density = np.log(np.maximum(density[begin:end], NEGLIGIBLE_WEIGHT * density.max()))
         fine_density = np.exp(CubicSpline(x, log_density)(fine_x) - log_density.max())
         fine_density[[0, -1]] *= 0.5  # the ends of the fine grid have half an interval, too
         return fine_x, fine_density / fine_density.sum()

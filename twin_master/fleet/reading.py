@@ -170,7 +170,7 @@ def notice_counts(group: "xr.DataTree", kind: str) -> Index:
 
 
 def believed_means(group: "xr.DataTree") -> Float:
-    """Return the mean states of B twins in T steps, a (B, T, F) array in SI units.
+    """Return the mean of F state factors of B twins in T steps, a (B, T, F) array in SI units.
 
     They are NaN in steps in which the probability that no state of the model explains the
     observations is above `BELIEVED`.
@@ -180,11 +180,11 @@ def believed_means(group: "xr.DataTree") -> Float:
 
 
 def last_steps(group: "xr.DataTree") -> Index:
-    """Return the number of the last flown step of each twin, a (B,) array; 0 if none was flown."""
+    """Return the number of the last flown step of each of B twins: (B,); 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
     flown_steps = (stored_values(group, "observed/control_index") >= 0).sum(axis=1)
-    last: Index = np.maximum(flown_steps - 1, 0)
-    return last
+    last_step: Index = np.maximum(flown_steps - 1, 0)
+    return last_step
 
 
 def severity(scenario: Scenario, mean: ArrayLike) -> Float:

@@ -78,7 +78,7 @@ def _interpolated_posterior(
     from scipy.interpolate import CubicSpline  # slow to import; only a twin that learns needs it
 
     # The considered draws with one neighbour on either side.
-    first = max(int(considered[0]) - 1, 0)
+    begin = max(int(considered[0]) - 1, 0)
     end = min(int(considered[-1]) + 2, len(values))
 
     # Each draw stands for the interval that ends half way to its neighbours. The interval of an
@@ -88,7 +88,7 @@ def _interpolated_posterior(
     edges[-1] += values[-1] - edges[-2]
 
     # Prior mass of the cells of a fine grid.
-    grid = np.linspace(edges[first], edges[end], _GRID_POINTS)
+    grid = np.linspace(edges[begin], edges[end], _GRID_POINTS)
     middle = 0.5 * (grid[1:] + grid[:-1])
     prior_distribution = np.concatenate([[0.0], np.cumsum(prior)])
     prior_mass = np.diff(np.interp(grid, edges, prior_distribution))
@@ -96,7 +96,7 @@ def _interpolated_posterior(
     # Posterior mass of the cells. The log evidence of negligible neighbours may be minus infinity;
     # it is raised to a finite floor for the spline.
     floor = np.min(log_evidence[considered]) - _LARGEST_LOG_RATIO
-    spline = CubicSpline(values[first:end], np.maximum(log_evidence[first:end], floor))
+    spline = CubicSpline(values[begin:end], np.maximum(log_evidence[begin:end], floor))
     log_evidence_on_grid = spline(middle)
     mass = prior_mass * np.exp(log_evidence_on_grid - log_evidence_on_grid.max())
     mass /= mass.sum()

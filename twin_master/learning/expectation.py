@@ -214,7 +214,7 @@ class LearntExpectation:
         return self._expect(hypotheses, np.ascontiguousarray(weight), controls, observation)
 
     def _draw_weight(self, learnt: Mapping[str, Learnt]) -> Float:
-        """Return weights (E,) of the draws with the learnt mean and deviation of the parameter."""
+        """Return weights of the E draws with the learnt mean and deviation of the parameter."""
         prior_weight = self.learning.sensor_model.draw_weight
         parameter = self.learning.parameter
         if parameter is None or parameter.name not in learnt:
@@ -232,7 +232,7 @@ class LearntExpectation:
     def _gauge_moments(
         self, learnt: Mapping[str, Learnt], name: str, default: float
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation (G,) of a quantity that each gauge may have learnt.
+        """Return mean and standard deviation of a quantity that each of G gauges may have learnt.
 
         If a gauge has not learnt the quantity, its value is the default, with deviation zero.
         """
@@ -245,7 +245,7 @@ class LearntExpectation:
 
     @cached_property
     def _closed_loop(self) -> Float:
-        """The transitions p(D' | D) under the policy: (S, S)."""
+        """The transitions p(D' | D) of the S states under the policy: (S, S)."""
         matrix = self.learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
@@ -382,7 +382,7 @@ class LearntExpectation:
 
 
 def _insert_state_and_control(values: Float) -> Float:
-    """Return values (K, G) as (K, 1, 1, G), with axes for states and controls."""
+    """Return values (K, G) of hypotheses and gauges with axes for state and control inserted."""
     return values[:, None, None]
 
 

@@ -94,12 +94,12 @@ class FreeGainStatistics:
 
     @classmethod
     def from_array(cls, array: Float) -> "FreeGainStatistics":
-        """Return a copy of the statistics in an array (G, 5), in the order of the fields."""
+        """Return the statistics of G gauges from an array (G, 5), in the order of the fields."""
         free_probability, fixed_squares, sum_cc, sum_cx, free_squares = array.T.copy()
         return cls(free_probability, fixed_squares, sum_cc, sum_cx, free_squares)
 
     def as_array(self) -> Float:
-        """Return the statistics as an array (G, 5), in the order of the fields."""
+        """Return the statistics of G gauges as an array (G, 5), in the order of the fields."""
         return np.column_stack(
             [
                 self.free_probability,
@@ -184,10 +184,10 @@ def update_model(
     # pairs may be larger: they are cut to zero, so that they do not overflow, and not used.
     largest = log_likelihood[considered].max()
     belief *= np.where(considered, np.exp(np.minimum(log_likelihood - largest, 0.0)), 0.0)
-    total = belief.sum()
-    belief /= total
+    probability = belief.sum()
+    belief /= probability
     squares += belief @ observation.residual**2
-    return float(largest + np.log(total)), kernel
+    return float(largest + np.log(probability)), kernel
 
 
 @compiled
@@ -256,7 +256,7 @@ def update_gauge_faults(
             largest = max(largest, weight[n])
 
         # Weights of the pairs, and what they add to the sums.
-        total = 0.0
+        total_weight = 0.0
         added_squares = 0.0
         added_cc = 0.0
         added_cx = 0.0
@@ -267,20 +267,20 @@ def update_gauge_faults(
                 variance = 1.0 + c * c * gain_variance
                 deviation = np.sqrt(variance) if is_present[g] else 1.0
                 weight[n] = fault_belief[n] * np.exp(weight[n] - largest) / deviation
-                total += weight[n]
+                total_weight += weight[n]
                 added_cc += weight[n] * c * c
                 added_cx += weight[n] * c * x
                 added_squares += weight[n] * (x - c * fitted_gain) ** 2 / variance
-        log_evidence[g, k] = largest + np.log(total) if total > 0.0 else -np.inf
+        log_evidence[g, k] = largest + np.log(total_weight) if total_weight > 0.0 else -np.inf
 
         # Normalised belief, and the sums.
         for n in range(len(fault_belief)):
             if fault_belief[n] > 0.0:
-                fault_belief[n] = weight[n] / total
-        if total > 0.0:
-            squares[g, k] += added_squares / total
-            sum_cc[g, k] += added_cc / total
-            sum_cx[g, k] += added_cx / total
+                fault_belief[n] = weight[n] / total_weight
+        if total_weight > 0.0:
+            squares[g, k] += added_squares / total_weight
+            sum_cc[g, k] += added_cc / total_weight
+            sum_cx[g, k] += added_cx / total_weight
     return log_evidence
 
 
@@ -344,8 +344,8 @@ def update_free_gains(
     log_density = model.log_likelihood[considered] + log_mixture.sum(axis=1)
     largest = log_density.max()
     weight = belief[considered] * np.exp(log_density - largest)
-    total = weight.sum()
-    weight /= total
+    total_weight = weight.sum()
+    weight /= total_weight
     belief[considered] = weight
 
     # Statistics, expected over the pairs.
@@ -356,4 +356,4 @@ def update_free_gains(
     statistics.sum_cc = statistics.sum_cc + weight @ c**2
     statistics.sum_cx = statistics.sum_cx + weight @ (c * x)
     statistics.free_squares = statistics.free_squares + weight @ (innovation**2 / variance)
-    return float(largest + np.log(total))
+    return float(largest + np.log(total_weight))

@@ -171,9 +171,11 @@ class HypothesisWeights:
         """
         self.current = self.current + log_ratio
         self.hidden = self.hidden + log_ratio[RECOVERED]
-        total = np.logaddexp(np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden))
-        self.current -= total
-        self.hidden -= total
+        log_total_weight = np.logaddexp(
+            np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden)
+        )
+        self.current -= log_total_weight
+        self.hidden -= log_total_weight
 
     @property
     def log_right_after_fault(self) -> float:
@@ -188,7 +190,7 @@ class HypothesisWeights:
 
     @property
     def gauge_fault_probability(self) -> Float:
-        """Probability of each gain error of each gauge (G K,), whether this shows or not."""
+        """Probability of each of K gain errors of G gauges (G K,), whether it shows or not."""
         log_hidden = self.hidden[GAUGES_OF_FAULTS]
         return np.asarray(np.exp(np.logaddexp(self.current[GAUGE_FAULTS], log_hidden)))
 

@@ -293,7 +293,7 @@ class LearningFilter:
         return result
 
     def _restore_draw_weights(self, log_belief: Float) -> Float:
-        """Give the draws of a log belief (K, S) their prior weights again, in every state.
+        """Give the draws of a log belief (hypotheses, states) their prior weights again.
 
         The weights of the transition factors stay as they are.
         """

@@ -54,7 +54,7 @@ class NoticeWriter:
     hypothesis_names: tuple[str, ...]
 
     def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
-        """Return whether each reading (G,) is implausible in every state under a control.
+        """Return for each of G gauges whether its reading is implausible in every state.
 
         A missing reading (NaN) is not absurd.
         """
@@ -130,19 +130,19 @@ class NoticeWriter:
 
         The state of the watch remembers which one is followed.
         """
-        best = max(hypotheses, key=lambda hypothesis: hypothesis.probability)
-        if best is hypotheses[0]:
+        most_probable = max(hypotheses, key=lambda hypothesis: hypothesis.probability)
+        if most_probable is hypotheses[0]:
             followed_hypothesis = 0
-        elif best.belief is None:
+        elif most_probable.belief is None:
             followed_hypothesis = -1
         else:
-            followed_hypothesis = self.hypothesis_names.index(best.name) + 1
-        if best.probability <= 0.5 or followed_hypothesis == state.followed_hypothesis:
+            followed_hypothesis = self.hypothesis_names.index(most_probable.name) + 1
+        if most_probable.probability <= 0.5 or followed_hypothesis == state.followed_hypothesis:
             return []
         state.followed_hypothesis = followed_hypothesis
 
         sensors = f"{self.wording.sensor}s"
-        probability = f"(probability {best.probability:.3g})"
+        probability = f"(probability {most_probable.probability:.3g})"
         if followed_hypothesis == 0:
             sentence = f"the model explains the {sensors} again {probability}."
         elif followed_hypothesis < 0:
@@ -153,12 +153,12 @@ class NoticeWriter:
         else:
             or_the_asset = f"{_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}"
             sentence = (
-                f"{best.name}: belief and decision follow the other {sensors} {probability}. "
-                f"{or_the_asset}: these data cannot tell."
+                f"{most_probable.name}: belief and decision follow the other {sensors} "
+                f"{probability}. {or_the_asset}: these data cannot tell."
             )
         numbers = (followed_hypothesis,) if followed_hypothesis > 0 else ()
         sentence = f"{self._step_text(step)}: {sentence}"
-        return [Notice("hypothesis", sentence, numbers, best.probability)]
+        return [Notice("hypothesis", sentence, numbers, most_probable.probability)]
 
     def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
         """Return the alarms that are raised in this step, and mark them as raised in `state`.

@@ -73,7 +73,7 @@ class RegressionSums(NamedTuple):
 
     @classmethod
     def view(cls, array: Float) -> "RegressionSums":
-        """Return the sums that an array (K, G, 6) holds, without a copy."""
+        """Return the sums in an array (K, G, 6) for K hypotheses and G gauges, without a copy."""
         return cls._make(np.moveaxis(array, -1, 0))
 
 
@@ -265,7 +265,7 @@ def _add_log_densities(
     observation, draw, prediction, inverse_deviation = readings
     for k in range(result.shape[0]):
         for s in range(result.shape[1]):
-            total = 0.0
+            log_density = 0.0
             # Products over gauges of the same power: Student's kernels, and predictive variances.
             kernel_product = 1.0
             variance_product = 1.0
@@ -290,7 +290,9 @@ def _add_log_densities(
                 power = 0.5 * (degrees + count[g] + 1.0) if degrees > 0.0 else 0.0
                 too_large = kernel_product > LARGEST_PRODUCT or variance_product > LARGEST_PRODUCT
                 if power != product_power or too_large:
-                    total -= product_power * np.log(kernel_product) + 0.5 * np.log(variance_product)
+                    log_density -= product_power * np.log(kernel_product) + 0.5 * np.log(
+                        variance_product
+                    )
                     kernel_product = 1.0
                     variance_product = 1.0
                     product_power = power
@@ -299,9 +301,9 @@ def _add_log_densities(
                     scaled_variance = (degrees + fit.residual_squares[k, g]) * variance
                     kernel_product *= 1.0 + x * x / scaled_variance
                 else:
-                    total -= 0.5 * x * x / variance
+                    log_density -= 0.5 * x * x / variance
             log_kernels = product_power * np.log(kernel_product)
-            result[k, s] += total - log_kernels - 0.5 * np.log(variance_product)
+            result[k, s] += log_density - log_kernels - 0.5 * np.log(variance_product)
 
 
 @compiled

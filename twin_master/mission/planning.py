@@ -36,7 +36,7 @@ _BISECTIONS = 4
 
 
 def discounts(scenario: Scenario) -> Float:
-    """Return the discount factor of each control (U,); zero if the control ends the mission."""
+    """Return the discount factor of each of U controls; zero if the control ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
 
@@ -101,25 +101,25 @@ def plan_within_limit(
 
     # Raise the price until the bound holds.
     too_low = 0.0
-    best = plan_with_price(1.0)
-    while not keeps_limit(best):
-        too_low = best.price
-        price = 4.0 * best.price
+    cheapest_plan = plan_with_price(1.0)
+    while not keeps_limit(cheapest_plan):
+        too_low = cheapest_plan.price
+        price = 4.0 * cheapest_plan.price
         if price > _LARGEST_PRICE:
             raise PlanningError(
                 f"no plan keeps the probability beyond a health limit at {allowed_probability:g}: "
                 "allow more, or give the scenario a gentler control or a repair"
             )
-        best = plan_with_price(price)
+        cheapest_plan = plan_with_price(price)
 
-    # Bisect between the largest price that is too low and the best one.
+    # Bisect between the largest price known to be too low and the lowest price that suffices.
     for _ in range(_BISECTIONS):
-        middle = plan_with_price(0.5 * (too_low + best.price))
+        middle = plan_with_price(0.5 * (too_low + cheapest_plan.price))
         if keeps_limit(middle):
-            best = middle
+            cheapest_plan = middle
         else:
             too_low = middle.price
-    return best
+    return cheapest_plan
 
 
 def _probability_beyond_limit(rewards: RewardModel) -> Float:

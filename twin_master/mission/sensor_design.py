@@ -162,7 +162,7 @@ def _draw_under_control(
 
 
 def _loading_of_parameter(sensors: GaussianSensorModel, control: int) -> Float:
-    """Return the change of each sensor in each state by the calibrated parameter (S, G, 1), SI.
+    """Return the change of G sensors in S states by the calibrated parameter, (S, G, 1), SI.
 
     If the sensors depend on the parameter linearly, its draws move them along one direction. This
     is the first singular vector of the deviations of the draws, times its singular value.

@@ -190,7 +190,7 @@ class _StatelessAssets:
         return _TrueStates(state_index, self._states.coordinates[state_index])
 
     def _observe(self, step: int, asset: int, control_index: int, state: Float) -> Float | str:
-        """Return the observation of an asset without noise (G,), SI, or the text of its error."""
+        """Return the values of an asset's G sensors without noise, SI, or the text of its error."""
         key = (asset, control_index, state.tobytes())
         if key not in self._observations:
             control = self._scenario.control[control_index]
@@ -326,7 +326,7 @@ class _Formation:
         flights.unexplained[is_flying, step] = 0.0  # none of these twins gives notices
 
     def _decide(self, filtered_belief: Float) -> Index:
-        """Return the next control of each twin (B,), within the budget of inspections."""
+        """Return the next control of each of B twins, within the budget of inspections."""
         knowledge = self._knowledge
         planner = knowledge.scenario.planner
         policy_on_belief = knowledge.plan.on_belief

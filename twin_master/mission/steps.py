@@ -417,7 +417,7 @@ class DamageGrowth:
 
 
 def _possible_states(probability: Float) -> _NextStates:
-    """Return the states of positive probability (S,) with their cumulative probability."""
+    """Return the states that have a positive probability, with their cumulative probability."""
     possible_states = np.flatnonzero(probability > 0.0)
     return _NextStates(np.cumsum(probability[possible_states]), possible_states)
 
@@ -425,8 +425,10 @@ def _possible_states(probability: Float) -> _NextStates:
 def _draw(states: _NextStates, uniform: Float) -> Index:
     """Return a state for each uniform random number, by inverse transform sampling."""
     # Rounding may leave the last cumulative probability a little below one.
-    last = len(states.state_indices) - 1
-    position = np.searchsorted(states.cumulative_probability, uniform, side="right").clip(max=last)
+    last_position = len(states.state_indices) - 1
+    position = np.searchsorted(states.cumulative_probability, uniform, side="right").clip(
+        max=last_position
+    )
     return np.asarray(states.state_indices[position])
 
 
@@ -550,7 +552,7 @@ class Plant:
         )
 
     def _state_in_asset(self, reading: AssetReading) -> Float:
-        """Return the true state (F,) that an asset with damage of its own reports."""
+        """Return the F true state factors that an asset with damage of its own reports."""
         if reading.state is None:
             raise MissionInputError(
                 f"step {self.step}: the asset does not report its damage, which the table `truth` "

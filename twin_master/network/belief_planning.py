@@ -57,7 +57,7 @@ class _Bounds:
         self.control = np.arange(controls)  # (N,), the first control of each vector
 
     def lower_bound_at(self, rows: Float) -> Float:
-        """Return the lower bound at rows (K, S) of probabilities that need not sum to one: (K,)."""
+        """Return the lower bound at K rows of S probabilities that need not sum to one: (K,)."""
         return np.asarray((rows @ self.vectors.T).max(axis=1))
 
     def backup(self, control: int, rows: Float) -> Float:

@@ -288,12 +288,12 @@ class ExactFilter:
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         log_likelihood = self._sensor_model.log_likelihood(observation, control_index)
-        previous = None
+        previous_belief = None
         if before is not None:
-            previous = (before.arrays["log_filtered"], before.control_index)
+            previous_belief = (before.arrays["log_filtered"], before.control_index)
         try:
             filtered_steps = filter_sequence(
-                self.model, [control_index], log_likelihood[None], previous
+                self.model, [control_index], log_likelihood[None], previous_belief
             )
         except ImpossibleObservation:
             worst_residuals = getattr(self._sensor_model, "worst_residuals", None)

@@ -301,13 +301,13 @@ class GraphicalModel:
 
     @cached_property
     def log_prior(self) -> Float:
-        """Log of the prior (S,), minus infinity where it is zero."""
+        """Log of the prior of the S states, minus infinity for a prior of zero."""
         with np.errstate(divide="ignore"):
             result: Float = np.log(self.prior)
         return result
 
     def policy(self, rows: ArrayLike) -> Float:
-        """Return a checked policy p(U | D): (S, U), read-only, row-stochastic.
+        """Return a policy p(control | state), checked and read-only: (states, controls).
 
         Raises
         ------
@@ -366,7 +366,7 @@ def repaired_table(table: Float, success: float) -> Float:
 
 
 def leaving_table(table: Float, factor: float) -> Float:
-    """Return transitions (L, L) with the probabilities to leave a level multiplied by a factor.
+    """Return transitions of L levels (L, L), with all probabilities to leave times a factor.
 
     Raises
     ------

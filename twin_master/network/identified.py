@@ -78,7 +78,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         return np.asarray(average)
 
     def _log_density_of_row(self, observation: Float, control_index: int) -> Float:
-        """Return the log density of one row in each state, for each draw: (S, E)."""
+        """Return the log density of one row in each of S states, for each of E draws: (S, E)."""
         row = np.array(observation, dtype=np.float64)
         count = self.sensor_count
         values = self.check_observation(row[:count])
@@ -89,16 +89,16 @@ class IdentifiedSensorModel(GaussianSensorModel):
 
         # Covariance in each state: identification, noise and model error, interval of the state.
         shape = (self.state_count, present_columns.size, present_columns.size)
-        total = np.array(
+        total_covariance = np.array(
             np.broadcast_to(covariance[np.ix_(present_columns, present_columns)], shape)
         )
         diagonal = np.arange(present_columns.size)
         noise = self.independent_standard_deviation[:, control_index, present_columns]
-        total[:, diagonal, diagonal] += noise**2
+        total_covariance[:, diagonal, diagonal] += noise**2
         interval = self.interval[:, control_index, present_columns]
-        total += interval @ interval.swapaxes(1, 2)
+        total_covariance += interval @ interval.swapaxes(1, 2)
         try:
-            root = np.linalg.cholesky(total)
+            root = np.linalg.cholesky(total_covariance)
         except np.linalg.LinAlgError:
             raise InvalidObservationError(
                 "the covariance of the observation is not positive definite"

@@ -174,7 +174,7 @@ def filter_many(
 
 
 def log_forecast(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
-    """Return log beliefs (B, S) one transition later, each under its control (B,).
+    """Return the log beliefs (B, S) of B twins after a transition, each under its control.
 
     A belief need not sum to one; its sum is kept.
     """

@@ -66,7 +66,7 @@ def _exp(value: float) -> float:
 def apply_blocks(
     lists: PredecessorLists, control: int, before: Float, after: Float, work: Float
 ) -> None:
-    """Fill `after` (S,) with the numbers `before` (S,) after every block of a transition.
+    """Fill `after` with the numbers `before`, one for each state, after all blocks of a transition.
 
     A block is applied along the first axis of the joint state, which becomes the last one. So after
     all blocks the order of the axes is as before. `work` (S,) is work space.

@@ -82,6 +82,6 @@ def _information(joint: Float) -> float:
     """
     observation_weight = joint.sum(axis=1, keepdims=True)
     state_weight = joint.sum(axis=0)
-    total = joint.sum()
-    independent = observation_weight * state_weight / total
-    return float(rel_entr(joint, independent).sum() / total / np.log(2.0))
+    joint_sum = joint.sum()
+    independent = observation_weight * state_weight / joint_sum
+    return float(rel_entr(joint, independent).sum() / joint_sum / np.log(2.0))

@@ -374,7 +374,7 @@ class _DecisionProcess:
         return np.asarray(self.reward + self.discount * np.stack(expected_returns, axis=1))
 
     def rounding_error(self, value: Float) -> Float:
-        """Return the largest rounding error of an action value in each state: (S,).
+        """Return the largest rounding error of an action value in each of S states: (S,).
 
         It is proportional to the sum of the absolute values of the terms.
         """

@@ -143,12 +143,12 @@ class QuantityModel:
 
     @cached_property
     def mean(self) -> Float:
-        """Mean over the draws (S, U, G)."""
+        """Mean over the draws, by state, control and sensor: (S, U, G)."""
         return np.asarray(np.tensordot(self.draw_weight, self.value_per_draw, axes=1))
 
     @cached_property
     def variance(self) -> Float:
-        """Variance over the draws (S, U, G)."""
+        """Variance over the draws, by state, control and sensor: (S, U, G)."""
         deviation = self.value_per_draw - self.mean
         return np.asarray(np.tensordot(self.draw_weight, deviation**2, axes=1))
 
@@ -348,7 +348,7 @@ class RewardModel:
         return mean, variance
 
     def planning_reward(self, health_weight: float, control_weight: float) -> Float:
-        """Return the expected reward of each state and control for planning, eq. (36): (S, U)."""
+        """Return the expected reward for planning, by state and control, eq. (36): (S, U)."""
         mean_health, _ = self._health_moments
         weighted_control = np.multiply(control_weight, self.control_reward)
         return np.asarray(health_weight * mean_health + weighted_control)

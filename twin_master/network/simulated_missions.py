@@ -132,14 +132,14 @@ def leaving_probability(
 
 
 def _rows_of_states(problem: DecisionProblem, control: int, states: Index) -> Float:
-    """Return p(next state | state, control) for states (B,): (B, S)."""
+    """Return p(next state | state, control) for the states of B missions: (B, S)."""
     distinct, index_of_distinct = np.unique(states, return_inverse=True)
     distributions = [problem.transition.row(control, state) for state in distinct.tolist()]
     return np.array(distributions)[index_of_distinct]
 
 
 def _normalize(rows: Float) -> Float:
-    """Return rows (B, S) divided by their sums."""
+    """Return rows of B missions, each divided by its sum."""
     return np.asarray(rows / rows.sum(axis=1, keepdims=True))
 
 

@@ -162,7 +162,7 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
 
 
 def transition_bytes(states: int, controls: int) -> float:
-    """Return the size of one table of transitions (U, S, S) [bytes]."""
+    """Return the size of a table of transitions of S states under U controls, (U, S, S) [bytes]."""
     return float(NUMBER * controls * states * states)
 
 
@@ -265,7 +265,7 @@ class TransitionModel:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Numbers of controls, states and states (U, S, S)."""
+        """Numbers of controls, states before and states after a transition (U, S, S)."""
         size = prod(block.shape[1] for block in self.blocks)
         return len(self.blocks[0]), size, size
 
@@ -276,7 +276,7 @@ class TransitionModel:
 
     @cached_property
     def matrix(self) -> Float:
-        """The table of all states (U, S, S).
+        """The table of all transitions: control, state before, state after (U, S, S).
 
         Raises
         ------
@@ -313,7 +313,7 @@ class TransitionModel:
         )
 
     def rows(self, control: Index, state: Index) -> Float:
-        """Return p(D_t | D_{t-1} = state, control) of N pairs of a control and a state: (N, S)."""
+        """Return the distribution of the next state for N pairs of control and state: (N, S)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
         # Kronecker product over the blocks, for all N pairs at once.
         probability = np.ones((len(state), 1))
@@ -325,7 +325,7 @@ class TransitionModel:
         return probability
 
     def forward(self, control: int, belief: Float) -> Float:
-        """Return beliefs (..., S) one step later, without logarithms."""
+        """Return beliefs (..., S) over the S states one step later, without logarithms."""
         if not self.is_product:
             return np.asarray(belief @ self.blocks[0][control])
         return _apply_along_axes([block[control].T for block in self.blocks], belief)

@@ -225,7 +225,7 @@ class UpperBound:
         return composition
 
     def bound_at(self, rows: Float) -> Float:
-        """Return the bound at rows (K, S) of probabilities that need not sum to one: (K,)."""
+        """Return the bound at K rows of S probabilities that need not sum to one: (K,)."""
         return self._compose(rows).bound
 
     def action_bound(self, belief: Float) -> Float:

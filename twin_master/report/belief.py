@@ -66,7 +66,7 @@ def _joint_figure(run: Run) -> Figure:
     steps = belief_steps(run)
     columns = min(4, len(steps))
     rows = -(-len(steps) // columns)  # rounded up
-    right = 0.115 + 0.785 * columns / 4
+    right_edge = 0.115 + 0.785 * columns / 4
     figure, grid = style.panels(
         rows,
         columns,
@@ -74,14 +74,14 @@ def _joint_figure(run: Run) -> Figure:
         0.52,
         0.43,
         left=0.075,
-        right=right,
+        right=right_edge,
         wspace=0.12,
         hspace=0.30,
     )
     for axes, step in zip(style.keep_first_panels(grid, len(steps)), steps, strict=True):
         image = _draw_joint_belief(axes, run, step)
     height = figure.get_figheight()
-    bar_axes = figure.add_axes((right + 0.015, 0.43 / height, 0.013, 1 - 0.95 / height))
+    bar_axes = figure.add_axes((right_edge + 0.015, 0.43 / height, 0.013, 1 - 0.95 / height))
     style.color_bar(figure, image, "probability", cax=bar_axes)
     style.shared_legend(figure, bbox_to_anchor=(0.5, 1.0))
     return figure
@@ -123,9 +123,9 @@ def draw_step_map(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
-        The run.
+        The run, as read from its folder.
     values : (T, n) array
         The values; those of one step form a column of the map.
     first_number : int
@@ -187,7 +187,7 @@ def _draw_state_map(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
         The run of a state with two factors.
     values : (S,) array

@@ -98,12 +98,12 @@ def caption_belief(run: Run, figure: Figure) -> ReportFigure:
     units = state_units(run)
     is_truth_known = run.true_state is not None
     if len(run.factors) == 2:
-        first, second = run.factors
+        first_factor, second_factor = run.factors
         report_figure = WORDS.figure(
             "joint_belief",
             figure,
-            first=first.symbol,
-            second=second.symbol,
+            first=first_factor.symbol,
+            second=second_factor.symbol,
             state_units=units,
             step=run.step_word,
             truth="; ring: truth" if is_truth_known else "",

@@ -159,13 +159,17 @@ def _draw_transform(axes: Axes, check: PredictiveCheck) -> None:
     If the model is right, the transform is uniform and the count of a bin is binomial: 95 % of the
     bars end in the grey range.
     """
-    total = max(len(check.transform), 1)
-    count, edges = np.histogram(check.transform, bins=_TRANSFORM_BINS, range=(0.0, 1.0))
-    low, high = binom.ppf([0.025, 0.975], total, 1 / _TRANSFORM_BINS) * _TRANSFORM_BINS / total
+    observation_count = max(len(check.transform), 1)
+    bin_counts, edges = np.histogram(check.transform, bins=_TRANSFORM_BINS, range=(0.0, 1.0))
+    low, high = (
+        binom.ppf([0.025, 0.975], observation_count, 1 / _TRANSFORM_BINS)
+        * _TRANSFORM_BINS
+        / observation_count
+    )
     _draw_expected_range(axes, low, high, 1.0)
     axes.bar(
         edges[:-1],
-        count * _TRANSFORM_BINS / total,
+        bin_counts * _TRANSFORM_BINS / observation_count,
         width=0.92 / _TRANSFORM_BINS,
         align="edge",
         color=style.PAST,
@@ -176,7 +180,7 @@ def _draw_transform(axes: Axes, check: PredictiveCheck) -> None:
     style.panel_label(axes, "c", "All observations")
 
 
-def _draw_expected_range(axes: Axes, low: float, high: float, expected: float) -> None:
+def _draw_expected_range(axes: Axes, low: float, high: float, expected_value: float) -> None:
     """Draw the expected value, and the range in which 95 % lie if the model is right."""
     axes.axhspan(low, high, color=style.REFERENCE, alpha=0.25, linewidth=0)
-    axes.axhline(expected, color=style.TRUTH, linewidth=0.9, linestyle=(0, (4, 2)))
+    axes.axhline(expected_value, color=style.TRUTH, linewidth=0.9, linestyle=(0, (4, 2)))

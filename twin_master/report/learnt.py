@@ -88,9 +88,13 @@ def _most_departed_sensor(quantity: LearntQuantity) -> int:
 
     The distance is measured in standard deviations of the last posterior.
     """
-    last = moments_of(quantity.posterior[-1])
-    prior = moments_of(quantity.prior)
-    return int(np.nanargmax(np.abs(last.mean - prior.mean) / last.standard_deviation))
+    last_moments = moments_of(quantity.posterior[-1])
+    prior_moments = moments_of(quantity.prior)
+    return int(
+        np.nanargmax(
+            np.abs(last_moments.mean - prior_moments.mean) / last_moments.standard_deviation
+        )
+    )
 
 
 def _draw_sensors_over_steps(axes: Axes, run: Run, quantity: LearntQuantity, sensor: int) -> None:
@@ -127,9 +131,9 @@ def _draw_course(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
-        The run.
+        The run, as read from its folder.
     course : Moments of (T,) arrays
         The posterior after each step.
     prior : Moments of numbers
@@ -166,24 +170,24 @@ def _draw_last_step(
 ) -> None:
     """Draw prior 90 % range (bar), last posterior (point) and true value (line) of each sensor."""
     sensor_numbers = np.arange(1.0, len(quantity.prior) + 1.0)
-    prior = moments_of(quantity.prior)
+    prior_moments = moments_of(quantity.prior)
     axes.bar(
         sensor_numbers,
-        prior.upper - prior.lower,
-        bottom=prior.lower,
+        prior_moments.upper - prior_moments.lower,
+        bottom=prior_moments.lower,
         width=1.0,
         color=style.PAST,
         alpha=0.12,
         linewidth=0,
     )
-    last = moments_of(quantity.posterior[-1])
+    last_moments = moments_of(quantity.posterior[-1])
     for sensor, number in enumerate(sensor_numbers):
         style.interval(
             axes,
             number,
-            last.mean[sensor],
-            last.lower[sensor],
-            last.upper[sensor],
+            last_moments.mean[sensor],
+            last_moments.lower[sensor],
+            last_moments.upper[sensor],
             color=style.PRESENT if sensor == highlighted_sensor else style.OBSERVED,
             marker="o",
             markersize=2.6,

@@ -83,27 +83,27 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     count : int
         The largest number of sensors.
     """
     if not run.sensors.unit:  # the sensors have different units: values cannot be compared
         return list(range(min(count, len(run.sensors.titles))))
-    expected = run["filtered/quantity_mean"]
-    chosen = [int(np.argmax(np.abs(expected).max(axis=0)))]
-    if 0 not in chosen:
-        chosen.append(0)
-    if np.all(expected > 0.0):
-        for sensitivity in _sensitivities(run, expected):
+    expected_values = run["filtered/quantity_mean"]
+    chosen_sensors = [int(np.argmax(np.abs(expected_values).max(axis=0)))]
+    if 0 not in chosen_sensors:
+        chosen_sensors.append(0)
+    if np.all(expected_values > 0.0):
+        for sensitivity in _sensitivities(run, expected_values):
             order = np.argsort(-sensitivity, kind="stable")
             # A sensor whose relative change is below 1e-3 hardly depends on the factor.
-            other_sensors = [int(sensor) for sensor in order if int(sensor) not in chosen]
+            other_sensors = [int(sensor) for sensor in order if int(sensor) not in chosen_sensors]
             if other_sensors and sensitivity[other_sensors[0]] > 1e-3:
-                chosen.append(other_sensors[0])
-    return chosen[:count]
+                chosen_sensors.append(other_sensors[0])
+    return chosen_sensors[:count]
 
 
-def _sensitivities(run: Run, expected: Float) -> Float:
+def _sensitivities(run: Run, expected_values: Float) -> Float:
     """Return the relative change of each sensor's value with each factor, a (K, G) array.
 
     K is the number of factors and G the number of sensors. The logarithms of the expected values
@@ -112,7 +112,7 @@ def _sensitivities(run: Run, expected: Float) -> Float:
     """
     control_indicators = np.eye(len(run.controls))[run.control_index]
     regressors = np.concatenate([run["filtered/mean"], control_indicators], axis=1)
-    coefficients = np.linalg.lstsq(regressors, np.log(expected), rcond=None)[0]
+    coefficients = np.linalg.lstsq(regressors, np.log(expected_values), rcond=None)[0]
     return np.asarray(coefficients[: len(run.factors)])
 
 
@@ -125,7 +125,7 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     now : int
         The row of the present step in the run's arrays, from 0 to T - 1.
     sensors : sequence of int, optional
@@ -156,13 +156,13 @@ def _panels_in_columns(run: Run, sensors: Sequence[int]) -> tuple[list[Panel], l
 
     States and control stand on the left, sensors on the right; rewards fill the shorter column.
     """
-    left: list[Panel] = [partial(_draw_state, factor) for factor in range(len(run.factors))]
-    left.append(_draw_control)
-    right: list[Panel] = [partial(_draw_sensor, sensor) for sensor in sensors]
+    left_column: list[Panel] = [partial(_draw_state, factor) for factor in range(len(run.factors))]
+    left_column.append(_draw_control)
+    right_column: list[Panel] = [partial(_draw_sensor, sensor) for sensor in sensors]
     for reward in range(len(REWARD_NAMES)):
-        shorter_column = left if len(left) <= len(right) else right
+        shorter_column = left_column if len(left_column) <= len(right_column) else right_column
         shorter_column.append(partial(_draw_reward, reward))
-    return left, right
+    return left_column, right_column
 
 
 def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
@@ -170,12 +170,14 @@ def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
 
     With headings, the zones are named above the panel if they are wide enough.
     """
-    first = run.first_step
-    present = first + now
-    end = present + run.horizon
-    axes.set_xlim(first - 0.8, end + 0.8)
-    axes.axvspan(present + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
-    axes.axvline(present, color=style.PRESENT, linewidth=0.8, zorder=0.5)
+    first_step = run.first_step
+    present_step = first_step + now
+    last_step = present_step + run.horizon
+    axes.set_xlim(first_step - 0.8, last_step + 0.8)
+    axes.axvspan(
+        present_step + 0.5, last_step + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0
+    )
+    axes.axvline(present_step, color=style.PRESENT, linewidth=0.8, zorder=0.5)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(axis="y")
@@ -184,12 +186,19 @@ def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
         return
     above = axes.get_xaxis_transform()
     height = 1.24
-    axes.text(present, height, f"now: {present}", transform=above, ha="right", color=style.PRESENT)
-    if now > _LONG_PAST * (end - first):
-        axes.text(first - 0.8, height, "past", transform=above, ha="left", color=style.PAST)
-    if run.horizon > _NARROW_ZONE * (end - first):
+    axes.text(
+        present_step,
+        height,
+        f"now: {present_step}",
+        transform=above,
+        ha="right",
+        color=style.PRESENT,
+    )
+    if now > _LONG_PAST * (last_step - first_step):
+        axes.text(first_step - 0.8, height, "past", transform=above, ha="left", color=style.PAST)
+    if run.horizon > _NARROW_ZONE * (last_step - first_step):
         axes.text(
-            present + 0.5,
+            present_step + 0.5,
             height,
             "prediction",
             transform=above,
@@ -204,15 +213,15 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel that is drawn in.
     run : Run
-        The run.
+        The run, as read from its folder.
     now : int
         The row of the present step.
     course : Course
         The estimates of the past, of the present step, and the predictions.
     truth : (T,) array or None
-        The true values.
+        The true value in each step; None if it is not known.
     """
     steps = run.first_step + np.arange(len(course.mean))
     _draw_part(axes, steps, course, slice(now + 1), color=style.PAST, label="past")
@@ -241,20 +250,20 @@ def _draw_part(
     axes: Axes,
     steps: Index,
     course: Course,
-    part: slice,
+    rows: slice,
     color: str,
     label: str,
     line: style.LineStyle | None = None,
 ) -> None:
     """Draw part of a course as a line with a band, in the steps where it has values."""
-    has_value = np.isfinite(course.mean[part])
+    has_value = np.isfinite(course.mean[rows])
     if not has_value.any():
         return
-    part_steps = steps[part][has_value]
+    part_steps = steps[rows][has_value]
     style.band(
-        axes, part_steps, course.lower[part][has_value], course.upper[part][has_value], color
+        axes, part_steps, course.lower[rows][has_value], course.upper[rows][has_value], color
     )
-    axes.plot(part_steps, course.mean[part][has_value], color=color, label=label, **(line or {}))
+    axes.plot(part_steps, course.mean[rows][has_value], color=color, label=label, **(line or {}))
 
 
 def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
@@ -264,9 +273,9 @@ def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
     are filtered, each given the observations up to its own step.
     """
     past_group = "smoothed" if now == run.step_count - 1 else "filtered"
-    past = run[f"{past_group}/{variable}"][: now + 1, ..., index]
-    predicted = run[f"predicted/{variable}"][now, ..., index]
-    return np.concatenate((past, predicted))
+    past_values = run[f"{past_group}/{variable}"][: now + 1, ..., index]
+    predicted_values = run[f"predicted/{variable}"][now, ..., index]
+    return np.concatenate((past_values, predicted_values))
 
 
 def _quantity_course(run: Run, sensor: int, now: int) -> Course:
@@ -304,12 +313,12 @@ def _state_course(run: Run, index: int, now: int) -> Course:
     predicted_deviation = run["predicted/standard_deviation"][now]
     mean = factor.scale * np.vstack((past_mean, predicted_mean))[:, index]
     deviation = factor.scale * np.vstack((past_deviation, predicted_deviation))[:, index]
-    lowest = factor.levels[0]
-    highest = factor.levels[-1]
+    lowest_level = factor.levels[0]
+    highest_level = factor.levels[-1]
     return Course(
         mean=mean,
-        lower=np.clip(mean - 2.0 * deviation, lowest, highest),
-        upper=np.clip(mean + 2.0 * deviation, lowest, highest),
+        lower=np.clip(mean - 2.0 * deviation, lowest_level, highest_level),
+        upper=np.clip(mean + 2.0 * deviation, lowest_level, highest_level),
     )
 
 
@@ -325,13 +334,13 @@ def _draw_state(index: int, axes: Axes, run: Run, now: int) -> str:
     )
     truth = None if run.true_state is None else factor.scale * run.true_state[:, index]
     _draw_course(axes, run, now, _state_course(run, index, now), truth)
-    lowest = factor.levels[0]
-    highest = factor.levels[-1]
-    margin = 0.075 * (highest - lowest)
+    lowest_level = factor.levels[0]
+    highest_level = factor.levels[-1]
+    margin = 0.075 * (highest_level - lowest_level)
     if margin == 0.0:  # a factor with one level
         margin = 6.0
     axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
-    axes.set(ylim=(lowest - margin, highest + margin), ylabel=factor.label)
+    axes.set(ylim=(lowest_level - margin, highest_level + margin), ylabel=factor.label)
     return capital(factor.title)
 
 
@@ -352,18 +361,24 @@ def _draw_sensor(sensor: int, axes: Axes, run: Run, now: int) -> str:
 
 
 def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
-    """Draw readings as dots and lost ones as crosses at the bottom.
+    """Draw readings as dots, and lost readings as crosses at the bottom.
 
     Readings after the step in row `now`, which the twin did not have yet, are hollow dots.
     """
-    until_now = steps <= steps[now]
-    later = steps > steps[now]
+    is_until_now = steps <= steps[now]
+    is_later = steps > steps[now]
     is_rasterized = len(steps) > _MANY_DOTS
     axes.plot(
-        steps[until_now], readings[until_now], **_DOT, label="observed", rasterized=is_rasterized
+        steps[is_until_now],
+        readings[is_until_now],
+        **_DOT,
+        label="observed",
+        rasterized=is_rasterized,
     )
-    axes.plot(steps[later], readings[later], **_DOT, markerfacecolor="none", label="observed later")
-    lost_steps = steps[until_now & np.isnan(readings)]
+    axes.plot(
+        steps[is_later], readings[is_later], **_DOT, markerfacecolor="none", label="observed later"
+    )
+    lost_steps = steps[is_until_now & np.isnan(readings)]
     if len(lost_steps):
         cross: style.LineStyle = {**_DOT, "marker": "x"}
         near_bottom = np.full(len(lost_steps), 0.04)
@@ -402,7 +417,7 @@ def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
 
     In a short mission each step is a bar; in a long one, successive steps are one bar.
     """
-    present = run.step_numbers[now]
+    present_step = run.step_numbers[now]
     row_span = (control, _BAR_HEIGHT)
     has_gaps = now + run.horizon < _MANY_STEPS
     width = 0.8 if has_gaps else 1.0
@@ -414,10 +429,10 @@ def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
     bars = [(span[0] - width / 2, span[-1] - span[0] + width) for span in spans if len(span)]
     axes.broken_barh(bars, row_span, facecolors=style.PAST, linewidth=0)
     if run.control_index[now] == control:
-        bar = (present - width / 2, width)
+        bar = (present_step - width / 2, width)
         axes.broken_barh([bar], row_span, facecolors=style.PRESENT, linewidth=0)
     axes.bar(
-        present + 1.0 + np.arange(run.horizon),
+        present_step + 1.0 + np.arange(run.horizon),
         _BAR_HEIGHT * run["predicted/control_probability"][now, :, control],
         width=width,
         bottom=control,

@@ -134,8 +134,8 @@ def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
     else:
         fell_back = f"{_subject(run)} {_changes_of_control(run)}; the first change came"
     delay = fallback.delay
-    time = f"{_one_or_count(delay, run.step_word)} after" if delay else "when"
-    return f"{fell_back} {time} {switch.factor} had reached {switch.level}"
+    time_text = f"{_one_or_count(delay, run.step_word)} after" if delay else "when"
+    return f"{fell_back} {time_text} {switch.factor} had reached {switch.level}"
 
 
 def _control_clause(run: Run) -> str:
@@ -176,17 +176,17 @@ def _belief_sentence(run: Run) -> str:
 
     If no state of the model explains the observations, the sentence says so instead.
     """
-    unexplained = run.get("notice/none_of_these")
-    if unexplained is not None and not is_state_believed(unexplained[-1]):
+    probability_of_none = run.get("notice/none_of_these")
+    if probability_of_none is not None and not is_state_believed(probability_of_none[-1]):
         return (
             f"At the end no state is believed: no state of the model explains the "
-            f"{run.sensors.word}s (probability {unexplained[-1]:.3g})."
+            f"{run.sensors.word}s (probability {probability_of_none[-1]:.3g})."
         )
     estimates = [_state_estimate(run, index) for index in range(len(run.factors))]
     if len(estimates) > _MOST_FACTORS:
-        remaining = len(estimates) - _MOST_FACTORS
+        other_count = len(estimates) - _MOST_FACTORS
         estimates = estimates[:_MOST_FACTORS]
-        estimates.append(f"{counted(remaining, 'other state')} as the figures below show")
+        estimates.append(f"{counted(other_count, 'other state')} as the figures below show")
     sentence = (
         f"At the end the twin puts {listing(estimates)}; "
         "in brackets two standard deviations either side"
@@ -231,9 +231,9 @@ def _state_estimate(run: Run, index: int) -> str:
 
 def _parameter_clause(quantity: LearntQuantity) -> str:
     """Return the clause on the learnt parameter: mean, two standard deviations, and true value."""
-    last = moments_of(quantity.posterior[-1])
-    mean = float(last.mean)
-    two_deviations = 2 * float(last.standard_deviation)
+    last_moments = moments_of(quantity.posterior[-1])
+    mean = float(last_moments.mean)
+    two_deviations = 2 * float(last_moments.standard_deviation)
     values = f"{mean:.3f} ({mean - two_deviations:.3f} to {mean + two_deviations:.3f}"
     if quantity.truth is not None:
         values += f", truth {float(quantity.truth):.4g}"
@@ -255,15 +255,15 @@ def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
     threshold = max(_LEAST_DEPARTURE, _DEVIATIONS_OF_CHANCE / np.sqrt(2.0 * count))
     coverage = f"{100.0 * check.overall_coverage:.0f} %"
     scatter = "The observations scatter about the twin's model"
-    within = f"{coverage} of them lie within their 95 % intervals"
+    within_clause = f"{coverage} of them lie within their 95 % intervals"
     if deviation > 1.0 + threshold:
         return (
-            f"{scatter} {deviation:.3g} times as far as it assumes: {within}; "
+            f"{scatter} {deviation:.3g} times as far as it assumes: {within_clause}; "
             "the noise is larger, or the model is off."
         )
     if deviation < 1.0 - threshold:
         return (
-            f"{scatter} {deviation:.2g} times as far as it assumes: {within}; "
+            f"{scatter} {deviation:.2g} times as far as it assumes: {within_clause}; "
             "its intervals are wider than they need be."
         )
     sensor = _sensor_with_low_coverage(check)
@@ -272,7 +272,10 @@ def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
             f"Of all observations {coverage} lie within their 95 % intervals, "
             f"but {100.0 * check.coverage[sensor]:.0f} % of those of {run.sensors.titles[sensor]}."
         )
-    return f"The twin's model explains the observations within the noise that it assumes: {within}."
+    return (
+        "The twin's model explains the observations within the noise that it assumes: "
+        f"{within_clause}."
+    )
 
 
 def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
@@ -282,11 +285,11 @@ def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
     binomial. The limit `_FALSE_ALARM` of its probability is divided by the number of
     sensors, because all sensors are tested (Bonferroni correction).
     """
-    within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
-    p_value = binom.cdf(within, np.maximum(check.count, 1), 0.95)
-    p_value = np.where(check.count > 0, p_value, 1.0)
-    sensor = int(np.argmin(p_value))
-    return sensor if p_value[sensor] < _FALSE_ALARM / len(p_value) else None
+    count_within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
+    p_values = binom.cdf(count_within, np.maximum(check.count, 1), 0.95)
+    p_values = np.where(check.count > 0, p_values, 1.0)
+    sensor = int(np.argmin(p_values))
+    return sensor if p_values[sensor] < _FALSE_ALARM / len(p_values) else None
 
 
 def _with_article(title: str) -> str:

@@ -105,13 +105,13 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     """Yield the figures that are drawn from the data of a run, in the order of the page."""
-    present = _present_row(run, now)
-    last = run.step_count - 1
-    figure = mission_figure(run, present)
-    yield captions.caption_mission(run, figure, present, MISSION_NOW)
-    if present != last:
-        figure = mission_figure(run, last)
-        yield captions.caption_mission(run, figure, last, MISSION_WHOLE)
+    present_row = _present_row(run, now)
+    last_row = run.step_count - 1
+    figure = mission_figure(run, present_row)
+    yield captions.caption_mission(run, figure, present_row, MISSION_NOW)
+    if present_row != last_row:
+        figure = mission_figure(run, last_row)
+        yield captions.caption_mission(run, figure, last_row, MISSION_WHOLE)
     yield captions.caption_belief(run, belief_figure(run))
     if run.learnt_quantities:
         yield captions.caption_learnt(run, learnt_figure(run))
@@ -124,7 +124,7 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
 
 
 def _present_row(run: Run, now: int | None) -> int:
-    """Return the row of the step with the number `now`; by default that of `default_now`.
+    """Return the row of the step with the number `now`, or else with `default_now`.
 
     Raises
     ------
@@ -133,13 +133,14 @@ def _present_row(run: Run, now: int | None) -> int:
     """
     if now is None:
         return default_now(run)
-    first = run.first_step
-    last = first + run.step_count - 1
-    if not first <= now <= last:
+    first_step = run.first_step
+    last_step = first_step + run.step_count - 1
+    if not first_step <= now <= last_step:
         raise RunFolderError(
-            f"The present step of the report must lie in {first}..{last}, but {now} was given."
+            f"The present step of the report must lie in {first_step}..{last_step}, but {now} was "
+            "given."
         )
-    return now - first
+    return now - first_step
 
 
 def _structure_figure(run: Run, folder: Path, check: PredictiveCheck) -> Iterator[ReportFigure]:
@@ -164,7 +165,7 @@ def render_page(
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure
@@ -223,7 +224,7 @@ class _Pictures:
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which the section is added.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure

@@ -64,7 +64,7 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     Parameters
     ----------
     policy : BeliefPolicy
-        The policy.
+        The policy that chooses the control for a belief.
     model : GraphicalModel
         The model of the states.
     """
@@ -77,10 +77,10 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     cell_weights = weights[mesh.triangles].mean(axis=1)  # (cells, 3), at the centres
     figure, (row,) = style.panels(1, len(names), 3.2, 0.4, 0.45, left=0.03, right=0.97)
     for factor, (axes, name) in enumerate(zip(row, names, strict=True)):
-        chosen = policy.decide(cell_weights @ corner_beliefs(model, factor))
+        chosen_controls = policy.decide(cell_weights @ corner_beliefs(model, factor))
         axes.tripcolor(
             mesh,
-            facecolors=chosen,
+            facecolors=chosen_controls,
             edgecolors="face",
             cmap=ListedColormap(colors),
             vmin=-0.5,
@@ -117,7 +117,7 @@ def design_figure(
     of_all: float,
     names: Sequence[str],
     places: Float | None,
-    chosen: Sequence[int],
+    chosen_sensors: Sequence[int],
     outlines: Sequence[Float],
 ) -> Figure:
     """Draw the information of chosen sensors, and their positions on the structure.
@@ -132,7 +132,7 @@ def design_figure(
         The names of the chosen sensors.
     places : (G, 2) array or None
         The positions of all sensors [m]; None if they are not known.
-    chosen : sequence of int
+    chosen_sensors : sequence of int
         The indices of the chosen sensors, from 0.
     outlines : sequence of (N, 2) array
         The outlines that are drawn below the sensors [m].
@@ -142,7 +142,7 @@ def design_figure(
     panels = figure.subplots(1, len(width_ratios), squeeze=False, width_ratios=width_ratios)[0]
     _draw_information(panels[0], information, of_all, names)
     if places is not None:
-        _draw_chosen_sensors(panels[1], places, chosen, outlines)
+        _draw_chosen_sensors(panels[1], places, chosen_sensors, outlines)
     figure.tight_layout()
     return figure
 
@@ -160,7 +160,7 @@ def _draw_information(
 
 
 def _draw_chosen_sensors(
-    axes: Axes, positions: Float, chosen: Sequence[int], outlines: Sequence[Float]
+    axes: Axes, positions: Float, chosen_sensors: Sequence[int], outlines: Sequence[Float]
 ) -> None:
     """Draw sensors at positions (G, 2) [m] and outlines; chosen sensors have their ranks."""
     for outline in outlines:
@@ -168,9 +168,9 @@ def _draw_chosen_sensors(
         axes.fill(x, y, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)
     x, y = positions.T
     axes.plot(x, y, "o", color=style.REFERENCE, markersize=3.5)
-    x, y = positions[list(chosen)].T
+    x, y = positions[list(chosen_sensors)].T
     axes.plot(x, y, "o", color=style.PRESENT, markersize=6)
-    for rank, sensor in enumerate(chosen, start=1):
+    for rank, sensor in enumerate(chosen_sensors, start=1):
         axes.annotate(str(rank), positions[sensor], (3, 3), textcoords="offset points")
     axes.set_aspect("equal")
     axes.set_axis_off()

@@ -46,9 +46,9 @@ class PrintedFactor:
     symbol : str
         The name with its trailing digits as a subscript, such as z₁.
     title : str
-        The name in words.
+        The name of the quantity in words.
     unit : str
-        The printed unit.
+        The unit as it is printed.
     scale : float
         The factor from the stored unit to the printed one.
     levels : tuple of float
@@ -191,7 +191,7 @@ class Run:
     scenario : Scenario
         The scenario that was flown.
     config : mapping
-        The content of `config.json`.
+        The content of the file `config.json`.
     summary, calibration : mapping
         The content of `summary.json` and of `calibration.json`; empty if the file is missing.
     """
@@ -285,7 +285,7 @@ class Run:
 
     @cached_property
     def factor_scales(self) -> Float:
-        """The factors from the stored units of the state to the printed ones, a (K,) array."""
+        """The factors (K,) that convert the K state factors from stored to printed units."""
         return np.array([factor.scale for factor in self.factors])
 
     @cached_property
@@ -300,10 +300,10 @@ class Run:
             return ()
         quantities = []
         ending = f"_prior_{MOMENTS[0]}"  # each learnt quantity has one variable with this ending
-        for variable, stored in self.tree["learnt"].data_vars.items():
+        for variable, stored_array in self.tree["learnt"].data_vars.items():
             if str(variable).endswith(ending):
                 name = str(variable).removesuffix(ending)
-                quantities.append(self._learnt_quantity(name, str(stored.attrs["units"])))
+                quantities.append(self._learnt_quantity(name, str(stored_array.attrs["units"])))
         return tuple(quantities)
 
     def _learnt_quantity(self, name: str, stored_unit: str) -> LearntQuantity:

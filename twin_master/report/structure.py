@@ -141,36 +141,36 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     Parameters
     ----------
     run : Run
-        The run.
+        The run, as read from its folder.
     planform : Planform
-        The wing.
+        The planform of the wing.
     residual : (G,) array
         The residuals of the last observations, in standard deviations; NaN where one was lost.
     """
-    figure, ((upper,), (lower,)) = style.panels(
+    figure, ((upper_axes,), (lower_axes,)) = style.panels(
         2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25
     )
     sensors = run.sensors
     _draw_wing(
         figure,
-        upper,
+        upper_axes,
         run,
         planform,
         values=sensors.scale * run.observations[-1],
         value_label=f"{sensors.quantity} ({sensors.unit})",
         look={"cmap": style.LEVELS},
     )
-    style.panel_label(upper, "a", f"Measured {sensors.quantity}")
+    style.panel_label(upper_axes, "a", f"Measured {sensors.quantity}")
     _draw_wing(
         figure,
-        lower,
+        lower_axes,
         run,
         planform,
         values=residual,
         value_label="standard deviations",
         look=style.RESIDUALS,
     )
-    style.panel_label(lower, "b", "Measured less expected")
+    style.panel_label(lower_axes, "b", "Measured less expected")
     return figure
 
 
@@ -237,9 +237,9 @@ class StructurePicture(NamedTuple):
     Attributes
     ----------
     figure : Figure
-        The picture.
+        The figure that is drawn in.
     largest : float
-        The largest displacement [m].
+        The largest displacement of a node [m].
     scale : float
         The factor by which displacements are drawn larger than they are.
     """
@@ -287,30 +287,30 @@ class Camera(NamedTuple):
 
     Attributes
     ----------
-    towards : (3,) array
-        The unit vector towards the viewer.
-    plane : (3, 2) array
+    to_viewer : (3,) array
+        The unit vector from the structure to the viewer.
+    picture_axes : (3, 2) array
         The unit vectors to the right and upwards in the picture, as columns.
     """
 
-    towards: Float
-    plane: Float
+    to_viewer: Float
+    picture_axes: Float
 
 
 def _camera() -> Camera:
     """Return the camera of all pictures of structures: azimuth -60°, elevation 28°."""
     azimuth = np.radians(-60.0)
     elevation = np.radians(28.0)
-    towards = np.array(
+    to_viewer = np.array(
         [
             np.cos(azimuth) * np.cos(elevation),
             np.sin(azimuth) * np.cos(elevation),
             np.sin(elevation),
         ]
     )
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    upwards = np.cross(towards, right)
-    return Camera(towards, np.column_stack((right, upwards)))
+    to_right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    upwards = np.cross(to_viewer, to_right)
+    return Camera(to_viewer, np.column_stack((to_right, upwards)))
 
 
 @style.publication_style()
@@ -331,21 +331,21 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
     largest = float(np.linalg.norm(field.displacement, axis=1).max())
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     scale = _DRAWN_DISPLACEMENT * diagonal / largest if largest > 0.0 else 0.0
-    displaced = np.asarray(points + scale * field.displacement)
+    displaced_points = np.asarray(points + scale * field.displacement)
     camera = _camera()
     figure, ((axes,),) = style.panels(
         1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9
     )
-    surface = _draw_surface(axes, field, displaced, camera)
+    surface = _draw_surface(axes, field, displaced_points, camera)
     gauges = _run_gauge_places(run_folder)
     if gauges is not None and len(gauges) == len(residual):
         distance = np.linalg.norm(points[:, None] - gauges, axis=2)  # (nodes, gauges)
         nearest_node = np.argmin(distance, axis=0)
         # A gauge is drawn with the displacement of the node nearest to it.
         displaced_gauges = gauges + scale * field.displacement[nearest_node]
-        in_picture = displaced_gauges @ camera.plane
+        gauges_in_picture = displaced_gauges @ camera.picture_axes
         label = "gauges: standard deviations"
-        _draw_gauges(figure, axes, in_picture, residual, label, style.RESIDUALS)
+        _draw_gauges(figure, axes, gauges_in_picture, residual, label, style.RESIDUALS)
     axes.autoscale_view()
     axes.set_aspect("equal")
     axes.axis("off")
@@ -357,22 +357,34 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
 def _draw_surface(
     axes: Axes, field: StructureField, points: Float, camera: Camera
 ) -> PolyCollection:
-    """Draw the outer faces of a structure with nodes at points (n, 3), and return them.
+    """Draw the surface of a structure, and return its coloured faces.
 
-    A face has the colour of the stiffness loss of its cell [%]; faces of damage regions have black
-    edges. Faces are drawn from the farthest to the nearest, so that near ones hide those behind.
+    A face has the colour of the stiffness loss of its cell [%]. Faces of damage regions have black
+    edges. Faces are drawn from the farthest to the nearest, so that near faces hide the faces
+    behind them.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel that is drawn in.
+    field : StructureField
+        The mesh, with the stiffness loss and the damage region of each cell.
+    points : (n, 3) array
+        The positions at which the n nodes of the mesh are drawn [m].
+    camera : Camera
+        The direction from which the structure is seen.
     """
     body = field.body
-    outer = body.outer_faces
-    corners = []
-    for cell, face in zip(outer.cell, outer.number, strict=True):
-        corners.append(body.cells[cell, list(body.kind.faces[face])])
-    distance = [(points[nodes] @ camera.towards).mean() for nodes in corners]
-    order = np.argsort(distance)
-    is_in_region = field.region[outer.cell] > 0
+    outer_faces = body.outer_faces
+    nodes_of_faces = []
+    for cell, face in zip(outer_faces.cell, outer_faces.number, strict=True):
+        nodes_of_faces.append(body.cells[cell, list(body.kind.faces[face])])
+    distances = [(points[nodes] @ camera.to_viewer).mean() for nodes in nodes_of_faces]
+    order = np.argsort(distances)
+    is_in_region = field.region[outer_faces.cell] > 0
     surface = PolyCollection(
-        [points[corners[face]] @ camera.plane for face in order],
-        array=100.0 * field.stiffness_loss[outer.cell][order],
+        [points[nodes_of_faces[face]] @ camera.picture_axes for face in order],
+        array=100.0 * field.stiffness_loss[outer_faces.cell][order],
         cmap=LOSS_COLORS,
         edgecolors=["black" if is_in_region[face] else "0.6" for face in order],
         linewidths=0.4,

@@ -38,11 +38,11 @@ def _add_table(
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which the section is added.
     name : str
         The name of its title and caption in `words.toml`.
     columns : sequence of PageColumn
-        The headings.
+        The columns of the table, with their headings.
     rows : iterable of sequence of str
         The cells. They may come from files of users: line breaks and repeated blanks become one
         blank.
@@ -62,10 +62,10 @@ def add_figures_table(page: Page, run: Run) -> None:
     if has_references:
         columns += [number_column("reference"), PageColumn("source of the reference")]
     rows = []
-    for figure, printed in zip(figures, printed_figures(figures), strict=True):
-        row = [figure.title, printed.value, figure.unit]
+    for figure, printed_figure in zip(figures, printed_figures(figures), strict=True):
+        row = [figure.title, printed_figure.value, figure.unit]
         if has_references:
-            row += [printed.reference, figure.reference_source]
+            row += [printed_figure.reference, figure.reference_source]
         rows.append(row)
     references = ", beside their references" if has_references else ""
     _add_table(page, "figures", columns, rows, references=references)
@@ -105,14 +105,14 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
 def _learnt_row(quantity: LearntQuantity) -> list[str]:
     """Return the cells of a learnt quantity: title, prior, and posterior after the last step."""
     prior = moments_of(quantity.prior)
-    last = moments_of(quantity.posterior[-1])
+    last_moments = moments_of(quantity.posterior[-1])
     return [
         quantity.label,
         number(float(prior.mean)),
         number(float(prior.standard_deviation)),
-        number(float(last.mean)),
-        number(float(last.standard_deviation)),
-        between(float(last.lower), float(last.upper)),
+        number(float(last_moments.mean)),
+        number(float(last_moments.standard_deviation)),
+        between(float(last_moments.lower), float(last_moments.upper)),
     ]
 
 
@@ -226,11 +226,11 @@ class _Monitor(NamedTuple):
     Attributes
     ----------
     title : str
-        The name in words.
+        The name of the quantity in words.
     values : (T,) array
         The values in the printed unit; NaN in steps without one.
     unit : str
-        The printed unit.
+        The unit as it is printed.
     """
 
     title: str

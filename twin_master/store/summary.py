@@ -498,9 +498,9 @@ def control_changes(
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
     changes = []
     for step in steps[:_MOST_CHANGES]:
-        previous = controls[int(control_index[step - 1])]
+        previous_control = controls[int(control_index[step - 1])]
         control = controls[int(control_index[step])]
-        changes.append(f"left {previous} for {control} at {step_name} {first_step + step}")
+        changes.append(f"left {previous_control} for {control} at {step_name} {first_step + step}")
     sentence = ", ".join(changes)
     further_changes = len(steps) - len(changes)
     if further_changes > 0:

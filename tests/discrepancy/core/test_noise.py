@@ -159,7 +159,7 @@ def samples_that_count():
 
 def test_ljung_box_allows_for_samples_that_do_not_count(samples_that_count):
     rows = np.random.default_rng(13).standard_normal((4000, 150))
-    p_values = np.array([ljung_box(row, used=samples_that_count)[1] for row in rows])
+    p_values = np.array([ljung_box(row, is_used=samples_that_count)[1] for row in rows])
     for level in (0.2, 0.05, 0.01, 0.0025):
         tolerance = 4.0 * np.sqrt(level / 4000) + 0.2 * level
         assert np.mean(p_values <= level) == pytest.approx(level, abs=tolerance)
@@ -167,15 +167,15 @@ def test_ljung_box_allows_for_samples_that_do_not_count(samples_that_count):
 
 def test_values_of_samples_that_do_not_count_do_not_matter(samples_that_count):
     row = np.random.default_rng(13).standard_normal(150)
-    p_value = ljung_box(row, used=samples_that_count)[1]
+    p_value = ljung_box(row, is_used=samples_that_count)[1]
     row[~samples_that_count] = 100.0
-    assert ljung_box(row, used=samples_that_count)[1] == p_value
-    assert ljung_box(row, used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
+    assert ljung_box(row, is_used=samples_that_count)[1] == p_value
+    assert ljung_box(row, is_used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
 
 
 def test_ljung_box_of_samples_that_all_count_is_that_without_a_mask():
     row = np.random.default_rng(13).standard_normal(150)
-    with_mask = ljung_box(row, used=np.ones(150, dtype=bool))[0]
+    with_mask = ljung_box(row, is_used=np.ones(150, dtype=bool))[0]
     assert with_mask == pytest.approx(ljung_box(row)[0], rel=1e-12)
 
 

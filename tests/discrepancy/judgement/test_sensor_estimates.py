@@ -1,7 +1,7 @@
 """Fitted gains and zeros stand beside each channel; where they hide an error, the verdict says so."""
 
 from dataclasses import replace
-from math import hypot, inf, isnan
+from math import hypot, inf, isnan, nan
 
 import numpy as np
 import pytest
@@ -99,6 +99,14 @@ def test_a_fitted_gain_is_shown_in_the_output_the_file_and_the_page(wide_gain, t
     page = render_report(content, {}, {})
     assert "Gains and zeros of the channels" in page
     assert row[2] in page
+
+
+def test_a_gain_that_was_not_stated_is_shown_itself():
+    problem = kit.closed_problem(seed=1, gain_deviation=0.02)
+    (stated, *_) = sensor_estimates(problem, kit.fitted(problem))
+    free = replace(stated, value=0.25, deviation=0.01, stated_deviation=inf, deviations=nan)
+    (row,) = printed_sensor_table([free], problem.campaign.channels).rows
+    assert row[1:] == ["gain", "1.250 ± 0.010", "", "not stated", ""]
 
 
 def test_of_many_channels_the_farthest_are_printed():

@@ -160,7 +160,7 @@ def test_the_first_block_is_never_held_out_and_not_too_much_is(count, block, sha
 
 
 def test_what_is_no_run_of_a_wing_is_refused_in_one_sentence(run, tmp_path):
-    with pytest.raises(CampaignFileError, match="no run folder"):
+    with pytest.raises(CampaignFileError, match="is not a run folder"):
         run_campaign(tmp_path)
     copy = shutil.copytree(run, tmp_path / "copy")
     config = (copy / "config.json").read_text(encoding="utf-8")
