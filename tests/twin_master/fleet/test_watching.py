@@ -423,7 +423,7 @@ def test_a_flown_asset_in_no_state_that_is_believed_has_no_state(fleet_of_noise,
     page = write_fleet_report(folder).read_text()
     assert np.isnan(leaving).all()
     assert page.count("not believed") >= 3
-    assert "with the most damage" not in page
+    assert "The asset with the most damage is" not in page
 
 
 def test_a_watched_asset_in_no_state_that_is_believed_has_no_state(fleet_of_noise, tmp_path):
@@ -431,7 +431,7 @@ def test_a_watched_asset_in_no_state_that_is_believed_has_no_state(fleet_of_nois
     page = write_fleet_report(tmp_path / "out").read_text()
     assert [(record["leaving"], record["severity"]) for record in records] == [(None, None)] * 3
     assert page.count("not believed") >= 3
-    assert "with the most damage" not in page
+    assert "The asset with the most damage is" not in page
 
 
 def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):
