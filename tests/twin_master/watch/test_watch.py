@@ -398,7 +398,7 @@ def test_another_watch_takes_in_all_but_what_a_damaged_line_said(damaged_watch, 
     ("damage", "sentence"),
     [
         (remove_line_4, r"line 196 .*lines before it are missing"),
-        (change_last_line_but_one, "line 196 .*and 1 behind it"),
+        (change_last_line_but_one, "line 196 .*and 1 after it"),
     ],
 )
 def test_a_journal_with_a_fault_at_its_end_is_refused_and_left(long_watch, tmp_path, damage, sentence):
@@ -411,6 +411,6 @@ def test_a_journal_with_a_fault_at_its_end_is_refused_and_left(long_watch, tmp_p
 
 def test_a_damaged_watch_names_the_command_that_watches_its_messages_again(long_watch, tmp_path):
     watch = long_watch.damaged_copy(tmp_path / "watch", change_last_line_but_one)
-    with pytest.raises(NotResumableError, match=r"line 196 .*and 1 behind it") as caught:
+    with pytest.raises(NotResumableError, match=r"line 196 .*and 1 after it") as caught:
         resume_watch(watch.folder, None, SilentProgress()).__enter__()
     assert f"--observations {watch.folder}" in caught.value.__notes__[-1]
