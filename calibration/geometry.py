@@ -61,8 +61,9 @@ class MeasuredLength:
     def __post_init__(self) -> None:
         if abs(self.measured / self.designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
-                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm "
-                "were designed, more than 10 % apart: check the units (both in mm) and the wing."
+                f"{self.name} measures {self.measured * 1e3:g} mm, but the design has "
+                f"{self.designed * 1e3:g} mm, a difference of more than 10 %: check the units "
+                "(both in mm) and the wing."
             )
 
     @property
@@ -149,18 +150,18 @@ def read_lengths(path: Path) -> Lengths:
     table = lab_table(path, GEOMETRY_FILE)
     names = table.cells("parameter", _NEEDED_BY)
     table.refuse_repeated(names, "parameter", "keep one of them")
-    missing = [published for published in PUBLISHED_NAMES if published not in names]
-    if missing:
+    missing_names = [published for published in PUBLISHED_NAMES if published not in names]
+    if missing_names:
         raise ExperimentFileError(
-            f"{table.name} lacks the row {' and '.join(missing)}; "
+            f"{table.name} lacks the row {' and '.join(missing_names)}; "
             f"{comma_list(PUBLISHED_NAMES)} are needed."
         )
     designed = _lengths_in_millimetres(table, "designed")
-    measured = _lengths_in_millimetres(table, "manufactured")
+    measured_lengths = _lengths_in_millimetres(table, "manufactured")
     lengths = {}
     for published, name in PUBLISHED_NAMES.items():
         row = names.index(published)
-        lengths[name] = MeasuredLength(name, 1e-3 * designed[row], 1e-3 * measured[row])
+        lengths[name] = MeasuredLength(name, 1e-3 * designed[row], 1e-3 * measured_lengths[row])
     return Lengths(**lengths)
 
 
@@ -217,8 +218,8 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
         if abs(value / designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
                 f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
-                f"{designed * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with "
-                "--design."
+                f"{designed * 1e3:.1f} mm, a difference of more than 10 %: give the design of this "
+                "wing with --design."
             )
     try:
         return design.changed(planform=planform)

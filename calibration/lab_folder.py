@@ -20,7 +20,7 @@ def possible_locations(folder: Path, name: Path) -> Iterator[Path]:
     Parameters
     ----------
     folder : Path
-        The user's folder.
+        The folder that the user names.
     name : Path
         The file or folder in the authors' layout, such as `step1/geometry_data.csv`.
     """

@@ -114,7 +114,7 @@ class VirtualWing:
     Attributes
     ----------
     model : ReducedModel
-        The wing.
+        The reduced model of the wing.
     truth : DigitalState
         The true state of the wing; the geometry is that of the model.
     frequency_error : (float, float)
@@ -225,7 +225,7 @@ def measure_load_test(bench: TestBench, seed: Seed) -> LoadDisplacementData:
     Parameters
     ----------
     bench : TestBench
-        The wing.
+        The wing on the test bench, with its true parameters.
     seed : int or SeedSequence
         The seed of the reading errors.
     """
@@ -253,7 +253,7 @@ def measure_ring_down(
     Parameters
     ----------
     bench : TestBench
-        The wing.
+        The wing on the test bench, with its true parameters.
     seed : int or SeedSequence
         The seed of noise and releases.
     trials : int

@@ -47,7 +47,7 @@ WITHOUT_NUMBA = (
 def compiled(
     function: Callable[Parameters, Result], calls: Iterable[NumericalFunction] = ()
 ) -> Callable[Parameters, Result]:
-    """Return a function compiled by numba, at its first call; it runs without the interpreter lock.
+    """Return a function that numba compiles at the first call, and that runs without Python's lock.
 
     The first time in a process that something is compiled, or runs as plain Python, the user gets a
     note.
@@ -101,7 +101,7 @@ if numba is not None:
             _note_once("Compiling loops by numba, kept for later runs: 10 to 25 s ...")
 
         def on_end(self, event: object) -> None:
-            """Do nothing: the stage of the command that compiles shows its time."""
+            """Do nothing, because the stage of the command that compiles shows the time."""
 
     event.register("numba:compile", _CompilationNote())
 

@@ -56,21 +56,23 @@ def filtered_record(
     signal = _interpolated(grid, time, signal)
     slope = _interpolated(grid, time, slope)
     # signal
-    held = levels_before_record(high_pass_filter, record, signal[0])
-    filtered = high_pass(signal, interval, time_constant, high_pass_filter.order, held)
+    levels_before = levels_before_record(high_pass_filter, record, signal[0])
+    filtered_signal = high_pass(
+        signal, interval, time_constant, high_pass_filter.order, levels_before
+    )
     # rate; each of several whole stages obeys y' = x' - y / tau
     is_whole_order = high_pass_filter.order == int(high_pass_filter.order)
     if is_whole_order:
         for order in range(1, int(high_pass_filter.order) + 1):
-            stage_output = high_pass(signal, interval, time_constant, order, held)
+            stage_output = high_pass(signal, interval, time_constant, order, levels_before)
             slope = slope - stage_output / time_constant
     else:
         slope = high_pass(slope, interval, time_constant, high_pass_filter.order, 0.0)
-    return _interpolated(time, grid, filtered), _interpolated(time, grid, slope)
+    return _interpolated(time, grid, filtered_signal), _interpolated(time, grid, slope)
 
 
 def _interpolated(times: FloatArray, known_times: FloatArray, values: FloatArray) -> FloatArray:
-    """Return columns (N, C) that are known at some times at others, by linear interpolation."""
+    """Return columns (N, C) at new times, by linear interpolation between the known times."""
     columns = [np.interp(times, known_times, column) for column in values.T]
     return np.stack(columns, axis=1)
 
@@ -80,9 +82,9 @@ def high_pass(
     interval: float,
     time_constant: float,
     order: float = 1.0,
-    held: FloatArray | float | None = None,
+    levels_before: FloatArray | float | None = None,
 ) -> FloatArray:
-    """Return (s tau / (1 + s tau))^order of a signal that is linear between its samples.
+    """Apply the high-pass filter (s tau / (1 + s tau))^order to a signal, linear between samples.
 
     The response to a unit step is 1F1(order; 1; -t / tau), whose integral is t 1F1(order; 2; -t /
     tau): the inverse of s^(order - 1) tau^order / (1 + s tau)^order, Abramowitz and Stegun 1964,
@@ -99,7 +101,7 @@ def high_pass(
         The time constant tau [s].
     order : float
         The number of equal first-order stages, not necessarily whole, from 0 to 4.
-    held : (...) array or float, optional
+    levels_before : (...) array or float, optional
         The value of the signal at all times before its first sample; by default that first sample.
 
     Returns
@@ -126,9 +128,9 @@ def high_pass(
     rows = np.asarray(signal, dtype=np.float64).reshape(count, -1)
     increments = np.diff(rows, axis=0, prepend=rows[:1])
     output = fftconvolve(increments, responses.increment[:, None], axes=0)[:count]
-    if held is not None:
-        held_row = np.broadcast_to(held, np.shape(signal)[1:]).reshape(-1)
-        jump = rows[0] - held_row
+    if levels_before is not None:
+        level_row = np.broadcast_to(levels_before, np.shape(signal)[1:]).reshape(-1)
+        jump = rows[0] - level_row
         output = output + responses.step[:, None] * jump
     return np.asarray(output.reshape(np.shape(signal)))
 

@@ -54,7 +54,7 @@ class Declaration:
     name : str
         Model name, with which the model identifier begins.
     description : str
-        One sentence for people.
+        A sentence that describes the FMU to people.
     table : tuple of FmuVariable
         The variables, in the order of their value references. Local ones are states, and then as
         many derivatives.
@@ -169,7 +169,7 @@ def _c_text(text: str) -> str:
 
 
 def _c_number(value: float | None, absent: str) -> str:
-    """Return a float as a constant of C with the same bits.
+    """Return a number as a constant of C that has exactly the same bits.
 
     Parameters
     ----------
@@ -305,10 +305,10 @@ def description_members(
     """
     later_elements = {row.reference for array in arrays for row in array.rows[1:]}
     rows = [row for row in declared.table if row.reference not in later_elements]
-    local = [row for row in rows if row.causality == "local"]
-    state_count = len(local) // 2
-    states = local[:state_count]
-    rates = local[state_count:]
+    local_rows = [row for row in rows if row.causality == "local"]
+    state_count = len(local_rows) // 2
+    states = local_rows[:state_count]
+    rates = local_rows[state_count:]
     state_of = {}
     for state, rate in zip(states, rates, strict=True):
         # FMI 2 counts variables from 1, FMI 3 uses value references; ours differ by one
@@ -325,7 +325,7 @@ def description_members(
         version=version("uav-twin"),
         token=PLACEHOLDER,
         sources=source_files,
-        exchange=bool(local),
+        exchange=bool(local_rows),
         categories=LOG_CATEGORIES,
         rows=rows,
         heads={array.rows[0].reference: array for array in arrays},
@@ -333,6 +333,6 @@ def description_members(
         dependencies=dependencies,
         rates=rates,
     )
-    interface = "model-exchange" if local else "co-simulation"
+    interface = "model-exchange" if local_rows else "co-simulation"
     page = rendered("index.html", declared=declared, host=host, fmi=fmi, interface=interface)
     return {"modelDescription.xml": xml, "documentation/index.html": page}

@@ -95,7 +95,7 @@ class FmuOutputError(FmuError, RuntimeError):
 
 
 class FmuStateError(FmuError, RuntimeError):
-    """A saved state cannot be made or restored, or a call came in the wrong phase."""
+    """A state cannot be saved or restored, or a call was made in the wrong phase."""
 
 
 class FmuWorkerError(FmuError, RuntimeError):

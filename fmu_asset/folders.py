@@ -52,7 +52,7 @@ def plain_folder() -> Path:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Return a context with a folder as `plain_folder` makes it, which is removed at the end."""
+    """Return a context with a folder as `plain_folder` makes it, removed when the context ends."""
     folder = plain_folder()
     try:
         yield folder
@@ -61,7 +61,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove our folders in a parent folder whose process has ended; once for each parent.
+    """Remove the folders of processes that have ended from a parent folder, once for each parent.
 
     Nothing is done on a system without /proc, which cannot tell whether a process runs.
     """
@@ -130,7 +130,7 @@ def _path_of_opened(folder: str) -> Iterator[str]:
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder with everything in it that can be removed, however deeply it is nested.
+    """Remove a folder and its content, however deeply nested, as far as it can be removed.
 
     Inner folders are first moved to the top. `shutil.rmtree` would call itself for each level, and
     a deep path is longer than the system allows. Links are not followed, not even those by which a
@@ -139,7 +139,7 @@ def remove_folder(folder: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     folder : path-like
-        The folder.
+        The path of the folder.
     """
     # strings instead of `Path` objects take half the time
     top = os.fspath(folder)

@@ -39,7 +39,7 @@ def structure_binding(design: StructureDesign, frequencies: int = 0) -> Binding:
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
-    """Return the file by which campaigns use a structure's FMU as a model.
+    """Return the file that describes a structure's FMU as a model for campaigns.
 
     It has the forces, outputs, ports and parameters of the structure's file. A control in N is a
     force, and one named load_factor is the load factor of flights. A point with a load of 1 N and a
@@ -49,7 +49,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     Parameters
     ----------
     design : MeshDesign or MatrixDesign
-        The structure.
+        The design of the structure, as read from its file.
     fmu : str
         Path of its FMU, relative to the folder of the file.
 

@@ -31,8 +31,8 @@ def require_one_of(value: object, allowed: Iterable[object], name: str) -> None:
             return
     quoted_choices = listing(map(repr, choices), "or")
     words = [choice for choice in choices if isinstance(choice, str)]
-    nearest = nearest_word(value, words) if isinstance(value, str) else None
-    advice = "" if nearest is None else f"; the nearest is {nearest!r}"
+    nearest_choice = nearest_word(value, words) if isinstance(value, str) else None
+    advice = "" if nearest_choice is None else f"; the nearest is {nearest_choice!r}"
     raise InvalidChoiceError(f"`{name}` must be {quoted_choices}, but {value!r} was given{advice}.")
 
 
@@ -47,5 +47,5 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
 
     It begins with a blank; it is empty if no known name is like it.
     """
-    nearest = nearest_word(name, known_names)
-    return "" if nearest is None else f" Did you mean `{nearest}`?"
+    nearest_name = nearest_word(name, known_names)
+    return "" if nearest_name is None else f" Did you mean `{nearest_name}`?"

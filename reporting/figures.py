@@ -246,7 +246,7 @@ def plain_powers(axis: Axis, multiples: tuple[float, ...]) -> None:
     Parameters
     ----------
     axis : Axis
-        The axis.
+        The horizontal or vertical axis of a panel.
     multiples : tuple of float
         The multiples of powers of ten that are labelled, such as (1, 2, 5).
     """
@@ -276,7 +276,7 @@ def interval(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     x : float
         The horizontal coordinate.
     mean, low, high : float
@@ -318,7 +318,7 @@ def shared_legend(
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     rows : int
         The number of rows of the legend.
     bbox_to_anchor : (float, float)
@@ -352,13 +352,13 @@ def color_bar(
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     artist : ScalarMappable or ColorizingArtist
         The map or the points whose colours stand for values.
     label : str
         The quantity and its unit.
     ax : Axes or sequence of Axes, optional
-        The panels beside which the scale is drawn, if it has no panel of its own.
+        The panels next to which the scale is drawn, if it has no panel of its own.
     cax : Axes, optional
         The panel in which the scale is drawn.
     location : str, optional
@@ -378,11 +378,11 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     label : str
         Its letter, such as ``a``.
     title : str
-        A few words beside the letter.
+        A few words after the letter.
     """
     axes.set_title("  ".join(text for text in (label, title) if text), loc="left")
 
@@ -417,7 +417,7 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     resolution : float
         The resolution in dots per inch.
     """
@@ -434,7 +434,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     folder : Path
         The folder of the files.
     name : str
@@ -542,7 +542,7 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
             look += f' {name}="{value}"'
     label = html.escape(description)
     view_box = attributes["viewBox"]
-    full = (
+    full_drawing = (
         f'<svg viewBox="{view_box}" role="img" aria-label="{label}">'
         f'<g id="{prefix}-{_DRAWING}"{look}>{content}</g></svg>'
     )
@@ -553,7 +553,7 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
         widths = [float(tile_box.split()[2]) for tile_box in tile_boxes]
         for tile_box, width in zip(tile_boxes, widths, strict=True):
             tiles.append(_tile_element(tile_box, width, f"{prefix}-{_DRAWING}"))
-    return InlineDrawing(full, tuple(tiles), is_wide=max(widths) > NARROW)
+    return InlineDrawing(full_drawing, tuple(tiles), is_wide=max(widths) > NARROW)
 
 
 def _tile_element(view_box: str, width: float, drawing: str) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from reporting.errors import DiskFullError, FileNotWrittenError
 
 TEMPORARY_SUFFIX = ".partial"
-"""Ending of the temporary names, by which the leftovers of a killed process are recognised."""
+"""Ending of temporary names, which marks the leftovers of a killed process."""
 
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
@@ -203,7 +203,7 @@ def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, byte
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     suffixes : collection of str
         The suffixes of the files to read, such as ".py"; all files by default.
     """
@@ -219,7 +219,7 @@ def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     members : mapping of str to bytes
         The contents by relative path.
     """
@@ -275,7 +275,7 @@ def hash_file(path: str | os.PathLike[str]) -> str:
 
 
 def hash_record(record: object) -> str:
-    """Return the SHA-256 of plain data of JSON; the order of keys does not matter.
+    """Return the SHA-256 of plain data as JSON; the order of keys does not matter.
 
     Raises
     ------

@@ -46,7 +46,7 @@ def lock_folder(folder: Path) -> int | None:
 
 @contextmanager
 def closing_lock(lock: int) -> Iterator[None]:
-    """Return a context at whose end the lock of a folder is released."""
+    """Return a context that releases the lock of a folder when it ends."""
     try:
         yield
     finally:
@@ -174,7 +174,7 @@ def restore_folder(folder: Path) -> bool:
 
 
 def _restore_from(parking: Path, folder: Path) -> bool:
-    """Move old content back to its folder if that is missing; return whether it was moved.
+    """Move old content back to its folder if the folder is missing; return whether it was moved.
 
     Parameters
     ----------
@@ -205,12 +205,12 @@ def _restore_from(parking: Path, folder: Path) -> bool:
 
 
 def _old_label(fresh: Path) -> str:
-    """Return the label of old content, which contains the inode of the folder replacing it."""
+    """Return the label of old content; it contains the inode of the folder that replaces it."""
     return f"{_OLD}-{fresh.stat().st_ino}"
 
 
 def _prefix(folder: Path, label: str) -> str:
-    """Return the beginning of the names of temporary folders of a kind next to `folder`."""
+    """Return how the names of temporary folders of one kind next to `folder` begin."""
     return f".{folder.name}.{label}-"
 
 

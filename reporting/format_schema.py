@@ -53,7 +53,7 @@ def format_schema(model: Any, title: str) -> JsonSchema:
 
 
 def attribute_descriptions(cls: type) -> dict[str, str]:
-    """Return the description of each attribute of a class, also of the inherited ones, by name."""
+    """Return the description of each attribute of a class, own or inherited, by name."""
     descriptions: dict[str, str] = {}
     # A TypedDict has its bases beside the order in which methods are looked up.
     bases = (*cls.__dict__.get("__orig_bases__", ()), *cls.__mro__)
@@ -129,7 +129,7 @@ class _DescribedSchema(GenerateJsonSchema):
     }
 
     def field_title_should_be_set(self, schema: Any) -> bool:
-        """Return that a key gets no title, since it would repeat the name of the key."""
+        """Return false: a title of a key would only repeat the name of the key."""
         return False
 
     def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:

@@ -91,7 +91,7 @@ def format_page(schema: JsonSchema, notation: Notation) -> str:
 
 
 def undocumented_keys(schema: JsonSchema) -> list[str]:
-    """Return the keys of a format that lack a description, and those of numbers without a unit."""
+    """Return the keys of a format without description, and the keys of numbers without unit."""
     keys = []
     for table in _TableFinder(schema, "json").tables:
         for key, key_schema in table.schema["properties"].items():
@@ -116,7 +116,7 @@ class _TableFinder:
             self._visit(node, place)
 
     def _visit(self, node: JsonSchema, place: str) -> None:
-        """Add the tables that a part of the schema describes, and remember those inside them."""
+        """Add the tables that a part of the schema describes, and note the tables inside them."""
         node = _resolved(node, self._root)
         for key in _ALTERNATIVES:
             for alternative in node.get(key, ()):
@@ -142,7 +142,7 @@ class _TableFinder:
             self._waiting.append((key_schema, self._place_in(place, key)))
 
     def _place_in(self, place: str, key: str) -> str:
-        """Return the place of a table in another one."""
+        """Return the place of a table inside another table."""
         if self._notation == "json":
             return f"{place}.{key}".lstrip(".")
         inner_place = place.strip("[]")
@@ -154,7 +154,7 @@ class _TableFinder:
 
 
 def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:
-    """Return a part of a schema, or the definition to which it refers."""
+    """Return a part of a schema; if the part is a reference, the definition that it refers to."""
     reference = node.get("$ref")
     if reference is None:
         return node
@@ -215,7 +215,7 @@ def _markdown(text: str) -> str:
 
 
 def _default_text(schema: JsonSchema) -> str:
-    """Return the default of a key; empty if it has none that can be written."""
+    """Return the default of a key as text; empty if there is none, or none that can be written."""
     default = schema.get("default")
     if default is None or default in ("", [], {}) or isinstance(default, dict):
         return ""
@@ -223,7 +223,17 @@ def _default_text(schema: JsonSchema) -> str:
 
 
 def _type_text(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]) -> str:
-    """Return the type of a value in words, with a link if it is a table."""
+    """Return the type of a value in words, such as "list of: number".
+
+    Parameters
+    ----------
+    node : JsonSchema
+        The schema of the value.
+    root : JsonSchema
+        The schema of the whole format, with the definitions to which `node` may refer.
+    link : callable
+        Returns a link to the section of the page about a table.
+    """
     node = _resolved(node, root)
     if "const" in node:
         return f"`{json.dumps(node['const'])}`"
@@ -266,7 +276,7 @@ def _range_text(node: JsonSchema, root: JsonSchema) -> str:
 
 
 def _bounds(node: JsonSchema, root: JsonSchema) -> Iterator[str]:
-    """Yield the bounds of a value and of the entries of a list; not those of the keys of tables."""
+    """Yield the bounds of a value and, if it is a list, of its entries."""
     node = _resolved(node, root)
     for key, sign in _BOUND_SIGNS.items():
         if key in node:
@@ -280,7 +290,7 @@ def _bounds(node: JsonSchema, root: JsonSchema) -> Iterator[str]:
 
 
 def _inner_schemas(node: JsonSchema) -> Iterator[JsonSchema]:
-    """Yield the schemas of alternatives, and of the entries of a list or of a table by names."""
+    """Yield the schemas of a value's alternatives, and of the entries of a list or table."""
     for key in (*_ALTERNATIVES, "prefixItems"):
         yield from node.get(key, ())
     for key in ("items", "additionalProperties"):
@@ -289,7 +299,7 @@ def _inner_schemas(node: JsonSchema) -> Iterator[JsonSchema]:
 
 
 def _basic_types(node: JsonSchema, root: JsonSchema) -> set[str]:
-    """Return the types of JSON that a value can have, and those of its entries, without tables."""
+    """Return the types of JSON, other than tables, that a value or its entries can have."""
     node = _resolved(node, root)
     types: set[str] = set()
     if "properties" in node:

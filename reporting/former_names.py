@@ -26,7 +26,7 @@ def with_present_names(
     source: str,
     error: type[Exception],
 ) -> dict[str, object]:
-    """Return the content of a file with the present name of each key that had another one.
+    """Return the content of a file, with keys that were renamed under their present names.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def with_present_names(
     Returns
     -------
     dict of str to object
-        The content. What has no former name is the same object as before.
+        The content. A table without a former name is the same object as in the record.
 
     Raises
     ------
@@ -55,20 +55,20 @@ def with_present_names(
     FormerNameWarning
         If there is a former name; once for each source in a process.
     """
-    renamed: object = record
-    used: dict[str, str] = {}
+    content: object = record
+    present_name_of_found: dict[str, str] = {}
     for location, present_name in present_names.items():
         *tables, former_name = location.split(".")
         try:
-            changed = _with_renamed_key(renamed, tables, former_name, present_name)
+            changed_content = _with_renamed_key(content, tables, former_name, present_name)
         except ValueError as cause:
             raise error(f"{source}: {cause}.") from None
-        if changed is not renamed:
-            used[former_name] = present_name
-            renamed = changed
-    if used:
-        warn_of_former_names(source, used)
-    return renamed if isinstance(renamed, dict) else dict(record)
+        if changed_content is not content:
+            present_name_of_found[former_name] = present_name
+            content = changed_content
+    if present_name_of_found:
+        warn_of_former_names(source, present_name_of_found)
+    return content if isinstance(content, dict) else dict(record)
 
 
 def _with_renamed_key(
@@ -88,7 +88,7 @@ def _with_renamed_key(
     Returns
     -------
     object
-        The node itself where it does not have the key.
+        The table or list with the present name; the node itself if it does not have the key.
 
     Raises
     ------
@@ -97,7 +97,8 @@ def _with_renamed_key(
     """
     if isinstance(node, list | tuple):
         entries = [_with_renamed_key(entry, tables, former_name, present_name) for entry in node]
-        is_changed = any(new is not old for new, old in zip(entries, node, strict=True))
+        pairs = zip(entries, node, strict=True)
+        is_changed = any(entry is not former_entry for entry, former_entry in pairs)
         return entries if is_changed else node
     if not isinstance(node, Mapping):
         return node
@@ -107,28 +108,34 @@ def _with_renamed_key(
         if present_name in node:
             raise ValueError(f"`{former_name}` is now called `{present_name}`, and both are given")
         return {present_name if key == former_name else key: node[key] for key in node}
-    inner, *further = tables
-    keys = list(node) if inner == EVERY_KEY else [inner] if inner in node else []
+    outermost_key, *inner_keys = tables
+    if outermost_key == EVERY_KEY:
+        keys = list(node)
+    else:
+        keys = [outermost_key] if outermost_key in node else []
     for key in keys:
-        changed = _with_renamed_key(node[key], further, former_name, present_name)
-        if changed is not node[key]:
-            node = {**node, key: changed}
+        changed_entry = _with_renamed_key(node[key], inner_keys, former_name, present_name)
+        if changed_entry is not node[key]:
+            node = {**node, key: changed_entry}
     return node
 
 
-def warn_of_former_names(source: str, used: Mapping[str, str]) -> None:
+def warn_of_former_names(source: str, present_names: Mapping[str, str]) -> None:
     """Warn the user, once for each source in a process, that names have changed.
 
     Parameters
     ----------
     source : str
         The name of the file, or what else has the former names; begins the message.
-    used : dict of str to str
+    present_names : dict of str to str
         The present name of each former name that was found.
     """
     if source in _sources_told:
         return
     _sources_told.add(source)
-    changes = listing(f"`{former}` is now called `{present}`" for former, present in used.items())
-    names = "The former name is" if len(used) == 1 else "The former names are"
+    changes = listing(
+        f"`{former_name}` is now called `{present_name}`"
+        for former_name, present_name in present_names.items()
+    )
+    names = "The former name is" if len(present_names) == 1 else "The former names are"
     warnings.warn(f"{source}: {changes}. {names} still read.", FormerNameWarning, stacklevel=3)

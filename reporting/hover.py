@@ -129,7 +129,7 @@ def _data_annotations(axes: Axes, line_names: dict[_LineLook, str]) -> Iterator[
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     line_names : dict of _LineLook to str
         The names of lines without a label of their own, by their appearance.
     """
@@ -322,7 +322,7 @@ def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str)
     Parameters
     ----------
     axis : Axis
-        The axis.
+        The horizontal or vertical axis of a panel.
     limits : (float, float)
         The values at its ends.
     scale : str

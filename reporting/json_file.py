@@ -57,7 +57,7 @@ def parse_json(
     Parameters
     ----------
     content : bytes or str
-        The text.
+        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception
@@ -104,7 +104,7 @@ def _parse_finite_float(text: str) -> float:
 
 
 def _parse_long_integer(digits: str) -> float:
-    """Return an integer, or a float where it has more digits than 64 bits hold."""
+    """Return a whole number as an integer, or as a float if it needs more than 64 bits."""
     if len(digits) < _LONGEST_INTEGER:
         return int(digits)
     return float(digits)

@@ -32,7 +32,7 @@ def known_keys(model: object, location: tuple[int | str, ...]) -> list[str]:
 
 
 def _alternatives(annotation: object) -> Iterator[object]:
-    """Yield the types of which a value may be, without their metadata."""
+    """Yield the types that an annotation allows for a value, without metadata."""
     origin = get_origin(annotation)
     if origin is Annotated:
         yield from _alternatives(get_args(annotation)[0])
@@ -44,10 +44,10 @@ def _alternatives(annotation: object) -> Iterator[object]:
 
 
 def _inner_types(annotation: object, step: int | str) -> list[object]:
-    """Return the types of the value at a key or an index of a value; empty if it has none there."""
+    """Return the types of the entry of a value at a key or an index; empty if there is none."""
     if isinstance(step, int):
         entries = [entry for entry in get_args(annotation) if entry is not Ellipsis]
-        return [inner for entry in entries for inner in _alternatives(entry)]
+        return [inner_type for entry in entries for inner_type in _alternatives(entry)]
     types_of_keys = _types_of_keys(annotation)
     if step in types_of_keys:
         return [*_alternatives(types_of_keys[step])]

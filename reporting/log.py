@@ -1,4 +1,4 @@
-"""The log of the package: all that library code has to say beside its results.
+"""The log of the package: all that library code has to say in addition to its results.
 
 Library code prints nothing. Its modules have loggers below the one logger `uav_twin`, which a user
 configures as that of any other package: ``logging.getLogger("uav_twin").setLevel("DEBUG")``. A
@@ -23,7 +23,7 @@ def module_logger(module: str) -> logging.Logger:
     Parameters
     ----------
     module : str
-        Its `__name__`.
+        The name of the module, its `__name__`.
     """
     return PACKAGE_LOGGER.getChild(module)
 

@@ -36,11 +36,11 @@ def _available_memory_of_machine() -> float:
 def _available_memory_of_container() -> float:
     """Return the memory that the limit of the container (control group) leaves [bytes]."""
     limit = (_CONTROL_GROUP / "memory.max").read_text(encoding="ascii")
-    used = (_CONTROL_GROUP / "memory.current").read_text(encoding="ascii")
+    used_memory = (_CONTROL_GROUP / "memory.current").read_text(encoding="ascii")
     statistics = (_CONTROL_GROUP / "memory.stat").read_text(encoding="ascii")
     # The kernel gives up cached file pages as soon as a process asks for memory.
     file_cache = float(statistics.split("\ninactive_file ")[1].split()[0])
-    return float(limit) - float(used) + file_cache
+    return float(limit) - float(used_memory) + file_cache
 
 
 def _unit_weight(_: object) -> int:

@@ -82,7 +82,7 @@ def write_groups(
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     groups : mapping of str to NetcdfGroup
         The groups by name.
     attrs : mapping of str to object
@@ -118,7 +118,7 @@ def _write_group(target: h5py.Group, group: NetcdfGroup) -> None:
 
 
 def _axis_sizes(group: NetcdfGroup) -> dict[str, int]:
-    """Return the size of each axis of a group, in the order in which axes are first used."""
+    """Return the size of each axis of a group, by name, in the order of first use."""
     sizes = {}
     for variable in {**group.variables, **group.coords}.values():
         for axis, size in zip(variable.dims, variable.values.shape, strict=True):
@@ -213,7 +213,7 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
 
     Returns
     -------
@@ -241,12 +241,12 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
 
 
 def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
-    """As the fork, send the groups of a file, or why it cannot be read, and end the process.
+    """In the forked process, send the groups of a file, or why it cannot be read, and end.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     writing_end : int
         The file descriptor of the pipe to the parent process.
     """
@@ -267,7 +267,7 @@ def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
 
 
 def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
-    """Return the groups of a file by their paths, or a line on why it cannot be read."""
+    """Return the groups of a file by their paths, or one line on why the file cannot be read."""
     import xarray as xr
 
     try:

@@ -68,11 +68,11 @@ class Table:
     rows: Sequence[Sequence[str]]
 
     def __post_init__(self) -> None:
-        needed = len(self.columns)
+        cells_needed = len(self.columns)
         for number, row in enumerate(self.rows):
-            if len(row) != needed:
+            if len(row) != cells_needed:
                 raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; {needed} are needed."
+                    f"Row {number} of a table has {len(row)} cells; {cells_needed} are needed."
                 )
 
 
@@ -141,7 +141,7 @@ class Words:
         Parameters
         ----------
         page : Page
-            The page.
+            The page to which content is added.
         name : str
             The name of the table in the file.
         rows : sequence of sequence of str
@@ -158,7 +158,7 @@ class Words:
 
 
 def _column_of_heading(heading: str | dict[str, str], fields: Mapping[str, object]) -> PageColumn:
-    """Return the column that a heading of the file describes, with its fields filled in."""
+    """Return the column that a heading in the file of texts describes, with fields filled in."""
     if isinstance(heading, str):
         return PageColumn(fill_template(heading, **fields))
     return number_column(fill_template(heading["number"], **fields), heading.get("unit", ""))
@@ -189,7 +189,7 @@ class Page:
         self._blocks: list[_PageBlock] = []
 
     def _add(self, kind: str, **content: object) -> None:
-        """Append a block of a kind with its content."""
+        """Append a block of content to the page."""
         self._blocks.append(_PageBlock(kind, content))
 
     def _next_number(self, kind: str) -> int:

@@ -63,7 +63,7 @@ class Progress:
         yield Stage()
 
     def note(self, message: str) -> None:
-        """Show one line, such as where a file was written; this one only writes it to the log."""
+        """Show one line, such as where a file was written; here it only goes to the log."""
         _logger.info(message)
 
 

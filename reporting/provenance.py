@@ -109,7 +109,7 @@ def _version(distribution: str) -> str:
 
 @cache
 def source_hash(package: str) -> str:
-    """Return the SHA-256 of the names and contents of the source files of a package.
+    """Return a SHA-256 of all names and contents of a package's source files.
 
     Raises
     ------

@@ -280,7 +280,7 @@ def _parse_rows(text: str, separator: str | None, name: str, errors: TableErrors
 def _parse_separated_rows(
     lines: Sequence[str], separator: str, name: str, errors: TableErrors
 ) -> list[_Row]:
-    """Return the rows of lines whose cells have a separator, and may be quoted."""
+    """Return the rows of lines, split at a separator outside quotes."""
     stream = io.StringIO("\n".join(lines))
     reader = csv.reader(stream, delimiter=separator, skipinitialspace=True)
     rows = []
@@ -296,7 +296,7 @@ def _parse_separated_rows(
 
 
 def _check_columns(columns: Sequence[str], name: str, errors: TableErrors) -> None:
-    """Refuse a table with another separator, or in which two columns have the same name."""
+    """Refuse a table with another separator, or with two columns of the same name."""
     if len(columns) == 1 and (";" in columns[0] or "\t" in columns[0]):
         raise errors.layout(
             f"{name} is not separated by commas: "
@@ -310,13 +310,13 @@ def _check_columns(columns: Sequence[str], name: str, errors: TableErrors) -> No
 
 
 def _width_message(row: _Row, columns: Sequence[str], *, has_header: bool, has_commas: bool) -> str:
-    """Return the message about a row whose number of cells is not that of the columns."""
+    """Return the message about a row that has not one cell for each column."""
     cells = counted(len(row.cells), "cell")
-    wanted = counted(len(columns), "column")
+    wanted_columns = counted(len(columns), "column")
     if has_header:
-        message = f"the row has {cells}, but the header has {wanted}."
+        message = f"the row has {cells}, but the header has {wanted_columns}."
     else:
-        message = f"the row has {cells}, but {wanted} ({', '.join(columns)}) are expected."
+        message = f"the row has {cells}, but {wanted_columns} ({', '.join(columns)}) are expected."
     has_more_cells = len(row.cells) > len(columns)
     if has_commas and has_more_cells and all(is_number(cell) for cell in row.cells):
         message += " A decimal comma makes two cells of a number: write it with a point."

@@ -168,12 +168,12 @@ def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:
 
 
 def break_words(text: str, longest: int) -> str:
-    """Return a text whose long words continue on a new line after an underscore or a hyphen.
+    """Return a text with line breaks in long words, after underscores or hyphens.
 
     Parameters
     ----------
     text : str
-        The text.
+        The text, in one or more lines.
     longest : int
         The longest part of a word on one line, in characters.
     """
@@ -308,7 +308,7 @@ def _extend_commands(command: _Command, options: Sequence[_Option]) -> None:
 
 @contextmanager
 def _shown_progress() -> Iterator[None]:
-    """Return a context for a command: library functions show their stages, and Ctrl-C ends it."""
+    """Return a context for a command, in which library functions show their stages."""
     previous_progress = reporting.progress.default_progress
     # The cache makes one progress object for all stages of the command, when the first begins.
     reporting.progress.default_progress = functools.cache(progress)

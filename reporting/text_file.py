@@ -14,7 +14,7 @@ def read_text(
     Parameters
     ----------
     path : Path or str
-        The file.
+        The path of the file.
     error : type of Exception
         The exception to raise.
     what : str

@@ -70,7 +70,7 @@ def tiles_of_figure(figure: Figure) -> list[Tile]:
     Parameters
     ----------
     figure : Figure
-        The figure.
+        The figure with all its panels drawn.
     """
     figure.draw_without_rendering()  # places the entries of legends
     renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
@@ -125,7 +125,7 @@ def _boxes_of_panels(figure: Figure, renderer: RendererAgg) -> list[Bbox]:
 
 
 def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axes) -> Axes | None:
-    """Return the panel whose box has the smallest gap to that of another panel; None without one.
+    """Return the panel with the smallest gap between its box and that of a given panel, or None.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axe
     panels : sequence of Axes
         The panels that are compared.
     axes : Axes
-        The other panel.
+        The given panel.
     """
     box = boxes[axes]
 
@@ -175,12 +175,12 @@ def _split_into_narrow_groups(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
 def _separate(
     boxes: Sequence[Tile], ends_of: Callable[[Tile], tuple[float, float]]
 ) -> list[list[Tile]]:
-    """Return boxes in groups that do not overlap along one direction, in their order along it.
+    """Return boxes in groups, ordered along one direction, that do not overlap in this direction.
 
     Parameters
     ----------
     boxes : sequence of Tile
-        The boxes.
+        The boxes, with low and high ends in both directions.
     ends_of : callable
         Returns the ends of a box along the direction.
     """
@@ -209,7 +209,7 @@ def _side_by_side(columns: Sequence[list[Tile]]) -> list[list[Tile]]:
 
 
 def _surrounding_tile(boxes: Sequence[Tile], width: float, height: float) -> Tile:
-    """Return the tile around boxes with its margin, inside a figure of a size [pt]."""
+    """Return the tile around some boxes, with a margin, inside a figure of a given size [pt]."""
     x_start = max(0.0, min(box.x for box in boxes) - _MARGIN)
     y_start = max(0.0, min(box.y for box in boxes) - _MARGIN)
     x_end = min(width, max(box.x_end for box in boxes) + _MARGIN)

@@ -66,7 +66,7 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> Tom
     Parameters
     ----------
     content : bytes or str
-        The text.
+        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception
@@ -249,7 +249,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the possible faults of the table, each with whether the table has it.
+        """Yield (is present, message) of each possible fault of the table.
 
         The first fault that the table has is raised; those after it are not evaluated.
         """
@@ -268,7 +268,7 @@ MISSING_KEY = "missing_key"
 
 
 def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
-    """Return the error by which a validator says that keys are missing.
+    """Return the error with which a validator reports missing keys.
 
     If several keys of a file are missing, one message names them all.
 
@@ -369,17 +369,17 @@ def _validation_message(error: ValidationError, model: object, what: str, first_
     """
     faults = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
-    unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
-    if unknown:
-        return _unknown_keys_message(unknown, model, what, first_index)
-    missing = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
-    if not missing:
+    unknown_key_faults = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
+    if unknown_key_faults:
+        return _unknown_keys_message(unknown_key_faults, model, what, first_index)
+    missing_key_faults = [fault for fault in faults if fault["type"] in _MISSING_KEY_TYPES]
+    if not missing_key_faults:
         return _value_message(faults[0], first_index)
     keys = []
-    for fault in missing:
+    for fault in missing_key_faults:
         keys += [short_repr(location) for location in _missing_locations(fault, first_index)]
-    if missing[0]["type"] == MISSING_KEY and len(keys) <= 1:
-        return _value_message(missing[0], first_index)
+    if missing_key_faults[0]["type"] == MISSING_KEY and len(keys) <= 1:
+        return _value_message(missing_key_faults[0], first_index)
     return f"{listing(keys)} {is_or_are(len(keys))} missing"
 
 

@@ -130,7 +130,7 @@ def _pint_expression(unit: str, *, gravity: bool) -> str:
     Parameters
     ----------
     unit : str
-        The unit.
+        The name of the unit.
     gravity : bool
         Whether g is an acceleration, not a mass.
 

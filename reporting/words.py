@@ -47,7 +47,7 @@ def brief(record: object, **facts: object) -> str:
     Parameters
     ----------
     record : object
-        The record.
+        The object to describe.
     **facts : object
         The values to show, by name.
     """
@@ -172,7 +172,7 @@ def plus_minus(value: float, deviation: float) -> str:
 
 
 def between(low: float, high: float, deviation: float | None = None) -> str:
-    """Return an interval with the decimals that its width, or a standard deviation, needs."""
+    """Return an interval as text, with as many decimals as its width or a deviation needs."""
     if deviation is None:
         deviation = high - low
     return f"{rounded(low, deviation)} to {rounded(high, deviation)}"

@@ -218,19 +218,31 @@ def _new_mission(
 
     if scenario_name is None:
         raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
-    loaded = load_scenario(scenario_name)
-    folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-    return folder, partial(fly, loaded, folder, overrides, **vars(parts), replace=replace)
+    loaded_scenario = load_scenario(scenario_name)
+    folder = out if out is not None else Path("runs") / loaded_scenario.scenario.mission.name
+    return folder, partial(fly, loaded_scenario, folder, overrides, **vars(parts), replace=replace)
 
 
 def _resumed_mission(
     scenario_name: str | None, folder: Path, parts: "TwinParts", *, has_changes: bool
 ) -> "Callable[..., RunOutcome]":
-    """Return the function that continues an interrupted run."""
+    """Return a function that continues an interrupted run.
+
+    Parameters
+    ----------
+    scenario_name : str or None
+        The scenario that the user named in addition; None if the user named only the folder.
+    folder : Path
+        The folder of the run.
+    parts : TwinParts
+        The sensor model and the estimator that the user gave.
+    has_changes : bool
+        Whether the user gave an option that would change the run, which is refused.
+    """
     from twin_master.scenario.reading import load_scenario
     from twin_master.workflow import resume
 
-    loaded = None if scenario_name is None else load_scenario(scenario_name)
+    loaded_scenario = None if scenario_name is None else load_scenario(scenario_name)
     if has_changes:
         raise typer.BadParameter(
             "a run is continued with the inputs in its folder: leave out options that would change "
@@ -240,7 +252,7 @@ def _resumed_mission(
     return partial(
         resume,
         folder,
-        loaded,
+        loaded_scenario,
         sensor_model=parts.sensor_model,
         estimator=parts.estimator,
     )
@@ -262,7 +274,7 @@ def _fly_and_print_mission(
         `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and
         `begun`.
     folder : Path
-        The run folder.
+        The path of the run folder.
     report : bool
         Whether to write the report.
     view : bool
@@ -316,18 +328,20 @@ def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
 
 
 def print_outcome(outcome: "RunOutcome") -> None:
-    """Print the figures of a run beside their references, and where the report is."""
+    """Print the figures of a run next to their reference values, and where the report is."""
     from twin_master.store.printed_figures import printed_figures
 
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    for figure, printed in zip(outcome.figures, printed_figures(outcome.figures), strict=True):
-        reference = printed.reference
+    for figure, printed_figure in zip(
+        outcome.figures, printed_figures(outcome.figures), strict=True
+    ):
+        reference = printed_figure.reference
         if reference and not isinstance(figure.reference, str):  # a text has its unit in it
             reference = f"{reference} {figure.unit}".strip()
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
-        value = "none" if figure.value is None else f"{printed.value} {figure.unit}".strip()
+        value = "none" if figure.value is None else f"{printed_figure.value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
     terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
     terminal.say(f"The twin {outcome.control}.")
@@ -361,17 +375,17 @@ def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")
         if seconds:
-            median = 1e3 * seconds["median"]
+            median_milliseconds = 1e3 * seconds["median"]
             largest = 1e3 * seconds["largest"]
-            time_of_step = f"{median:.3g} ms (largest {largest:.3g} ms)"
+            time_of_step = f"{median_milliseconds:.3g} ms (largest {largest:.3g} ms)"
             rows.append([f"{part}, per {outcome.step_name}", time_of_step, ""])
     rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s", ""])
     return rows
 
 
-def printed_value(value: float | int | str | None, unit: str, missing: str = "") -> str:
-    """Return a value with its unit; the text `missing` for None."""
-    return missing if value is None else f"{number(value)} {unit}".strip()
+def printed_value(value: float | int | str | None, unit: str, text_for_none: str = "") -> str:
+    """Return a value with its unit; the text `text_for_none` for None."""
+    return text_for_none if value is None else f"{number(value)} {unit}".strip()
 
 
 def run_command_line(application: Callable[[], None], *further_errors: type[Exception]) -> None:

@@ -35,7 +35,7 @@ except ImportError:
     ) from None
 
 Info = dict[str, Any]
-"""What is known of a step beside its observation, see `ScenarioEnvironment`."""
+"""Facts about a step in addition to its observation, see `ScenarioEnvironment`."""
 
 
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
@@ -203,25 +203,25 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
                 "expected the index of one of the controls "
                 f"{comma_list(self.scenario.control_names)}, got {action!r}"
             )
-        ended = ""
+        reason_of_end = ""
         try:
             observation, reward, info = self._fly(int(action), self._control)
             if self.scenario.ends(int(action)):
-                ended = sentence_of_ending_action(self.scenario, int(action))
+                reason_of_end = sentence_of_ending_action(self.scenario, int(action))
         except FmuEndedError as error:
             observation = self._last_observation.copy()
             reward = 0.0
             info = self._last_info
-            ended = error.sentence
-        terminated = ended != ""
+            reason_of_end = error.sentence
+        terminated = reason_of_end != ""
         if terminated:
             self._step = steps
-            info = info | {"ended": ended}
+            info = info | {"ended": reason_of_end}
         truncated = not terminated and self._step >= steps
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Close the asset, and remove the files that were made for it."""
+        """Close the asset, and remove its temporary files."""
         self._resources.close()
         self._plant = None
 

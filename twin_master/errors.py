@@ -92,13 +92,13 @@ def check_names(
     Parameters
     ----------
     owner : str
-        What has the names, as the beginning of the sentence: "the scenario has the".
+        The owner of the names, as the beginning of the sentence: "the scenario has the".
     reference : str
-        What knows names: "the binding uav_wing".
+        The place where names are known: "the binding uav_wing".
     rows : iterable of (str, iterable of str, collection of str)
-        For each kind of name: what is named, in the singular; the names; the known names.
+        For each kind of name: the noun of the kind in the singular, the names, and the known names.
     advice : str
-        What the user can do.
+        The advice to the user, which ends the message.
 
     Raises
     ------
@@ -106,10 +106,10 @@ def check_names(
         If a name is not known; the sentence lists the known ones.
     """
     for kind, names, known_names in rows:
-        unknown = sorted({*names} - {*known_names})
-        if unknown:
+        unknown_names = sorted({*names} - {*known_names})
+        if unknown_names:
             what_to_do = f": {advice}" if advice else ""
             raise MissionInputError(
-                f"{owner} {kind} {', '.join(unknown)}, which {reference} does not know; it knows "
-                f"{', '.join(known_names) or 'none'}{what_to_do}."
+                f"{owner} {kind} {', '.join(unknown_names)}, which {reference} does not know; it "
+                f"knows {', '.join(known_names) or 'none'}{what_to_do}."
             )

@@ -180,9 +180,9 @@ class _Console:
 
 
 def _heading(standing: Standing) -> str:
-    """Return the heading of a table of watched assets, such as "3 assets, 120 steps, 1 alarm".
+    """Return the heading of the table of watched assets, such as "3 assets, 120 steps, 1 alarm".
 
-    Refused messages, and assets that could not be watched, are added if there are any.
+    If messages were refused, or assets could not be watched, the heading has their numbers, too.
 
     Parameters
     ----------
@@ -349,7 +349,7 @@ def fly_and_print_fleet(
     Parameters
     ----------
     fleet : Fleet
-        The fleet.
+        The plan of the fleet.
     out : Path or None
         Its folder; ``runs/NAME`` if None.
     engine : Engine
@@ -393,19 +393,19 @@ def _print_outcome(outcome: "FleetOutcome") -> None:
     """Print how many twins flew, why flights failed or ended early, and where the report is."""
     from twin_master.fleet.configuration import REPORT_NAME
 
-    flown = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
+    flown_text = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
     if outcome.shards_kept:
-        flown += f", {counted(outcome.shards_kept, 'shard')} there before"
+        flown_text += f", {counted(outcome.shards_kept, 'shard')} there before"
     endings = f"{len(outcome.failures)} failed in flight"
     if outcome.ended:
         endings += f", {len(outcome.ended)} ended early"
-    terminal.say(f"{flown}; {endings}.")
+    terminal.say(f"{flown_text}; {endings}.")
     reasons = [*outcome.failures.items(), *outcome.ended.items()]
     for name, reason in reasons[:MOST_ENDINGS]:
         terminal.say(f"  {name}: {reason}", fg="yellow")
     if len(reasons) > MOST_ENDINGS:
-        further = len(reasons) - MOST_ENDINGS
-        terminal.say(f"  and {further} more, in {outcome.folder / 'fleet.json'}")
+        further_count = len(reasons) - MOST_ENDINGS
+        terminal.say(f"  and {further_count} more, in {outcome.folder / 'fleet.json'}")
     report = outcome.folder / REPORT_NAME
     if report.is_file():
         terminal.say(f"Report: {report}")

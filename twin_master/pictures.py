@@ -38,7 +38,7 @@ def plot_belief(
     Parameters
     ----------
     run : DataTree or RunOutcome
-        What `open_run` or `fly` returns.
+        The results of a run, from `open_run` or `fly`.
     axes : Axes or sequence of Axes, optional
         A panel for each factor; new ones of pyplot by default.
 
@@ -55,16 +55,16 @@ def plot_belief(
     from reporting import figures as style
 
     tree = _tree_of(run)
-    filtered = tree["filtered"].to_dataset()
+    filtered_group = tree["filtered"].to_dataset()
     policy = tree["policy"].to_dataset()
     truth = tree["truth"].to_dataset() if "truth" in tree.children else {}
-    names = [str(name) for name in filtered["region"].values]
-    steps = filtered["step"].values
+    names = [str(name) for name in filtered_group["region"].values]
+    steps = filtered_group["step"].values
     panels = new_panels(len(names), axes)
     for panel, name in zip(panels, names, strict=True):
         scale, unit = printed_state(policy[name].attrs.get("units", "1"))
-        mean = scale * filtered["mean"].sel(region=name).values
-        deviation = scale * filtered["standard_deviation"].sel(region=name).values
+        mean = scale * filtered_group["mean"].sel(region=name).values
+        deviation = scale * filtered_group["standard_deviation"].sel(region=name).values
         levels = scale * policy[name].values
         lower = np.clip(mean - 2.0 * deviation, levels.min(), levels.max())
         upper = np.clip(mean + 2.0 * deviation, levels.min(), levels.max())
@@ -88,7 +88,7 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     Parameters
     ----------
     run : DataTree or RunOutcome
-        What `open_run` or `fly` returns.
+        The results of a run, from `open_run` or `fly`.
     axes : Axes, optional
         The panel; a new one of pyplot by default.
 
@@ -130,7 +130,7 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
     Parameters
     ----------
     fleet : DataTree
-        What `open_fleet` returns.
+        The store of the fleet, from `open_fleet`.
     axes : Axes or sequence of Axes, optional
         A panel for each factor of each group; new ones of pyplot by default.
 

@@ -190,8 +190,8 @@ def _prepare(
     from twin_master.mission.sensor_design import add_candidate_gauges
     from twin_master.scenario.reading import load_scenario
 
-    loaded = load_scenario(scenario_name)
-    scenario = resolve_scenario(loaded, {"seed": seed, "calibration": calibration})
+    loaded_scenario = load_scenario(scenario_name)
+    scenario = resolve_scenario(loaded_scenario, {"seed": seed, "calibration": calibration})
     believed_source(scenario).check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
@@ -381,11 +381,11 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
 
 
 def _compare_returns(
-    knowledge: "Knowledge", chosen: Sequence[str], candidates: Sequence[str]
+    knowledge: "Knowledge", chosen_sensors: Sequence[str], candidates: Sequence[str]
 ) -> dict[str, list[float]]:
     """Return mean and half width of the returns: with the chosen and with all sensors."""
     titles = _sensor_titles(knowledge.scenario)
-    not_chosen = [title for title in titles if title not in chosen]
+    not_chosen = [title for title in titles if title not in chosen_sensors]
     no_candidates = [title for title in titles if title not in candidates]
     with_chosen = _plan_mission(_without_information(knowledge, not_chosen)).simulated
     with_all = _plan_mission(_without_information(knowledge, no_candidates)).simulated

@@ -66,7 +66,7 @@ def create_run_folder(
     *,
     replace: bool = False,
 ) -> Iterator[None]:
-    """Create a folder with its configuration and copies of what is flown, in one step, and lock it.
+    """Create a run folder with configuration and copies of all flown files, in one step; lock it.
 
     The folder is locked until the context ends.
 
@@ -176,7 +176,7 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     config : dict
         The content of its `config.json`.
     seed : int
@@ -187,18 +187,18 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
     NotResumableError
         If packages have changed; the sentence names them.
     """
-    recorded = config["provenance"]
+    recorded_provenance = config["provenance"]
     current = collect_provenance(seed)
     current_tables = {"versions": current.versions, "source_hashes": current.source_hashes}
     for table, current_values in current_tables.items():
-        recorded_values = recorded.get(table)
+        recorded_values = recorded_provenance.get(table)
         if not isinstance(recorded_values, dict):
             recorded_values = {}
-        changed = set()
+        changed_packages = set()
         for name, value in current_values.items():
             if recorded_values.get(name) != value:
-                changed.add(name)
-        names = sorted(changed - HARMLESS_PACKAGES)
+                changed_packages.add(name)
+        names = sorted(changed_packages - HARMLESS_PACKAGES)
         if names:
             raise NotResumableError(
                 f"{folder} was begun with another version of {', '.join(names)}, so its results "
@@ -207,12 +207,12 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
 
 
 def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:
-    """Write the hashes of what is flown into the configuration, or check them if they are there.
+    """Write the hashes of all flown files into the configuration, or check them if they are there.
 
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     config : dict
         The content of its `config.json`.
     hashes : mapping of str to str
@@ -228,16 +228,18 @@ def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -
     NotResumableError
         If inputs have changed since the run was begun; the sentence names them.
     """
-    recorded = config.get("inputs")
-    if recorded is None:
+    recorded_hashes = config.get("inputs")
+    if recorded_hashes is None:
         config = {**config, "inputs": dict(hashes)}
         atomic_write_text(folder / CONFIG_NAME, to_json(config))
         return config
-    if recorded != dict(hashes):
-        changed = sorted(
-            name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name)
+    if recorded_hashes != dict(hashes):
+        changed_names = sorted(
+            name
+            for name in {*recorded_hashes, *hashes}
+            if recorded_hashes.get(name) != hashes.get(name)
         )
-        names = ", ".join(changed).replace("_", " ")
+        names = ", ".join(changed_names).replace("_", " ")
         raise NotResumableError(
             f"the {names} changed since the run in {folder} was begun: fly the mission again with "
             "--replace."
@@ -267,7 +269,7 @@ def read_scenario(folder: Path) -> Scenario:
 
 @contextmanager
 def new_run_folder(
-    resolved: Scenario,
+    resolved_scenario: Scenario,
     file: Mapping[str, str],
     folder: Path,
     files: Mapping[str, bytes],
@@ -280,7 +282,7 @@ def new_run_folder(
 
     Parameters
     ----------
-    resolved : Scenario
+    resolved_scenario : Scenario
         The scenario with all overrides.
     file : mapping of str to str
         The name and the hash of its file, see `LoadedScenario.file`.
@@ -306,22 +308,22 @@ def new_run_folder(
         config["watched"] = True
     if parts:
         config["parts"] = dict(parts)
-    config["scenario"] = resolved.portable().to_dict()
+    config["scenario"] = resolved_scenario.portable().to_dict()
     config["scenario_file"] = dict(file)
-    config["provenance"] = collect_provenance(resolved.mission.seed).as_dict()
+    config["provenance"] = collect_provenance(resolved_scenario.mission.seed).as_dict()
     with create_run_folder(folder, config, files, replace=replace):
-        yield LockedRun(config, resolved.portable().with_paths_from(folder))
+        yield LockedRun(config, resolved_scenario.portable().with_paths_from(folder))
 
 
 @contextmanager
-def hold_run_folder(folder: Path, loaded: LoadedScenario | None) -> Iterator[LockedRun]:
+def hold_run_folder(folder: Path, loaded_scenario: LoadedScenario | None) -> Iterator[LockedRun]:
     """Lock the folder of an earlier run or watch, in order to continue it.
 
     Parameters
     ----------
     folder : Path
-        The folder.
-    loaded : LoadedScenario or None
+        The path of the folder.
+    loaded_scenario : LoadedScenario or None
         The scenario that the user expects there; it is compared with that of the folder.
 
     Raises
@@ -334,11 +336,11 @@ def hold_run_folder(folder: Path, loaded: LoadedScenario | None) -> Iterator[Loc
     config = read_config(folder)
     scenario = read_scenario(folder)
     file = config["scenario_file"]
-    if loaded is not None and file.get("sha256") != loaded.content_hash:
+    if loaded_scenario is not None and file.get("sha256") != loaded_scenario.content_hash:
         verb = "watches" if config.get("watched") else "flies"
         raise NotResumableError(
             f"{folder} {verb} another scenario ({scenario.mission.name}, {file.get('name')}) than "
-            f"{loaded.path}: resume it without naming a scenario."
+            f"{loaded_scenario.path}: resume it without naming a scenario."
         )
     with closing_lock(lock_run_folder(folder)):
         yield LockedRun(config, scenario.with_paths_from(folder))

@@ -217,11 +217,11 @@ def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None
     if terminal.loudness.quiet:
         return
     counts = watched.intake.counts
-    refused = ""
+    refused_messages = ""
     if counts.rejected:
-        refused = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
-    received = counted(counts.received, "message")
-    typer.echo(f"Watch: {folder}, {received}{refused}.", err=True)
+        refused_messages = f", {counted(counts.rejected, 'message')} refused (see rejected.jsonl)"
+    received_messages = counted(counts.received, "message")
+    typer.echo(f"Watch: {folder}, {received_messages}{refused_messages}.", err=True)
     if report and (folder / REPORT_NAME).is_file():
         typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
 

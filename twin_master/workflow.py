@@ -100,7 +100,7 @@ def fly(
     report : bool
         Whether to write the report.
     progress : Progress, optional
-        Shows the stages.
+        The display of the progress in stages.
     begun : callable, optional
         Called with the run folder before the first stage.
 
@@ -117,25 +117,25 @@ def fly(
         If the mission cannot be flown; the error is one clear sentence, and the run folder stays
         resumable.
     """
-    loaded = load_scenario(scenario)
-    resolved = resolve_scenario(loaded, overrides)
-    folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
+    loaded_scenario = load_scenario(scenario)
+    resolved_scenario = resolve_scenario(loaded_scenario, overrides)
+    folder = Path("runs") / resolved_scenario.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
     parts = TwinParts(policy, sensor_model, estimator)
     parts.with_objects()  # so that a wrong name is refused before the folder is made
     policy_files = {}
-    model = build_graphical_model(resolved)
+    model = build_graphical_model(resolved_scenario)
     policy_on_states = parts.policy_for(model)
     if policy_on_states is not None:
         policy_files[POLICY_NAME] = encode_policy(policy_on_states, model)
-    if loaded.remark:
-        progress.note(loaded.remark)
+    if loaded_scenario.remark:
+        progress.note(loaded_scenario.remark)
     run_folder.restore(folder, progress)
-    source = asset_source(resolved)
+    source = asset_source(resolved_scenario)
     source.check()  # before the folder is made, so that missing input leaves none behind
     new_folder = run_folder.new_run_folder(
-        resolved,
-        loaded.file,
+        resolved_scenario,
+        loaded_scenario.file,
         folder,
         source.files() | policy_files,
         replace=replace,
@@ -147,7 +147,7 @@ def fly(
 
 def resume(
     folder: Path | str,
-    loaded: LoadedScenario | None = None,
+    loaded_scenario: LoadedScenario | None = None,
     *,
     sensor_model: GivenSensorModel | None = None,
     estimator: GivenEstimator | None = None,
@@ -160,15 +160,15 @@ def resume(
     Parameters
     ----------
     folder : Path or str
-        The run folder.
-    loaded : LoadedScenario, optional
+        The path of the run folder.
+    loaded_scenario : LoadedScenario, optional
         The scenario that the user expects to be flown; it is compared with that of the folder.
     sensor_model, estimator : optional
         The same as for `fly`, if the run was begun with any.
     report : bool
         Whether to write the report.
     progress : Progress, optional
-        Shows the stages.
+        The display of the progress in stages.
     begun : callable, optional
         Called with the run folder before the first stage.
 
@@ -181,7 +181,7 @@ def resume(
     parts = TwinParts(None, sensor_model, estimator)
     progress = progress or SilentProgress()
     run_folder.restore(folder, progress)
-    with run_folder.hold_run_folder(folder, loaded) as locked:
+    with run_folder.hold_run_folder(folder, loaded_scenario) as locked:
         finished = finished_run(folder)
         if finished is not None and (finished.report or not report):
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
@@ -385,14 +385,14 @@ def _write_report(folder: Path) -> None:
 
 
 def check_scenario(
-    loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+    loaded_scenario: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
 ) -> run_folder.JsonObject:
     """Check a scenario and its files; return the asset that flies and the model of the twin.
 
     Parameters
     ----------
-    loaded : LoadedScenario
-        The scenario.
+    loaded_scenario : LoadedScenario
+        The scenario, as read from its file.
     overrides : Overrides or mapping, optional
         What differs from the file, as for `fly`.
 
@@ -412,7 +412,7 @@ def check_scenario(
     BindingError, InvalidDesignError, DesignFileError
         If the binding or the design is wrong.
     """
-    scenario = resolve_scenario(loaded, overrides)
+    scenario = resolve_scenario(loaded_scenario, overrides)
     is_watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if is_watched else asset_source(scenario)
     source.check()

@@ -226,7 +226,9 @@ def calibrate_wing(
     if data is None:
         lab = published_data()
     else:
-        lab = read_lab_folder(data, None if measured is None else targets, free=fitted)
+        lab = read_lab_folder(
+            data, None if measured is None else targets, frequencies_fitted=fitted
+        )
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
@@ -289,7 +291,7 @@ def calibrate_ringdown(
     from reporting.table_file import table_text
 
     start = FIRST_PEAK if start is None else start
-    trials = fit_trials(read_records(data), free=fitted, start=start)
+    trials = fit_trials(read_records(data), frequencies_fitted=fitted, start=start)
     if extremes:
         trials = refine_by_extremes(trials)
     rows = []

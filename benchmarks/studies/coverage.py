@@ -115,7 +115,7 @@ class Results:
 
 
 def measure(
-    model: ReducedModel, seed: int, model_error: tuple[float, float], *, free: bool
+    model: ReducedModel, seed: int, model_error: tuple[float, float], *, frequencies_fitted: bool
 ) -> MeasuredWing:
     """Draw a wing from the prior and measure it.
 
@@ -127,7 +127,7 @@ def measure(
         Seed of the wing and its measurements.
     model_error : (float, float)
         Relative standard deviations of the first two frequencies from the model's.
-    free : bool
+    frequencies_fitted : bool
         Whether ring-downs are fitted; otherwise frequencies come from the spectrum.
     """
     generator = np.random.default_rng([2021, seed])
@@ -141,7 +141,7 @@ def measure(
     )
     load_test = measure_load_test(wing, seed)
     weight = weigh(state, seed)
-    modes = measured_modes(fit_trials(records, free=free))
+    modes = measured_modes(fit_trials(records, frequencies_fitted=frequencies_fitted))
     return MeasuredWing(truth, load_test, (weight, *modes))
 
 
@@ -165,7 +165,7 @@ def calibrate_wings(
     wing_error: tuple[float, float],
     assumed_error: tuple[float, float],
     *,
-    free: bool,
+    frequencies_fitted: bool,
 ) -> Results:
     """Measure and calibrate a wing for each seed; see `measure` for the parameters.
 
@@ -177,7 +177,7 @@ def calibrate_wings(
     for seed in seeds:
         try:
             with results.timed("measuring and fitting"):
-                wing = measure(model, seed, wing_error, free=free)
+                wing = measure(model, seed, wing_error, frequencies_fitted=frequencies_fitted)
         except ExperimentDataError:
             results.without_modes += 1
             continue
@@ -269,7 +269,7 @@ def main() -> int:
         range(arguments.first_seed, arguments.first_seed + arguments.wings),
         wing_error=(0.0, 0.0) if arguments.exact_model else MODEL_ERROR,
         assumed_error=(0.0, 0.0) if arguments.trusting else MODEL_ERROR,
-        free=not arguments.peaks,
+        frequencies_fitted=not arguments.peaks,
     )
     coverage = np.mean(results.held, axis=0)
     print_results(results, coverage)

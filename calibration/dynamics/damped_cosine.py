@@ -92,11 +92,11 @@ def modal_gradients(pole: complex) -> Float:
         The derivatives of the frequency [Hz] and of the damping ratio [1] (rows) with respect to
         Re s and Im s (columns).
     """
-    real = pole.real
-    imaginary = pole.imag
+    real_part = pole.real
+    imaginary_part = pole.imag
     magnitude = abs(pole)
-    frequency_gradient = np.array([real, imaginary]) / magnitude / (2.0 * math.pi)
-    ratio_gradient = np.array([-(imaginary**2), real * imaginary]) / magnitude**3
+    frequency_gradient = np.array([real_part, imaginary_part]) / magnitude / (2.0 * math.pi)
+    ratio_gradient = np.array([-(imaginary_part**2), real_part * imaginary_part]) / magnitude**3
     return np.array([frequency_gradient, ratio_gradient])
 
 
@@ -173,12 +173,12 @@ class DampedCosines:
         else:
             self._line = offset[:, None]
 
-    def residual(self, pole: ComplexArray) -> Float:
+    def residual(self, poles: ComplexArray) -> Float:
         """Return the residuals at given poles, with the best amplitudes and the best line.
 
         Parameters
         ----------
-        pole : (K,) array
+        poles : (K,) array
             The poles s [1/s].
 
         Returns
@@ -188,9 +188,9 @@ class DampedCosines:
         """
         # Variable projection (Golub and Pereyra 1973): the linear unknowns are eliminated by an
         # orthogonal projection on the columns of the basis.
-        orthogonal_basis = np.linalg.qr(self._basis(self._waves(pole)))[0]
-        fitted = orthogonal_basis @ (orthogonal_basis.T @ self._signal)
-        return np.asarray(self._signal - fitted).ravel()
+        orthogonal_basis = np.linalg.qr(self._basis(self._waves(poles)))[0]
+        fitted_signals = orthogonal_basis @ (orthogonal_basis.T @ self._signal)
+        return np.asarray(self._signal - fitted_signals).ravel()
 
     def fit(
         self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True
@@ -204,25 +204,25 @@ class DampedCosines:
         frequencies_fitted : bool
             Whether the damped frequencies are unknown; otherwise they keep their values.
         """
-        count = start.size
+        wave_count = start.size
         if frequencies_fitted:
-            scale = np.concatenate([start.real, start.imag])
+            start_values = np.concatenate([start.real, start.imag])
         else:
-            scale = np.concatenate([start.real])
+            start_values = np.concatenate([start.real])
 
         def pole_of(relative_values: Float) -> ComplexArray:
-            scaled = relative_values * scale
-            imaginary = scaled[count:] if frequencies_fitted else start.imag
-            return np.asarray(scaled[:count] + 1j * imaginary)
+            unknowns = relative_values * start_values
+            angular_frequencies = unknowns[wave_count:] if frequencies_fitted else start.imag
+            return np.asarray(unknowns[:wave_count] + 1j * angular_frequencies)
 
         optimum = least_squares(
             lambda relative_values: self.residual(pole_of(relative_values)),
-            np.ones(scale.size),
+            np.ones(start_values.size),
             method="lm",
             xtol=1e-12,
             ftol=1e-14,
             gtol=1e-14,
-            max_nfev=_MOST_EVALUATIONS * scale.size,
+            max_nfev=_MOST_EVALUATIONS * start_values.size,
         )
         return self.solve(pole_of(optimum.x), frequencies_fitted=frequencies_fitted)
 
@@ -240,21 +240,21 @@ class DampedCosines:
         basis = self._basis(wave)
         solution = np.linalg.lstsq(basis, self._signal, rcond=None)[0]
         # Rows of the solution: K Re A, K Im A, and the coefficients of the line
-        coefficient = np.asarray(solution, dtype=np.float64)
+        coefficients = np.asarray(solution, dtype=np.float64)
         count = pole.size
-        amplitude = coefficient[:count] + 1j * coefficient[count : 2 * count]
-        fitted = basis @ coefficient
-        sum_of_squares = np.sum((self._signal - fitted) ** 2, axis=0)
+        amplitude = coefficients[:count] + 1j * coefficients[count : 2 * count]
+        fitted_signals = basis @ coefficients
+        sum_of_squares = np.sum((self._signal - fitted_signals) ** 2, axis=0)
         variance, covariance = self._covariance(
             wave, basis, amplitude, sum_of_squares, frequencies_fitted=frequencies_fitted
         )
         return DampedCosineFit(
             pole=pole,
             amplitude=amplitude,
-            fitted=fitted,
+            fitted=fitted_signals,
             deviation=np.sqrt(variance),
             covariance=covariance,
-            chi_square=_wave_chi_square(count, basis, coefficient, sum_of_squares),
+            chi_square=_wave_chi_square(count, basis, coefficients, sum_of_squares),
         )
 
     def _covariance(
@@ -275,7 +275,7 @@ class DampedCosines:
         basis : (N, B) array
             The basis of the linear unknowns of a signal.
         amplitude : (K, C) array
-            The complex amplitudes.
+            The complex amplitude of each wave in each signal [V].
         sum_of_squares : (C,) array
             The sum of squared residuals of each signal.
         frequencies_fitted : bool

@@ -115,8 +115,8 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
     half_line = 0.5 * float(np.percentile(highest - lowest, 10.0))
     start = np.array([*wave.real, *wave.imag, *pole.real, 0.0, 0.0, half_line]) / scale
 
-    def residual(scaled: Float) -> Float:
-        unknowns = _ExtremesUnknowns.from_array(scaled * scale)
+    def residual(relative_values: Float) -> Float:
+        unknowns = _ExtremesUnknowns.from_array(relative_values * scale)
         signal = unknowns.signal(instants, pole.imag)
         lowest_ink = signal.min(axis=1) - unknowns.half_line
         highest_ink = signal.max(axis=1) + unknowns.half_line

@@ -81,8 +81,8 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     The style names colours by what they show in most figures; here they only tell curves apart.
     """
     time = fit.record.time
-    measured = fit.record.signal * _MILLIVOLTS_PER_VOLT
-    axes.plot(time, measured, ".", color=style.OBSERVED, ms=2.2, label="measured")
+    measured_signal = fit.record.signal * _MILLIVOLTS_PER_VOLT
+    axes.plot(time, measured_signal, ".", color=style.OBSERVED, ms=2.2, label="measured")
     axes.plot(time, fit.fitted * _MILLIVOLTS_PER_VOLT, color=style.PAST, lw=0.9, label="two modes")
     colours = (style.PRESENT, style.PREDICTION)
     for mode, colour, dashes in zip(fit.modes, colours, ("--", ":"), strict=True):

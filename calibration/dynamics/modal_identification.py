@@ -159,7 +159,7 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
 
 
 def _refuse_dead_accelerometers(record: Float) -> None:
-    """Refuse a record (N, A) in which an accelerometer shows a constant value."""
+    """Refuse a record (N, A) with an accelerometer that shows a constant value."""
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(
@@ -193,11 +193,11 @@ def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
     # The correlations of a block have 2 `lags` lags. A decay is not divided into blocks, but must
     # be longer than its correlations.
     blocks = BLOCKS if kind == "ambient" else 4
-    needed = blocks * 2 * lags
-    if len(record) < needed:
+    samples_needed = blocks * 2 * lags
+    if len(record) < samples_needed:
         raise ExperimentDataError(
-            f"the record has {len(record)} samples; {needed} are needed to estimate modes and "
-            "their covariance: record longer, or sample more slowly."
+            f"the record has {len(record)} samples; {samples_needed} are needed to estimate modes "
+            "and their covariance: record longer, or sample more slowly."
         )
 
 
@@ -220,7 +220,7 @@ def _modes_in_bands(
     identification : _Identification
         The poles of the record.
     limits : (M, 2) array
-        The bands [Hz].
+        The lowest and the highest frequency of each band [Hz].
     values_per_mode : int
         The number of modal values, 1 + A.
     """
@@ -311,8 +311,10 @@ class _AmbientIdentification:
         ]
         covariances = []
         for position, number in enumerate(numbers):
-            changed = np.array([values_of_poles[position] for values_of_poles in changed_values])
-            derivative = (changed - self.poles.modal_values(number)) / _DIFFERENCE_STEP
+            changed_modal_values = np.array(
+                [values_of_poles[position] for values_of_poles in changed_values]
+            )
+            derivative = (changed_modal_values - self.poles.modal_values(number)) / _DIFFERENCE_STEP
             covariances.append(derivative.T @ derivative / (block_count * (block_count - 1)))
         return covariances
 
@@ -427,7 +429,7 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
     Parameters
     ----------
     fit : DampedCosineFit
-        The fit.
+        The fitted waves of the record.
     number : int
         The number of the damped cosine.
 
@@ -446,7 +448,7 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
         for of_channel, derivative in ((channel, by_amplitude), (0, by_first_amplitude)):
             # Order of the unknowns: the poles (K Re s, K Im s), and then for each channel K Re A,
             # K Im A and the offset. For an analytic w(A), dRe w = Re w' dRe A - Im w' dIm A.
-            real = 2 * count + of_channel * (2 * count + 1) + number
-            imaginary = real + count
-            gradient[1 + channel, [real, imaginary]] = derivative.real, -derivative.imag
+            real_row = 2 * count + of_channel * (2 * count + 1) + number
+            imaginary_row = real_row + count
+            gradient[1 + channel, [real_row, imaginary_row]] = derivative.real, -derivative.imag
     return np.asarray(gradient @ fit.covariance @ gradient.T)

@@ -34,6 +34,7 @@ _SIGNAL_NAMES = ("spanwise", "V_mid", "middle")
 _LOWEST_NAMES = ("V_low", "lowest")
 _HIGHEST_NAMES = ("V_high", "highest")
 """Possible names of the columns of a record; only records read off a plot have the last two."""
+_UNEVEN_FRACTION = 0.05  # of a time step, up to which samples may lie off even steps
 _ROUNDING = 1e-4  # s; a time printed to few digits may not change between samples at 100 kHz
 _CLIPPED_DURATION = 3e-3  # s at the extreme value; natural peaks of a 30 Hz mode are sharper
 
@@ -102,13 +103,13 @@ def _refuse_uneven_time(record: RingDownRecord) -> None:
     even_time = np.linspace(time[0], time[-1], record.count)
     largest_deviation = np.abs(time - even_time).max()
     is_increasing = step.min() >= 0.0 and mean_step > 0.0
-    if is_increasing and largest_deviation <= max(0.05 * mean_step, _ROUNDING):
+    if is_increasing and largest_deviation <= max(_UNEVEN_FRACTION * mean_step, _ROUNDING):
         return
     usual_step = np.median(step)
     sample = int(np.argmax(np.abs(step - usual_step)))
     raise ExperimentDataError(
-        f"{record.source}: time must run upwards in even steps, but after sample {sample + 1} "
-        f"it moves by {step[sample]:.6g} s where {usual_step:.6g} s is usual."
+        f"{record.source}: times must increase in equal steps, but after sample {sample + 1} the "
+        f"step is {step[sample]:.6g} s instead of the usual {usual_step:.6g} s."
     )
 
 
@@ -126,13 +127,13 @@ def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     signal : (N,) array
         The signal, or its lowest or highest values.
     extreme : float
         The smallest or largest value of the signal.
     name : str
-        Which of the two it is, for the message.
+        The word for this extreme in the message.
     """
     is_extreme = np.abs(signal - extreme) <= 1e-9 * np.ptp(signal)
     # Runs of extreme values begin and end where the padded mask changes, in turn.
@@ -169,9 +170,9 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
     """
     files = find_records(path)
     if not files:
-        raw, _, read_off = FILE_PATTERNS
+        raw_pattern, _, read_off_pattern = FILE_PATTERNS
         raise ExperimentFileError(
-            f"{path} holds no ring-down record; {raw} or {read_off} is needed, "
+            f"{path} holds no ring-down record; {raw_pattern} or {read_off_pattern} is needed, "
             f"there or in its folder {STEP_FOLDER}."
         )
     return tuple(_read_record(file) for file in files)

@@ -186,7 +186,7 @@ class Subspace:
         return np.asarray(vectors / np.sqrt(self._singular_values[:order]))
 
     def poles(self, order: int, variance: Float | float = 1.0) -> tuple[IdentifiedPoles, float]:
-        """Return the poles of the system of a given order, and how well it fits the correlations.
+        """Return the poles of the system of a given order, and the misfit of its correlations.
 
         Parameters
         ----------

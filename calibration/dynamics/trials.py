@@ -54,7 +54,7 @@ class RingDownFit:
         The fitted signal [V].
     residual_deviation : float
         The standard deviation of the residuals [V].
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies were fitted; otherwise they are those of spectral peaks.
     """
 
@@ -62,7 +62,7 @@ class RingDownFit:
     record: RingDownRecord
     fitted: Float
     residual_deviation: float
-    free: bool
+    frequencies_fitted: bool
 
 
 Fits = tuple[RingDownFit, ...]
@@ -78,7 +78,7 @@ def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     start : float
         The instant after which the record begins [s].
 
@@ -203,7 +203,7 @@ def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
     Parameters
     ----------
     record : RingDownRecord
-        The record.
+        The times and signals of one recording.
     decay : float
         The decay rate lambda of the factor exp(-lambda t) on the record [1/s].
     """
@@ -237,21 +237,21 @@ def _noise_amplitude(record: RingDownRecord) -> float:
 
 
 def fit_ring_down(
-    record: RingDownRecord, *, free: bool = False, start: float = FIRST_PEAK
+    record: RingDownRecord, *, frequencies_fitted: bool = False, start: float = FIRST_PEAK
 ) -> RingDownFit:
     """Return the fit of two damped cosines, an offset and a drift to one record.
 
     The authors hold the damped frequencies fixed at the two highest peaks of the spectrum. The
-    Levenberg-Marquardt iteration finds decay rates (and damped frequencies, if they are free);
-    cosine and sine amplitudes, offset and drift are eliminated by linear least squares at each
-    step. Where a record holds averages over intervals, the model is averaged over them too,
-    exactly.
+    Levenberg-Marquardt iteration finds the decay rates, and the damped frequencies if they are
+    fitted, too. Cosine and sine amplitudes, offset and drift are eliminated by linear least squares
+    at each step. If the values of a record are averages over intervals, the model is averaged over
+    the same intervals, exactly.
 
     Parameters
     ----------
     record : RingDownRecord
         One trial, as read.
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies are fitted, too.
     start : float
         The instant at which the record is cropped [s].
@@ -267,7 +267,7 @@ def fit_ring_down(
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     candidates = []
     for ratio in _STARTING_RATIOS:
-        candidates.append(model.fit((1j - ratio) * omega, frequencies_fitted=free))
+        candidates.append(model.fit((1j - ratio) * omega, frequencies_fitted=frequencies_fitted))
     best = min(candidates, key=lambda candidate: float(candidate.deviation[0]))
     low, high = sorted(best.modes, key=lambda mode: mode.pole.imag)
     refuse_growing((low, high), record.source)
@@ -276,7 +276,7 @@ def fit_ring_down(
         record=record,
         fitted=best.fitted[:, 0],
         residual_deviation=float(best.deviation[0]),
-        free=free,
+        frequencies_fitted=frequencies_fitted,
     )
 
 
@@ -337,12 +337,12 @@ class Averaged(NamedTuple):
 
 
 def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
-    """Return the average of a modal quantity over trials.
+    """Return the mean of a modal quantity over trials, with its scatter and standard error.
 
     Parameters
     ----------
     trials : Fits
-        The fitted trials.
+        The ring-down trials with their fitted modes.
     name : {"frequency", "damping_ratio"}
         The natural frequency [Hz] or the damping ratio [1].
     mode : {0, 1}
@@ -357,9 +357,12 @@ def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
 
 
 def fit_trials(
-    records: Sequence[RingDownRecord], *, free: bool = False, start: float = FIRST_PEAK
+    records: Sequence[RingDownRecord],
+    *,
+    frequencies_fitted: bool = False,
+    start: float = FIRST_PEAK,
 ) -> Fits:
-    """Return the fits of all records, see `fit_ring_down`.
+    """Return the fits of all records; the arguments are those of `fit_ring_down`.
 
     Raises
     ------
@@ -368,7 +371,10 @@ def fit_trials(
     """
     if not records:
         raise ExperimentDataError("there is no ring-down record; at least one is needed.")
-    return tuple(fit_ring_down(record, free=free, start=start) for record in records)
+    return tuple(
+        fit_ring_down(record, frequencies_fitted=frequencies_fitted, start=start)
+        for record in records
+    )
 
 
 WINDOW = 0.8

@@ -160,9 +160,9 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
 
 
 def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
-    """Return the systematic uncertainty of the first mode from its change with the amplitude.
+    """Return the systematic change of frequency and damping of the first mode with its amplitude.
 
-    It is zero if there are too few windows with different amplitudes.
+    The change is zero if there are too few windows with different amplitudes.
     """
     windows = [window for fit in trials for window in amplitude_dependence(fit)]
     if len(windows) < _FEWEST_WINDOWS:
@@ -208,11 +208,11 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
     Parameters
     ----------
     trials : Fits
-        The fitted trials.
+        The ring-down trials with their fitted modes.
     frequency, ratio : float
         The mean frequency [Hz] and damping ratio [1] of the second mode in these fits.
     """
-    delays = _LATER_STARTS if trials[0].free else (0.0, *_LATER_STARTS)
+    delays = _LATER_STARTS if trials[0].frequencies_fitted else (0.0, *_LATER_STARTS)
     changes = []
     for delay in delays:
         refitted = [_refit_second_mode(fit, delay) for fit in trials]
@@ -234,9 +234,10 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
 
 
 def _beyond_chance(difference: float, error: float) -> float:
-    """Return the part of a difference that its standard error does not explain.
+    """Return the part of a difference that exceeds its standard error.
 
-    That is the difference minus its standard error in quadrature, or 0 if it is not significant.
+    This part is the root of the squared difference minus the squared standard error. It is zero if
+    the difference is not significant.
     """
     if abs(difference) <= _SIGNIFICANT_DIFFERENCE * error:
         return 0.0
@@ -249,9 +250,9 @@ def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
     Parameters
     ----------
     fit : RingDownFit
-        A fitted record.
+        The record with its two fitted modes.
     delay : float
-        The time by which the start is later [s].
+        The delay of the start [s].
 
     Returns
     -------

@@ -168,8 +168,8 @@ class _WhitenedPosterior:
         return self._states(self._optimum_u + points @ self._whitening)
 
     def _states(self, u: Float) -> Float:
-        # Rounding must not put a state outside its range.
         """Return the states (N, P) of coordinates u (N, P), limited to their ranges."""
+        # Rounding must not put a state outside its range.
         return np.asarray(np.clip(self._mean + self._deviation * u, self._low, self._high))
 
     def _residuals(self, u: Float) -> tuple[Float, Float]:
@@ -293,23 +293,23 @@ def _comparison_with_wing(
     readings: Sequence[FigureReading],
     model_error: tuple[float, float],
 ) -> Callable[[Float], Comparison]:
-    """Return the function that compares the load test and other readings with a wing.
+    """Return a function that compares the readings with what a wing in a given state would show.
 
     Parameters
     ----------
     wing : WingTable
-        The wing.
+        The outputs of the wing at each state.
     static : LoadDisplacementData
-        The load test.
+        The pairs of load and displacement of the load test.
     readings : sequence of FigureReading
-        The weighed mass and the readings of the modes.
+        The weighed mass, and the frequencies and damping ratios of the modes.
     model_error : (float, float)
         The relative standard deviations of the model's two frequencies.
 
     Returns
     -------
     callable
-        Takes states (N, 5) and returns a `Comparison`.
+        Takes states (N, 5) and returns a `Comparison` with the pairs of the load test first.
     """
     output_names = [quantity.name for quantity in QUANTITIES]
     columns = [output_names.index(reading.name) for reading in readings]
@@ -321,14 +321,14 @@ def _comparison_with_wing(
     def compare(states: Float) -> Comparison:
         outputs = wing.outputs(states)
         stiffness = outputs[:, :1]
-        predicted = outputs[:, columns]
+        predicted_values = outputs[:, columns]
         # A load differs from k x by R_f + k^2 R_x, see `residual_variance`; a frequency by the
         # reading's error and the model's.
         load_difference = static.load - stiffness * static.displacement
         load_deviation = np.sqrt(residual_variance(static, stiffness))
-        reading_deviation = np.hypot(deviation, relative_error * predicted)
+        reading_deviation = np.hypot(deviation, relative_error * predicted_values)
         return Comparison(
-            difference=np.hstack([load_difference, value - predicted]),
+            difference=np.hstack([load_difference, value - predicted_values]),
             deviation=np.hstack(
                 [np.broadcast_to(load_deviation, load_difference.shape), reading_deviation]
             ),

@@ -153,8 +153,9 @@ class WingTable:
     ----------
     limits : (3, 2) array
         The ranges of e [1], servo mass and pitot mass [kg].
-    coefficient : (I, J, K, 2) array
-        The coefficients of products of Chebyshev polynomials in the three scaled parameters.
+    coefficients : (I, J, K, 2) array
+        The coefficients of products of Chebyshev polynomials in e, servo mass and pitot mass, each
+        scaled to [-1, 1]; I, J and K are the numbers of polynomials in each of them.
     stiffness : StiffnessCurve
         The tip stiffness k(e).
     error : float
@@ -162,7 +163,7 @@ class WingTable:
     """
 
     limits: Float
-    coefficient: Float
+    coefficients: Float
     stiffness: StiffnessCurve
     error: float = 0.0
 
@@ -174,7 +175,7 @@ class WingTable:
         return dict(zip(_PARAMETERS, ranges, strict=True))
 
     def frequency(self, states: ArrayLike) -> Float:
-        """Return the frequencies of states.
+        """Return the natural frequencies of both flapwise modes of the wing in N states.
 
         Parameters
         ----------
@@ -203,11 +204,11 @@ class WingTable:
                 f"for {prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a "
                 "model with a wider range."
             )
-        scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
-        return _evaluate(scaled, self.coefficient)
+        unit_points = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
+        return _evaluate(unit_points, self.coefficients)
 
     def outputs(self, states: Float) -> Float:
-        """Return the outputs of states.
+        """Return the measurable quantities of the wing in N states.
 
         Parameters
         ----------
@@ -224,48 +225,55 @@ class WingTable:
         OutsideValidityError
             If a state lies outside the range of the model or is not finite.
         """
-        frequency = self.frequency(states)
+        frequencies = self.frequency(states)
         # Each array is (N, 1), so that it is combined with the two columns of frequencies.
-        factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]  # each (N, 1)
-        ratio = rayleigh_damping_ratio(alpha, beta, frequency)
-        total_mass = 2.0 * servo + pitot
-        return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, total_mass])
+        factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]
+        damping_ratios = rayleigh_damping_ratio(alpha, beta, frequencies)
+        total_masses = 2.0 * servo + pitot
+        return np.hstack(
+            [self.stiffness.stiffness(factor), frequencies, damping_ratios, total_masses]
+        )
 
 
-def _evaluate(scaled: Float, coefficient: Float) -> Float:
-    """Return the frequencies (N, 2) [Hz] of a table at scaled parameters.
+def _evaluate(unit_points: Float, coefficients: Float) -> Float:
+    """Return the frequencies (N, 2) [Hz] that Chebyshev polynomials of their logarithms give.
 
     Parameters
     ----------
-    scaled : (N, 3) array
-        The parameters, scaled to [-1, 1].
-    coefficient : (I, J, K, 2) array
-        The Chebyshev coefficients of ln f1 and ln f2.
+    unit_points : (N, 3) array
+        The values of e, servo mass and pitot mass, each scaled to [-1, 1].
+    coefficients : (I, J, K, 2) array
+        The coefficients of ln f1 and ln f2, see `WingTable`.
     """
-    x, y, z = scaled.T
-    return np.asarray(np.exp(chebval3d(x, y, z, coefficient)).T)
+    x, y, z = unit_points.T
+    return np.asarray(np.exp(chebval3d(x, y, z, coefficients)).T)
 
 
-def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int]) -> Float:
-    """Return the polynomials of ln f1 and ln f2 that pass through frequencies at nodes.
+def _interpolating_coefficients(
+    nodes: Float, frequencies: Float, degrees: tuple[int, int, int]
+) -> Float:
+    """Return the Chebyshev coefficients with which ln f1 and ln f2 are exact at the nodes.
 
     Parameters
     ----------
-    scaled : (N, 3) array
-        The nodes, in parameters scaled to [-1, 1].
-    frequency : (N, 2) array
-        The frequencies there [Hz].
+    nodes : (N, 3) array
+        The values of e, servo mass and pitot mass at the nodes, each scaled to [-1, 1].
+    frequencies : (N, 2) array
+        The frequencies f1 and f2 at the nodes [Hz].
     degrees : (int, int, int)
-        The degrees I - 1, J - 1, K - 1 of the polynomials in the parameters, with N = I J K.
+        The degrees I - 1, J - 1, K - 1 of the polynomials in the three parameters. The nodes are as
+        many as the coefficients: N = I J K.
 
     Returns
     -------
     (I, J, K, 2) array
-        The Chebyshev coefficients.
+        The coefficients of ln f1 and ln f2.
     """
-    x, y, z = scaled.T
-    coefficient = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequency))
-    return np.asarray(coefficient.reshape(*(degree + 1 for degree in degrees), 2))
+    x, y, z = nodes.T
+    # Each row of the matrix holds the products of the polynomials at one node.
+    coefficients = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequencies))
+    counts = [degree + 1 for degree in degrees]
+    return np.asarray(coefficients.reshape(*counts, 2))
 
 
 def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
@@ -305,15 +313,16 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     # The first point of the sequence is a corner of the range.
     halton = qmc.Halton(3, scramble=False).random(_CHECK_COUNT + 1)[1:]
     check_points = 2.0 * halton - 1.0
-    expected = _model_frequencies(model, limits, check_points)
+    model_frequencies = _model_frequencies(model, limits, check_points)
     error = np.inf
     for degrees in _DEGREES:
         grid = _chebyshev_grid(degrees)
-        coefficient = _interpolate(grid, _model_frequencies(model, limits, grid), degrees)
-        relative_errors = _evaluate(check_points, coefficient) / expected - 1.0
+        grid_frequencies = _model_frequencies(model, limits, grid)
+        coefficients = _interpolating_coefficients(grid, grid_frequencies, degrees)
+        relative_errors = _evaluate(check_points, coefficients) / model_frequencies - 1.0
         error = float(np.abs(relative_errors).max())
         if error <= tolerance:
-            return WingTable(limits, coefficient, curve, error)
+            return WingTable(limits, coefficients, curve, error)
     raise PosteriorError(
         "the flapwise frequencies of the model are not smooth over its range: a polynomial errs by "
         f"{error:.2g} where {tolerance:.2g} are allowed; build a model with a narrower range of "
@@ -321,23 +330,23 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     )
 
 
-def _model_frequencies(model: ReducedModel, limits: Float, scaled: Float) -> Float:
-    """Return the flapwise frequencies (N, 2) [Hz] of a model at scaled parameters (N, 3).
+def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -> Float:
+    """Return the frequencies (N, 2) [Hz] of the flapwise modes of a model in N states.
 
     Parameters
     ----------
     model : ReducedModel
-        The wing.
+        The reduced model of the wing.
     limits : (3, 2) array
-        The ranges of the parameters.
-    scaled : (N, 3) array
-        The parameters, scaled to [-1, 1].
+        The ranges of e [1], servo mass and pitot mass [kg].
+    unit_points : (N, 3) array
+        The states: values of these parameters, each scaled from its range to [-1, 1].
     """
     centre = limits.mean(axis=1)
     half_width = 0.5 * np.diff(limits, axis=1)[:, 0]
     lower, upper = limits.T
     # A node at an end may leave the range by a rounding error.
-    states = np.clip(centre + half_width * scaled, lower, upper)
+    states = np.clip(centre + half_width * unit_points, lower, upper)
     frequencies = []
     for state in states.tolist():
         modes = model.modes(**dict(zip(_PARAMETERS, state, strict=True)))

@@ -130,7 +130,7 @@ def _printed_moments(row: TableRow, moments: Moments) -> str:
 
 
 def printed_table_1(rows: Sequence[TableRow]) -> TitledTable:
-    """Return Table 1 of the paper with this calibration beside it, as texts."""
+    """Return the cells of Table 1 of the paper, with the values of this calibration added."""
     columns: list[RecordColumn[TableRow]] = [
         text_cells(
             "figure", lambda row: ", ".join(filter(None, (row.paper.title, row.paper.unit)))
@@ -215,7 +215,7 @@ _RUN_LINES = ("-", "--", "-.", ":")
 
 @style.publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
-    """Return Fig. 5 of the paper: measurements and bands, densities of e and of the stiffness."""
+    """Return Fig. 5 of the paper: the load test with bands; densities of e and stiffness."""
     figure = style.new_figure(height=4.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
     figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
@@ -324,7 +324,7 @@ def _draw_densities(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     prior, exact, particle : ScalarPosterior
         The densities [SI].
     scale : float

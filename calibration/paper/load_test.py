@@ -148,11 +148,11 @@ def particle_filter(
     Parameters
     ----------
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     seed : int or SeedSequence
         The seed of all draws.
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     prior : GaussianPrior, optional
         The prior of e; the paper's by default.
     particle_count : int
@@ -235,11 +235,11 @@ def _pair_density(
     Parameters
     ----------
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     pair : int
         The number of the pair.
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     window : (float, float)
         The range of e in which the density is needed.
     generator : Generator
@@ -277,9 +277,9 @@ class StaticCalibration:
     Attributes
     ----------
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     prior : GaussianPrior
         The prior p(e).
     particle : ParticlePosterior
@@ -326,7 +326,7 @@ def calibrate_static(
     *,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> StaticCalibration:
-    """Return the posterior of e by both methods, and under other assumptions.
+    """Return the posterior of e by quadrature and by particle filter, and under other assumptions.
 
     Parameters
     ----------
@@ -388,7 +388,7 @@ def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPos
     posterior : ScalarPosterior
         The density of e.
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     """
     stiffness = curve.stiffness(posterior.grid)
     is_positive = stiffness > 0.0

@@ -75,21 +75,21 @@ def fit_masses(
     OutsideValidityError
         If a sample of e lies outside the range of the model.
     """
-    measured = {reading.name: reading.value for reading in readings}
-    total_mass = measured["weighed_mass"]
-    target = np.array([measured["frequency_1"], measured["frequency_2"]])
-    ratios = measured["damping_ratio_1"], measured["damping_ratio_2"]
+    measured_values = {reading.name: reading.value for reading in readings}
+    total_mass = measured_values["weighed_mass"]
+    target = np.array([measured_values["frequency_1"], measured_values["frequency_2"]])
+    ratios = measured_values["damping_ratio_1"], measured_values["damping_ratio_2"]
     limits = servo_range(validity, total_mass)
     samples = []
     fitted_frequencies = []
     for factor in young_modulus_factor.tolist():
         servo_mass = _nearest_servo_mass(frequencies, factor, total_mass, target, limits)
         pitot_mass = total_mass - 2.0 * servo_mass
-        fitted = frequencies(np.array([[factor, servo_mass, pitot_mass]]))[0]
-        frequency_1, frequency_2 = fitted.tolist()
+        fitted_pair = frequencies(np.array([[factor, servo_mass, pitot_mass]]))[0]
+        frequency_1, frequency_2 = fitted_pair.tolist()
         alpha, beta = damping_coefficients((frequency_1, frequency_2), ratios)
         samples.append((factor, servo_mass, pitot_mass, alpha, beta))
-        fitted_frequencies.append(fitted)
+        fitted_frequencies.append(fitted_pair)
     return PaperSamples(np.array(samples), np.array(fitted_frequencies))
 
 

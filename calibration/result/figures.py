@@ -1,4 +1,4 @@
-"""Figures of any calibration: samples pair by pair, and readings beside the model."""
+"""Figures of any calibration: samples pair by pair, and readings compared with the model."""
 
 import math
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
 
     These parameters are drawn pair by pair.
     """
-    measured = {reading.name for reading in result.readings}
+    measured_names = {reading.name for reading in result.readings}
     columns = []
     titles = []
     for column, prior in enumerate(result.priors):
-        if prior.name not in measured:
+        if prior.name not in measured_names:
             columns.append(column)
             titles.append(fill(prior.figure.axis_title, _TITLE_WIDTH))
     return columns, titles

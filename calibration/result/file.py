@@ -89,7 +89,7 @@ def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Return a stored calibration, of a wing or of the parameters of any model.
+    """Read a calibration, of a wing or of any model's parameters, from its file.
 
     Raises
     ------
@@ -203,14 +203,14 @@ def _read(path: Path) -> tuple[Groups, Root]:
 
 @lru_cache(maxsize=8)
 def _tree(path: Path, content: bytes) -> xr.DataTree:
-    """Return the groups of a file, which are cached for each hash of its content.
+    """Return the groups of a file; they are cached by the hash of the content.
 
     A run reads the same calibration some twenty times.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     content : bytes
         The hash of its content; a changed file is read again.
     """
@@ -327,13 +327,13 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, object]:
     parameter : str
         The parameter or quantity of which the twin has several values.
     """
-    measured = calibration.measured
+    measured_tables = calibration.measured
     return {
         **plain_record(calibration),
         "parameter": parameter,
         "prior": _prior_record(calibration, parameter),
         "posterior": _density(calibration.draws_of(parameter)),
-        "data": {str(name): measured[name].values.tolist() for name in measured},
+        "data": {str(name): measured_tables[name].values.tolist() for name in measured_tables},
     }
 
 

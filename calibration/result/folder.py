@@ -43,7 +43,7 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The calibration with its samples and readings.
     folder : Path
         The folder that gets the files; it is made if it is missing.
 
@@ -93,9 +93,9 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The calibration with its samples and readings.
     folder : Path
-        The folder.
+        The path of the folder.
     report : bool
         Whether to write a page with its figures, too.
 
@@ -123,7 +123,7 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The calibration with its samples and readings.
     folder : Path
         The folder of the page, in which the figures are written.
     """

@@ -221,8 +221,8 @@ class Calibration:
         for prior in self.priors:
             name = prior.name
             posterior = plus_minus(self.mean(name), self.standard_deviation(name))
-            stated = plus_minus(*self.prior_moments(name))
-            rows.append([prior.figure.title, stated, posterior, prior.figure.shown_unit])
+            prior_text = plus_minus(*self.prior_moments(name))
+            rows.append([prior.figure.title, prior_text, posterior, prior.figure.shown_unit])
         title = f"Calibration of {self.asset}: parameters of {self.model}"
         return html_table(title, ("parameter", "prior", "posterior", "unit"), rows, self.findings)
 
@@ -289,7 +289,7 @@ class Calibration:
         return float(np.mean(self.draws_of(name)))
 
     def standard_deviation(self, name: str) -> float:
-        """Return the posterior standard deviation of a figure, SI; zero where it does not vary."""
+        """Return the posterior standard deviation of a figure, SI; zero for a fixed figure."""
         return moments(self.draws_of(name))[1]
 
     def prior_moments(self, name: str) -> tuple[float, float]:
@@ -401,7 +401,7 @@ class Calibration:
         name : str
             The parameter whose values are given.
         values : (n,) array
-            Its values [unit].
+            The values of that figure, in its unit.
 
         Returns
         -------
@@ -417,8 +417,8 @@ class Calibration:
             other_draws = self.draws_of(prior.name)
             covariance = float(np.mean((draws - draws.mean()) * (other_draws - other_draws.mean())))
             slope = covariance / variance if variance else 0.0
-            expected = other_draws.mean() + slope * (values - draws.mean())
-            expectations[prior.name] = np.clip(expected, other_draws.min(), other_draws.max())
+            expected_draws = other_draws.mean() + slope * (values - draws.mean())
+            expectations[prior.name] = np.clip(expected_draws, other_draws.min(), other_draws.max())
         return expectations
 
     @property
@@ -465,7 +465,7 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     count : int
         The number of samples.
     seed : int
-        The seed.
+        The seed of the random numbers.
 
     Returns
     -------
@@ -503,7 +503,7 @@ def correlation(values: Float) -> Float:
 
 
 def check_name(asset: str) -> str:
-    """Return the name of an asset if it can be printed.
+    """Return the name of an asset; refuse a name that cannot be printed.
 
     Raises
     ------

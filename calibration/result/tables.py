@@ -62,7 +62,7 @@ def _prior_text(result: Calibration, name: str) -> str:
 
 
 def readings_table(result: Calibration) -> TitledTable:
-    """Return the table of measured figures beside those of the model before and after."""
+    """Return the table of measured figures, with the model's before and after calibration."""
     units = {figure.name: figure.shown_unit for figure in reversed(result.figures)}
     columns: list[RecordColumn[FigureReading]] = [
         text_cells("experiment", lambda reading: reading.experiment),
@@ -118,7 +118,7 @@ def _rms_text(rms: float) -> str:
 
 
 def origin_table(result: Calibration) -> TitledTable:
-    """Return the table of the origin of a calibration."""
+    """Return a table with the origin of a calibration: asset, model, data, seed and software."""
     versions = result.provenance["versions"].items()
     items = {
         "asset": result.asset,

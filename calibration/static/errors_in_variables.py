@@ -83,9 +83,9 @@ def pair_log_likelihoods(
     Parameters
     ----------
     curve : StiffnessCurve
-        The stiffness k(e).
+        The tip stiffness k(e) [N/m] as a function of the factor e.
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}
@@ -205,6 +205,7 @@ def exact_posterior(
         half_width = _REACH * max(posterior.standard_deviation, spacing)
         narrower_lower = max(posterior.mean - half_width, lowest_allowed)
         narrower_upper = posterior.mean + half_width
+        # The grid fits the posterior once a further step would hardly narrow it.
         if narrower_upper - narrower_lower > 0.99 * (grid_upper - grid_lower):
             break
         grid_lower, grid_upper = narrower_lower, narrower_upper
@@ -278,7 +279,7 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     Parameters
     ----------
     data : LoadDisplacementData
-        The measured pairs.
+        The measured pairs of load and displacement.
     stiffness : float
         The tip stiffness [N/m].
     """

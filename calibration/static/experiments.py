@@ -14,7 +14,7 @@ from reporting.arrays import Float
 from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
-"""Gravity by which the authors convert a mass on the scale to a load [m/s^2]."""
+"""Gravity with which the authors convert a mass on the scale to a load [m/s^2]."""
 
 HALF_WIDTH_95 = 1.96
 """Half-width of a 95 % interval of a Gaussian, in standard deviations, as rounded in the paper."""
@@ -33,7 +33,7 @@ MEASUREMENTS_FILE = Path("step2") / "load_displacement_measurements.csv"
 
 
 class _UnitError(NamedTuple):
-    """A unit other than N or mm, by which load over displacement changes by a factor."""
+    """A unit other than N or mm, which changes load over displacement by a factor."""
 
     factor: float
     remedy: str
@@ -176,15 +176,15 @@ def read_measurements(path: Path) -> LoadDisplacementData:
 def _refuse_other_units(file: str, load: Float, displacement_mm: Float) -> None:
     """Refuse loads (N,) [N] and displacements (N,) [mm] whose ratio shows other units."""
     stiffness = float(np.median(load / displacement_mm))  # N/mm
-    expected = EXPECTED_TIP_STIFFNESS * 1e-3
-    ratio = stiffness / expected
+    expected_stiffness = EXPECTED_TIP_STIFFNESS * 1e-3
+    ratio = stiffness / expected_stiffness
     if 1.0 / _PLAUSIBLE_FACTOR <= ratio <= _PLAUSIBLE_FACTOR:
         return
-    nearest = min(_UNIT_ERRORS, key=lambda error: abs(math.log(ratio / error.factor)))
-    remedy = nearest.remedy
-    if abs(math.log(ratio / nearest.factor)) > math.log(_UNIT_TOLERANCE):
+    nearest_unit_error = min(_UNIT_ERRORS, key=lambda error: abs(math.log(ratio / error.factor)))
+    remedy = nearest_unit_error.remedy
+    if abs(math.log(ratio / nearest_unit_error.factor)) > math.log(_UNIT_TOLERANCE):
         remedy = "check the columns, their units (N and mm) and the wing"
     raise ExperimentDataError(
         f"{file}: load over displacement is {stiffness:.3g} N/mm, {ratio:.3g} times the "
-        f"{expected:.3g} N/mm expected before calibration; {remedy}."
+        f"{expected_stiffness:.3g} N/mm expected before calibration; {remedy}."
     )

@@ -61,7 +61,7 @@ class WingCalibration:
     procedure : {"joint", "paper"}
         The procedure that is kept.
     lab : LabData
-        The measurements.
+        The measurements of the laboratory.
     model : ReducedModel
         The model of the tailored design.
     static, static_published : StaticCalibration
@@ -187,7 +187,7 @@ class _RecordMaker:
     drawn, tailored : WingDesign
         The design as drawn, and with the measured planform.
     lab : LabData
-        The measurements.
+        The measurements of the laboratory.
     table : WingTable
         The outputs of the tailored model.
     static : StaticCalibration
@@ -232,7 +232,7 @@ class _RecordMaker:
         Parameters
         ----------
         procedure : Procedure
-            The procedure.
+            The procedure by which the wing was calibrated.
         states : (N, 5) array
             Its samples of e, masses and Rayleigh coefficients.
         """
@@ -304,7 +304,7 @@ def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
     count : int
         The number of samples.
     seed : int
-        The seed.
+        The seed of the random numbers.
 
     Returns
     -------

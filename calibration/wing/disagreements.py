@@ -40,9 +40,9 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
     Parameters
     ----------
     result : Calibration
-        The calibration.
+        The calibration with its samples and readings.
     lab : LabData
-        The measurements.
+        The measurements of the laboratory.
     quality : FitQuality
         The residuals of the load test.
     """
@@ -67,10 +67,10 @@ def _reading_disagreements(result: Calibration, *, is_published: bool) -> list[s
         is_noticeable = is_frequency and abs(difference) > NOTICEABLE_FREQUENCY
         if not is_noticeable and score <= NOTICEABLE:
             continue
-        measured = figure.shown(reading.value, reading.deviation)
+        measured_text = figure.shown(reading.value, reading.deviation)
         model = figure.shown(result.mean(name), result.standard_deviation(name))
         sentence = (
-            f"{capital(figure.title)}: measured {measured}, calibrated model {model}, "
+            f"{capital(figure.title)}: measured {measured_text}, calibrated model {model}, "
             f"{_percent(difference)} off ({score:.1f} standard deviations)."
         )
         if name == "frequency_2" and is_published:
@@ -119,7 +119,7 @@ def _mean_mode(windows: Sequence[RingDownMode]) -> _MeanMode:
 
 
 def _softening_sentences(windows: Sequence[RingDownMode]) -> list[str]:
-    """Return a sentence that the first frequency depends on the amplitude, if it does.
+    """Return a sentence on the dependence of the first frequency on the amplitude, if there is one.
 
     The third of the windows with the smallest amplitudes is compared with the third with the
     largest.

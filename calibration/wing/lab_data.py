@@ -49,7 +49,7 @@ def write_lab_folder(
     records: Sequence[RingDownRecord],
     total_mass: FigureReading,
 ) -> tuple[Path, ...]:
-    """Write measurements into a folder as `read_lab_folder` reads them; each file in one step.
+    """Write measurements into a folder, in the layout that `read_lab_folder` reads.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class LabData:
     trials : Fits or None
         The fitted ring-downs of step 3; None if the readings are the published ones.
     authors : PaperSamples or None
-        The authors' own results of step 3, to be drawn beside ours.
+        The authors' own results of step 3, to be drawn next to ours.
     """
 
     lengths: Lengths
@@ -212,8 +212,10 @@ def published_data() -> LabData:
     )
 
 
-def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = False) -> LabData:
-    """Return the measurements in a lab folder; those of a missing step are the published ones.
+def read_lab_folder(
+    path: Path, targets: Targets | None = None, *, frequencies_fitted: bool = False
+) -> LabData:
+    """Return the measurements in a lab folder; for a missing step, the published measurements.
 
     Parameters
     ----------
@@ -222,7 +224,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
         in the authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
         Whether step 3 uses the ring-down records; by default it does where there are any.
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies of a record are fitted; otherwise they are those of its spectrum, as
         in the authors' procedure.
 
@@ -264,9 +266,9 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
     if 2 in steps:
         lab = _with_load_test(lab, path)
     if record_files and targets != "published":
-        lab = _with_ring_downs(lab, path, record_files, free=free)
+        lab = _with_ring_downs(lab, path, record_files, frequencies_fitted=frequencies_fitted)
     elif record_files:
-        lab = _with_origin(lab, 3, f"records left aside as asked; {_PUBLISHED[3]}", read=False)
+        lab = _with_origin(lab, 3, f"records ignored as requested; {_PUBLISHED[3]}", read=False)
     mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
     if mass_file is not None:
         lab = _with_weighed_mass(lab, mass_file)
@@ -277,7 +279,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
 
 
 def _with_origin(lab: LabData, step: int, text: str, *, read: bool) -> LabData:
-    """Return lab data in which one step has another origin."""
+    """Return lab data with another origin of one step."""
     origins = {origin.step: origin for origin in lab.origins}
     origins[step] = StepOrigin(step, read, text)
     return replace(lab, origins=tuple(origins.values()))
@@ -304,7 +306,7 @@ def _with_load_test(lab: LabData, path: Path) -> LabData:
 
 
 def _with_ring_downs(
-    lab: LabData, path: Path, record_files: Sequence[Path], *, free: bool
+    lab: LabData, path: Path, record_files: Sequence[Path], *, frequencies_fitted: bool
 ) -> LabData:
     """Return lab data with the ring-downs of step 3, and the frequencies and damping from them.
 
@@ -316,10 +318,10 @@ def _with_ring_downs(
         The lab folder.
     record_files : sequence of Path
         The files of the ring-downs.
-    free : bool
+    frequencies_fitted : bool
         Whether the frequencies of each record are fitted, too.
     """
-    trials = fit_trials(read_records(path), free=free)
+    trials = fit_trials(read_records(path), frequencies_fitted=frequencies_fitted)
     if all(fit.record.lowest is not None for fit in trials):
         # These records were read off plots. The lowest and the highest ink in a column of pixels
         # are extremes of the signal in its interval, while the middle between them is not quite
@@ -338,7 +340,7 @@ def _with_ring_downs(
 
 
 def _with_weighed_mass(lab: LabData, file: Path) -> LabData:
-    """Return lab data with the weighed mass of a file as its first reading."""
+    """Return lab data with the weighed mass that a file holds as its first reading."""
     mass = read_weighed_mass(file)
     _, *modes = lab.readings
     lab = replace(lab, readings=(mass, *modes))

@@ -39,6 +39,9 @@ WORDS = Words("calibration.wing")
 LOAD_FACTOR = 3.0
 """Load factor of the turn in which `wing.vtu` shows the wing."""
 
+_CHORD_TO_THE_LEFT = 0.45
+_CHORD_DOWNWARD = 0.40
+"""Shifts of a point in the oblique view of a wing, per unit of its chordwise position."""
 TABLE_NAME = "table_1.csv"
 
 
@@ -50,7 +53,7 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
     Parameters
     ----------
     calibration : WingCalibration
-        The calibration.
+        The calibration of the wing, with its samples.
     folder : Path
         The folder of the files.
     report : bool
@@ -94,7 +97,7 @@ def _add_sections(
     page : Page
         The page, with the sections that every calibration has.
     calibration : WingCalibration
-        The calibration.
+        The calibration of the wing, with its samples.
     fields : WingFields
         The displacement fields of the wing on its mesh.
     folder : Path
@@ -258,20 +261,21 @@ def _draw_surface(
     Parameters
     ----------
     axes : Axes
-        The panel.
+        The panel to draw in.
     points : (N, 3) array
-        The nodes.
+        The positions of the nodes: x aft, y along the span, z upward [m].
     triangles : (T, 3) array
         The nodes of each triangle.
     shade : (N,) array
-        The value at each node, from 0 to `largest`.
+        The value at each node that its colour shows, from 0 to `largest`.
     colours : str
-        The colour map.
+        The name of the colour map.
     largest : float
-        The value of the last colour.
+        The value that the last colour of the map stands for.
     """
     x, y, z = points.T
-    projection = Triangulation(y - 0.45 * x, z - 0.40 * x, triangles)
+    # Oblique projection: the chord goes to the lower left of the panel.
+    projection = Triangulation(y - _CHORD_TO_THE_LEFT * x, z - _CHORD_DOWNWARD * x, triangles)
     axes.tripcolor(
         projection,
         shade,

@@ -1,1 +1,1 @@
-"""Kinds of finite elements, and what is assembled on cells of one kind."""
+"""Kinds of finite elements, and the matrices that are assembled on cells of one kind."""

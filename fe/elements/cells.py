@@ -26,7 +26,7 @@ _MOST_FACE_CORNERS = 4
 _SUMMED_ENTRIES = 4_000_000  # entries of element arrays that are summed at once, of 16 bytes each
 
 
-def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:
+def jacobians(kind: ElementKind, nodes: FloatArray, local_positions: FloatArray) -> FloatArray:
     """Return the Jacobians dx_i/dX_j of cells.
 
     Parameters
@@ -35,7 +35,7 @@ def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatA
         The kind of the cells, with k nodes.
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
-    local : (q, 3) array
+    local_positions : (q, 3) array
         Local positions.
 
     Returns
@@ -43,12 +43,12 @@ def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatA
     (n, q, 3, 3) array
         The Jacobians.
     """
-    _, local_gradients = kind.shape_functions(local)
+    _, local_gradients = kind.shape_functions(local_positions)
     return np.asarray(np.einsum("nai,qaj->nqij", nodes, local_gradients, optimize=True))
 
 
 def gradients(
-    kind: ElementKind, nodes: FloatArray, local: FloatArray
+    kind: ElementKind, nodes: FloatArray, local_positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the gradients of the shape functions in space, and the Jacobian determinants.
 
@@ -58,7 +58,7 @@ def gradients(
         The kind of the cells, with k nodes.
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
-    local : (q, 3) array
+    local_positions : (q, 3) array
         Local positions.
 
     Returns
@@ -68,8 +68,8 @@ def gradients(
     determinants : (n, q) array
         The determinants [m^3].
     """
-    jacobian = jacobians(kind, nodes, local)
-    _, local_gradients = kind.shape_functions(local)
+    jacobian = jacobians(kind, nodes, local_positions)
+    _, local_gradients = kind.shape_functions(local_positions)
     inverse_jacobian = np.linalg.inv(jacobian)
     spatial_gradients = local_gradients[np.newaxis] @ inverse_jacobian
     determinants = np.linalg.det(jacobian)
@@ -151,7 +151,7 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
     density : (n,) array
         Density of each cell [kg/m^3].
     rule : Rule
-        Integration rule.
+        The points and weights of the integration in the reference cell.
 
     Returns
     -------
@@ -204,7 +204,7 @@ class CellMesh:
 
     @property
     def unknowns(self) -> int:
-        """Number of displacements; that of a component of a node is 3 node + component."""
+        """Number of displacements; that of a node along an axis has the number 3 node + axis."""
         return AXES * len(self.points)
 
     @cached_property
@@ -245,24 +245,26 @@ class CellMesh:
         unknowns = first_unknown[..., np.newaxis] + np.arange(components)
         return np.asarray(unknowns.reshape(len(cells), -1))
 
-    def positions(self, cells: IntArray, local: FloatArray) -> FloatArray:
+    def positions(self, cells: IntArray, local_positions: FloatArray) -> FloatArray:
         """Return the positions (n, q, 3) [m] of local positions (q, 3) in cells (n,)."""
-        values, _ = self.kind.shape_functions(local)
+        values, _ = self.kind.shape_functions(local_positions)
         return np.asarray(np.einsum("qa,nai->nqi", values, self.nodes[cells]))
 
-    def jacobians_at(self, cells: IntArray, local: FloatArray) -> FloatArray:
+    def jacobians_at(self, cells: IntArray, local_positions: FloatArray) -> FloatArray:
         """Return the Jacobians (p, 3, 3) at one local position (p, 3) of each of p cells."""
-        _, local_gradients = self.kind.shape_functions(local)
+        _, local_gradients = self.kind.shape_functions(local_positions)
         return np.asarray(np.einsum("pai,paj->pij", self.nodes[cells], local_gradients))
 
-    def strains(self, displacement: FloatArray, local: FloatArray | None = None) -> FloatArray:
+    def strains(
+        self, displacement: FloatArray, local_positions: FloatArray | None = None
+    ) -> FloatArray:
         """Return the strains of all cells.
 
         Parameters
         ----------
         displacement : (nn, 3) array
             Displacements of all nodes [m].
-        local : (q, 3) array, optional
+        local_positions : (q, 3) array, optional
             Local positions in the cells; by default their centre.
 
         Returns
@@ -270,9 +272,9 @@ class CellMesh:
         (nc, q, 6) array
             Strains xx, yy, zz, yz, xz, xy, with engineering shear strains.
         """
-        if local is None:
-            local = self.kind.centre[np.newaxis]
-        spatial_gradients, _ = gradients(self.kind, self.nodes, local)
+        if local_positions is None:
+            local_positions = self.kind.centre[np.newaxis]
+        spatial_gradients, _ = gradients(self.kind, self.nodes, local_positions)
         cell_displacement = displacement[self.cells].reshape(len(self.cells), -1)
         B = strain_matrix(spatial_gradients)
         return np.asarray(np.einsum("nqij,nj->nqi", B, cell_displacement))
@@ -282,7 +284,7 @@ class CellMesh:
         row: ArrayLike,
         weight: ArrayLike,
         cells: IntArray,
-        local: FloatArray,
+        local_positions: FloatArray,
         direction: FloatArray,
     ) -> sparse.csr_array:
         """Return the matrix that maps nodal displacements to weighted sums of normal strains.
@@ -299,7 +301,7 @@ class CellMesh:
             The weight of each strain in the sum.
         cells : (p,) array of int
             The cell that contains each point.
-        local : (p, 3) array
+        local_positions : (p, 3) array
             The local position of each point in its cell.
         direction : (p, 3) array
             The direction of each normal strain, a unit vector.
@@ -309,8 +311,8 @@ class CellMesh:
         csr (rows, 3 nn)
             The sums per displacement [1/m].
         """
-        _, local_gradients = self.kind.shape_functions(local)
-        inverse_jacobians = np.linalg.inv(self.jacobians_at(cells, local))
+        _, local_gradients = self.kind.shape_functions(local_positions)
+        inverse_jacobians = np.linalg.inv(self.jacobians_at(cells, local_positions))
         # dN_a/dX_i dX_i/dx_j d_j, for the node a of the cell at the point p
         gradient_along_direction = np.einsum(
             "pai,pij,pj->pa", local_gradients, inverse_jacobians, direction
@@ -332,7 +334,7 @@ class CellMesh:
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         elasticity : (6, 6) or (n, 6, 6) array
             Elasticity in space [Pa].
         factor : (n, q) array, optional
@@ -356,14 +358,14 @@ class CellMesh:
     def mass(
         self, cells: IntArray, density: ArrayLike, rule: Rule | None = None
     ) -> sparse.csr_array:
-        """Return the mass of some cells, of one component of the displacement.
+        """Return the mass matrix of some cells for one component of the displacement.
 
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         density : (n,) array or float
-            Their density [kg/m^3].
+            The density of the cells [kg/m^3].
         rule : Rule, optional
             Integration rule; by default the mass rule of the kind.
 
@@ -389,7 +391,7 @@ class CellMesh:
         Parameters
         ----------
         cells : (n,) array of int
-            The cells.
+            The numbers of the cells.
         blocks : callable
             Returns the element matrices of a slice of the cells.
         components : int

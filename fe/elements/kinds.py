@@ -175,9 +175,9 @@ class ElementKind:
     Attributes
     ----------
     name : str
-        Its name in sentences, in the plural.
+        The name of the kind in sentences, in the plural.
     file_type, calculix : str
-        Its names in meshio and in CalculiX.
+        The names of the kind in meshio and in CalculiX.
     exponents : (k, 3) tuples
         Exponents of the monomials that span the shape functions.
     corners : (c, 3) tuples
@@ -253,21 +253,21 @@ class ElementKind:
         distance = np.abs(difference).sum(axis=2)
         return np.asarray(distance.argmin(axis=1))
 
-    def contains(self, local: FloatArray, tolerance: float) -> BoolArray:
+    def contains(self, local_positions: FloatArray, tolerance: float) -> BoolArray:
         """Return whether local positions (p, 3) lie in the reference cell, up to a tolerance."""
         frames = self.face_frames
         along_first, along_second = np.moveaxis(frames.tangents, 1, 0)
         outward = np.cross(along_first, along_second)
-        from_corner = local[:, np.newaxis] - frames.corner
+        from_corner = local_positions[:, np.newaxis] - frames.corner
         distance = (from_corner * outward).sum(axis=2)
         return np.asarray((distance <= tolerance).all(axis=1))
 
-    def shape_functions(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def shape_functions(self, local_positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate the shape functions.
 
         Parameters
         ----------
-        local : (q, 3) array
+        local_positions : (q, 3) array
             Local positions.
 
         Returns
@@ -275,14 +275,14 @@ class ElementKind:
         values : (q, k) array
             Values of the shape functions.
         gradients : (q, k, 3) array
-            Their local gradients.
+            The gradients of the shape functions by the local coordinates.
         """
         exponents = np.array(self.exponents)
         # powers 0, 1, 2 of each coordinate (q, 3, 3), and their derivatives
-        zero = np.zeros_like(local)
-        one = np.ones_like(local)
-        powers = np.stack((one, local, local**2), axis=2)
-        slopes = np.stack((zero, one, 2.0 * local), axis=2)
+        zeros = np.zeros_like(local_positions)
+        ones = np.ones_like(local_positions)
+        powers = np.stack((ones, local_positions, local_positions**2), axis=2)
+        slopes = np.stack((zeros, ones, 2.0 * local_positions), axis=2)
         x, y, z = (powers[:, axis, exponents[:, axis]] for axis in range(3))
         dx, dy, dz = (slopes[:, axis, exponents[:, axis]] for axis in range(3))
         # monomials and their derivatives, combined

@@ -48,7 +48,10 @@ class Cuts(NamedTuple):
 
 
 def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
-    """Find the best cut of each part.
+    """Find for each part of a graph the cut into two halves that costs least.
+
+    A cut is made at a value of one coordinate of the vertices. The values at which a part is tried
+    leave fixed fractions of its weight on either side.
 
     Parameters
     ----------
@@ -69,8 +72,8 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
         cumulative = np.cumsum(weight[order])
         for fraction in CUT_FRACTIONS:
             # cut each part where this fraction of its weight is reached
-            median = order[np.searchsorted(cumulative, weight_before + fraction * total)]
-            is_above = coordinate > coordinate[median][part]
+            cut_node = order[np.searchsorted(cumulative, weight_before + fraction * total)]
+            is_above = coordinate > coordinate[cut_node][part]
             first_is_above, second_is_above = is_above[edges]
             crossing_edges = edges[:, first_is_above != second_is_above]
             for half in (True, False):  # the vertices on either side of the cut separate the halves
@@ -78,12 +81,12 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
                 on_cut = np.zeros(len(part), dtype=bool)
                 on_cut[crossing_edges[is_in_half]] = True
                 cost = _cut_costs(part, weight, total, on_cut, is_above)
-                # keep what is better than before
+                # keep the cuts that cost less than the best cuts before
                 is_better = cost < lowest_cost
                 lowest_cost[is_better] = cost[is_better]
-                chosen = is_better[part]
-                separator[chosen] = on_cut[chosen]
-                side[chosen] = is_above[chosen]
+                is_cut_here = is_better[part]
+                separator[is_cut_here] = on_cut[is_cut_here]
+                side[is_cut_here] = is_above[is_cut_here]
     return Cuts(separator, side, np.isfinite(lowest_cost))
 
 
@@ -120,9 +123,10 @@ def _cut_costs(
 
 
 def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
-    """Return coordinates (n,) of the vertices along which parts may be cut.
+    """Return coordinates (n,) of the vertices, at values of which parts may be cut.
 
-    These are the distances from two distant ends of each part, and first their difference.
+    Each part has two distant ends. The coordinates of a vertex are the difference of its distances
+    from the two ends, and each distance by itself, counted in edges.
     """
     size = len(part)
     ones = np.ones(edges.shape[1])
@@ -232,7 +236,7 @@ def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
     parts : _Parts
         The parts.
     cuts : Cuts
-        Their cuts.
+        The cuts of the parts.
     position : (n,) array of int
         The first position of the block of each vertex; changed in place.
     """

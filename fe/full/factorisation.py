@@ -139,24 +139,24 @@ class Factorisation:
         position[self._order] = np.arange(size)
         rows = self.stiffness[self._order]
         columns = position[rows.indices]
-        local = np.empty(size, dtype=np.int64)  # from positions to rows of the present front
+        row_in_front = np.empty(size, dtype=np.int64)  # from positions to rows of the present front
         waiting: list[list[_SchurComplement]] = [[] for _ in self._fronts]
         for front, contributions in zip(self._fronts, waiting, strict=True):
             pivots = front.end - front.start
-            local[front.start : front.end] = np.arange(pivots)
-            local[front.boundary] = pivots + np.arange(len(front.boundary))
+            row_in_front[front.start : front.end] = np.arange(pivots)
+            row_in_front[front.boundary] = pivots + np.arange(len(front.boundary))
             # assemble the front, right of its diagonal: transposed, that is LAPACK's lower half
-            pivot_rows = _assembled_pivot_rows(front, rows, columns, local)
+            pivot_rows = _assembled_pivot_rows(front, rows, columns, row_in_front)
             remaining = np.zeros((len(front.boundary), len(front.boundary)))
             while contributions:  # popped, so that each is freed as soon as it is added
-                _extend_add(pivot_rows, remaining, contributions.pop(), local)
+                _extend_add(pivot_rows, remaining, contributions.pop(), row_in_front)
             # factorise the pivots
             diagonal = np.ascontiguousarray(pivot_rows[:, :pivots])
             coupling = np.ascontiguousarray(pivot_rows[:, pivots:])
             lower, failed = lapack.dpotrf(diagonal.T, lower=1, overwrite_a=1, clean=0)
             if failed:
-                unknown = self._order[front.start + failed - 1]
-                self._refuse(f"unknown {unknown} is left without a positive pivot")
+                failed_unknown = self._order[front.start + failed - 1]
+                self._refuse(f"unknown {failed_unknown} is left without a positive pivot")
             below = coupling.T
             if len(front.boundary):
                 below = blas.dtrsm(1.0, lower, below, side=1, lower=1, trans_a=1, overwrite_b=1)
@@ -206,16 +206,16 @@ class Factorisation:
         (n,) or (n, k) array
             L'^-1 y in the order of the unknowns.
         """
-        ordered = np.array(whitened, dtype=np.float64, order="C")
-        values = ordered.reshape(len(ordered), -1)
+        ordered_values = np.array(whitened, dtype=np.float64, order="C")
+        values = ordered_values.reshape(len(ordered_values), -1)
         with _threads().limit(limits=1):
             for front, factor in zip(self._fronts[::-1], self._factors[::-1], strict=True):
                 pivots = values[front.start : front.end]
                 if len(front.boundary):
                     pivots -= factor.below.T @ values[front.boundary]
                 _substitute(factor.diagonal, pivots, transposed=True)
-        solution = np.empty_like(ordered)
-        solution[self._order] = ordered
+        solution = np.empty_like(ordered_values)
+        solution[self._order] = ordered_values
         return solution
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
@@ -241,7 +241,9 @@ class Factorisation:
         correction = self.riesz(right_hand_side - self.stiffness @ solution)
         solution = solution + correction
         error = self.backward_error(solution, right_hand_side)
-        length = max(float(np.linalg.norm(solution)), 1e-300)
+        length = max(
+            float(np.linalg.norm(solution)), 1e-300
+        )  # a zero load has no solution to scale
         change = float(np.linalg.norm(correction)) / length
         is_accurate = error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT
         if not is_accurate:
@@ -263,9 +265,9 @@ class Factorisation:
 
 
 def _assembled_pivot_rows(
-    front: Front, rows: sparse.csr_array, columns: IntArray, local: IntArray
+    front: Front, rows: sparse.csr_array, columns: IntArray, row_in_front: IntArray
 ) -> FloatArray:
-    """Return the rows (p, p + b) of a front's pivots, right of the diagonal.
+    """Return the rows (p, p + b) of a front's pivots, from the diagonal to the right.
 
     Parameters
     ----------
@@ -275,8 +277,9 @@ def _assembled_pivot_rows(
         The matrix, its rows in the order of elimination.
     columns : (nnz,) array of int
         The position of the column of each entry.
-    local : (n,) array of int
-        Column in the front of each of its positions.
+    row_in_front : (n,) array of int
+        The number of each position in the front, which counts its rows and its columns. Only the
+        entries at positions of the front are used.
     """
     pivots = front.end - front.start
     pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))
@@ -285,9 +288,9 @@ def _assembled_pivot_rows(
     row_of_entry = np.repeat(np.arange(pivots), np.diff(row_starts))
     column = columns[entries]
     is_later = column >= front.start
-    row_in_front = row_of_entry[is_later]
-    column_in_front = local[column[is_later]]
-    pivot_rows[row_in_front, column_in_front] = rows.data[entries][is_later]
+    pivot_row = row_of_entry[is_later]
+    pivot_column = row_in_front[column[is_later]]
+    pivot_rows[pivot_row, pivot_column] = rows.data[entries][is_later]
     return pivot_rows
 
 
@@ -307,11 +310,11 @@ def _extend_add(
     pivot_rows: FloatArray,
     remaining: FloatArray,
     contribution: _SchurComplement,
-    local: IntArray,
+    row_in_front: IntArray,
 ) -> None:
     """Add a Schur complement to the pivot rows (p, p + b) and the remaining block (b, b)."""
     pivots = len(pivot_rows)
-    index = local[contribution.boundary]
+    index = row_in_front[contribution.boundary]
     split = int(np.searchsorted(index, pivots))
     pivot_index = index[:split]
     remaining_index = index[split:] - pivots

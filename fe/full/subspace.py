@@ -224,7 +224,7 @@ class ProjectedBasis(OrthonormalBasis):
         return images
 
     def _extended_projection(self, projected: FloatArray, images: FloatArray) -> FloatArray:
-        """Return terms on the present basis, from those on the previous one and the new images."""
+        """Return the terms on the extended basis, from those on the previous one and new images."""
         previous_count = projected.shape[1]
         new_columns = self.displacements.T @ images
         coupling = new_columns[:, :previous_count]

@@ -35,7 +35,7 @@ def built_once(
     Parameters
     ----------
     path : Path
-        The file of the result; the lock file lies beside it.
+        The file of the result; the lock file lies next to it.
     load : callable
         Reads the file. It raises `OSError` or `ReducedModelFileError` if the file is missing or
         not usable.

@@ -110,7 +110,7 @@ class StaticReduction:
     design_fields : DesignFields
         The fields of the reduced model that no basis changes.
     modal : ModalReduction
-        Its modal basis.
+        The modal basis of the structure.
     stage : Stage
         Advances after each state.
 
@@ -215,7 +215,7 @@ class StaticReduction:
         return float(np.max(relative))
 
     def model(self, directions: FloatArray | None = None) -> ReducedModel:
-        """Return the reduced model of the present basis, or of combinations of it.
+        """Return the reduced model on the present basis, or on combinations of its vectors.
 
         Parameters
         ----------
@@ -249,13 +249,18 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return loads and stiffness images in the smallest basis that holds all residuals.
+        """Return the loads and the stiffness terms that form the residuals, with few coordinates.
+
+        A residual of the reduced model is the load minus the stiffness times the displacement. All
+        residuals lie in the span of the loads and of the images of the basis under the terms of the
+        stiffness; the factors are coordinates in an orthonormal basis of this span.
 
         Parameters
         ----------
         directions : (N, K) array
             Combinations of the N basis vectors that span the reduced model.
         """
+        # Images of the K basis vectors under each term of the stiffness
         images = self.residual_stiffness @ directions
         # A Galerkin residual is orthogonal to the basis. In whitened coordinates the reference
         # stiffness is the identity, so that the images of the basis under it are the basis itself:
@@ -280,17 +285,19 @@ class StaticReduction:
         residual_directions, factor = np.linalg.qr(
             images_and_loads - basis_directions @ (basis_directions.T @ images_and_loads)
         )
-        # read out loads and terms, these in their own order
-        loads = slice(first_load, first_load + self.loads.shape[1])
-        ordered_terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
+        # Separate the columns of the loads from those of the terms, and sort the terms again as in
+        # the stiffness.
+        load_columns = slice(first_load, first_load + self.loads.shape[1])
+        term_columns = np.delete(factor, load_columns, axis=1)
+        reordered_terms = term_columns.reshape(len(factor), len(order), -1)
         return _ResidualFactors(
-            load=factor[:, loads],
-            stiffness=ordered_terms[:, np.argsort(order)],
+            load=factor[:, load_columns],
+            stiffness=reordered_terms[:, np.argsort(order)],
             directions=residual_directions,
         )
 
     def _residual_allowance(self) -> float:
-        """Return the bound of what the basis of residuals leaves out, per unit of coordinates.
+        """Return a bound of the residual outside the basis of residuals, per unit coordinate.
 
         By Cauchy and Schwarz |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta), where theta is
         largest at the largest parameters and the least losses.
@@ -311,8 +318,8 @@ class StaticReduction:
     def bound(self, model: ReducedModel, state: State) -> float:
         """Return the certified relative bound of a reduced model at a state.
 
-        It is the largest of all loads, each relative to its largest strain or displacement, or to
-        `least_outputs` if that is larger.
+        The result is the largest bound of all loads. The bound of a load is relative to the largest
+        strain or displacement under the load, or to `least_outputs` if that is larger.
         """
         worst = 0.0
         for number, response in enumerate(self.responses(model, state)):
@@ -411,7 +418,7 @@ class StaticReduction:
         )
 
     def compressed(self, tolerance: float) -> FloatArray:
-        """Return the fewest combinations (N, K) of the basis whose bound keeps a tolerance."""
+        """Return as few combinations (N, K) of the basis as keep the bound within a tolerance."""
         model = self.model()
         states = self.terms.training_states()
         coordinates: list[FloatArray] = []
@@ -449,17 +456,19 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
     Returns
     -------
     list of State
-        First the worst state, then always the one with the largest product of its bound and its
-        distance from all that are chosen.
+        First the state with the largest bound. Each further state has the largest product of its
+        bound and its distance from the nearest state chosen before.
     """
-    scaled = states / np.maximum(np.ptp(states, axis=0), 1e-300)
-    chosen = [int(bounds.argmax())]
-    distance = np.full(len(states), np.inf)
-    while len(chosen) < count:
-        distance_from_last = np.linalg.norm(scaled - scaled[chosen[-1]], axis=1)
-        distance = np.minimum(distance, distance_from_last)
-        score = np.where(bounds > least, bounds * distance, 0.0)
+    # Distances are relative to the range of each input; one without a range counts as constant.
+    scaled_states = states / np.maximum(np.ptp(states, axis=0), 1e-300)
+    chosen_numbers = [int(bounds.argmax())]
+    distance_from_nearest = np.full(len(states), np.inf)
+    while len(chosen_numbers) < count:
+        last_chosen = scaled_states[chosen_numbers[-1]]
+        distance_from_last = np.linalg.norm(scaled_states - last_chosen, axis=1)
+        distance_from_nearest = np.minimum(distance_from_nearest, distance_from_last)
+        score = np.where(bounds > least, bounds * distance_from_nearest, 0.0)
         if not score.any():
             break
-        chosen.append(int(score.argmax()))
-    return [tuple(states[number].tolist()) for number in chosen]
+        chosen_numbers.append(int(score.argmax()))
+    return [tuple(states[number].tolist()) for number in chosen_numbers]

@@ -56,7 +56,7 @@ def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> 
     terms : ReductionTerms
         The full model, with n free unknowns.
     outputs : (n, O) array
-        Its outputs, whitened.
+        The outputs of the full model, whitened.
     stage : Stage
         Advances after each state.
 
@@ -118,7 +118,7 @@ def _project_duals(
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
+        The terms of the full model, and its loads and outputs.
     outputs : (n, O) array
         The outputs, whitened.
     directions : (O, n, M) array
@@ -142,7 +142,7 @@ def _project_batch(
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
+        The terms of the full model, and its loads and outputs.
     outputs : (n, b) array
         The outputs, whitened.
     displacements : (n, b, M) array
@@ -166,7 +166,7 @@ def _project_batch(
 
 
 def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
-    """Return a small matrix by which the norm of a dual residual is evaluated.
+    """Return a small matrix that has the norm of each dual residual.
 
     The residual of a dual solution is the output minus a combination of forces, with n rows:
     r = [output, force] c. Its norm is needed for many combinations c. With the QR factorisation

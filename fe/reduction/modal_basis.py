@@ -72,7 +72,7 @@ def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalRed
     Parameters
     ----------
     terms : ReductionTerms
-        The full model.
+        The terms of the full model, and its loads and outputs.
     count : int
         The number of modes.
     stage : Stage

@@ -141,14 +141,14 @@ def reduced_model(
     memory_limit: float | None = None,
     with_ports: bool = False,
 ) -> ReducedModel:
-    """Return the reduced model of a wing, or of a structure file, from the cache if it is there.
+    """Return the reduced model of a wing or of a structure file, from the cache if possible.
 
     Parameters
     ----------
     source : WingDesign, Path or str, optional
         The design of a wing, by default the shipped one, or the path of a structure file.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
         The accuracy that is asked for of a wing; by default that of the design.
     memory_limit : float, optional
@@ -179,14 +179,14 @@ def wing_fields(
     progress: Progress | None = None,
     settings: StructureSettings | None = None,
 ) -> WingFields:
-    """Return the reduced model of a wing with its bases on the mesh, from the cache if it is there.
+    """Return the reduced model of a wing with its bases on the mesh, from the cache if possible.
 
     Parameters
     ----------
     design : WingDesign, optional
         The wing; the shipped one by default.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
         The accuracy that is asked for; by default that of the design.
 
@@ -222,14 +222,14 @@ def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators
 
 
 def patch_arrays(design: WingDesign | None = None, progress: Progress | None = None) -> PatchArrays:
-    """Return the arrays of a wing that can be patched, from the cache if they are there.
+    """Return the arrays of a wing that can be patched, from the cache if possible.
 
     Parameters
     ----------
     design : WingDesign, optional
         The wing; the shipped one by default.
     progress : Progress, optional
-        Where a build reports.
+        The display of the progress, if the arrays must be built.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingField
     operators : AffineOperators
         The full model of the wing.
     reduction : Reduction
-        Its reduced model, and the bases.
+        The reduced model of the structure, and the bases.
     """
     mesh = operators.wing_mesh
 

@@ -37,7 +37,7 @@ PATCHED_STATES = 240
 DAMAGED_LOSS = 0.7
 """Stiffness loss of every damage region in the second state of health of the working basis."""
 LIFT_POLYNOMIALS = 6
-"""Legendre polynomials along the span by which the lift is weighted for the working basis."""
+"""Number of Legendre polynomials along the span that weight the lift for the working basis."""
 MODES = 8
 """Modes that are snapshots."""
 INERTIA_SHAPES = 6
@@ -93,9 +93,9 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
     Parameters
     ----------
     operators : AffineOperators
-        The full model.
+        The finite element operators of the full wing.
     progress : Progress, optional
-        Where to report.
+        The display of the progress.
 
     Raises
     ------
@@ -104,62 +104,64 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
     """
     progress = reporter(progress)
     with progress.stage("Computing solutions of the wing with changes"):
-        full = assemble_patch_operators(operators)
-        basis = _working_basis(full)
+        full_model = assemble_patch_operators(operators)
+        basis = _working_basis(full_model)
     with progress.stage("Reducing the patched wing"):
-        directions = _kept_directions(project(full, basis))
-        return project(full, basis @ directions)
+        directions = _kept_directions(project(full_model, basis))
+        return project(full_model, basis @ directions)
 
 
-def _working_basis(full: PatchOperators) -> FloatArray:
+def _working_basis(full_model: PatchOperators) -> FloatArray:
     """Return a basis (n, N) of the snapshots of the healthy and the damaged wing.
 
     The columns are orthonormal in the energy norm (method of snapshots): with the eigenpairs of the
     Gram matrix S^T K S v = w v, they are S v / sqrt(w).
     """
-    snapshots = np.concatenate((_snapshots(full, 0.0), _snapshots(full, DAMAGED_LOSS)), axis=1)
-    gram = snapshots.T @ (full.operators.stiffness() @ snapshots)
+    snapshots = np.concatenate(
+        (_snapshots(full_model, 0.0), _snapshots(full_model, DAMAGED_LOSS)), axis=1
+    )
+    gram = snapshots.T @ (full_model.operators.stiffness() @ snapshots)
     squares, vectors = np.linalg.eigh(gram)
     is_large = squares > WORKING_TOLERANCE * squares[-1]
     return np.asarray(snapshots @ (vectors[:, is_large] / np.sqrt(squares[is_large])))
 
 
-def _snapshots(full: PatchOperators, loss: float) -> FloatArray:
+def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
     """Return solutions (n, S) of the full model, all damage regions with one loss.
 
     Parameters
     ----------
-    full : PatchOperators
-        The full model.
+    full_model : PatchOperators
+        The full model of the wing, with the rows that patches act on.
     loss : float
         The stiffness loss.
     """
-    operators = full.operators
+    operators = full_model.operators
     health = dict.fromkeys(operators.regions, loss)
     factors = Factorisation(operators.stiffness(None, health))
     frequency, modes = natural_frequencies(operators, MODES, health, factors)
     # solutions under loads, of unit energy, and modes
-    whitened = factors.whitened(_snapshot_loads(full, modes).T)
+    whitened = factors.whitened(_snapshot_loads(full_model, modes).T)
     responses = factors.unwhitened(whitened / np.linalg.norm(whitened, axis=0))
     solutions = np.concatenate((responses, modes / (2.0 * np.pi * frequency)), axis=1)
     # solutions under the forces that each part of the skin takes in these solutions
-    skin_forces = np.concatenate(_skin_forces(full, solutions), axis=1)
+    skin_forces = np.concatenate(_skin_forces(full_model, solutions), axis=1)
     return np.concatenate((solutions, factors.riesz(skin_forces)), axis=1)
 
 
-def _snapshot_loads(full: PatchOperators, modes: FloatArray) -> FloatArray:
+def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray:
     """Return the loads (L, n) of the snapshots: first the gauges, then tip force and lift.
 
     Parameters
     ----------
-    full : PatchOperators
-        The full model.
+    full_model : PatchOperators
+        The full model of the wing, with the rows that patches act on.
     modes : (n, m) array
-        Its modes.
+        The lowest modes of the model.
     """
-    operators = full.operators
-    lines = full.line_rows
-    stations = full.layout["stations"]
+    operators = full_model.operators
+    lines = full_model.line_rows
+    stations = full_model.layout["stations"]
     step = max(1, len(stations) // POINT_STATIONS)
     polynomials = legendre.legvander(2.0 * stations / stations[-1] - 1.0, LIFT_POLYNOMIALS - 1)
     point_forces = (
@@ -171,32 +173,32 @@ def _snapshot_loads(full: PatchOperators, modes: FloatArray) -> FloatArray:
     inertia = [(term @ modes[:, :INERTIA_SHAPES]).T for term in operators.mass_terms]
     return np.vstack(
         (
-            full.strain_rows.along.toarray(),
+            full_model.strain_rows.along.toarray(),
             operators.load_tip,
             operators.load_lift,
             operators.tip_row,
-            full.weight,
-            full.flap_row,
-            polynomials.T @ full.lift_rows,
-            full.strain_rows.across.toarray(),
-            full.strain_rows.shear.toarray(),
+            full_model.weight,
+            full_model.flap_row,
+            polynomials.T @ full_model.lift_rows,
+            full_model.strain_rows.across.toarray(),
+            full_model.strain_rows.shear.toarray(),
             *(force.toarray() for force in point_forces),
             *inertia,
         )
     )
 
 
-def _skin_forces(full: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
+def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
     """Return the elastic forces (n, s) of each part of the skin in the snapshot solutions.
 
     Parameters
     ----------
-    full : PatchOperators
-        The full model.
+    full_model : PatchOperators
+        The full model of the wing, with the rows that patches act on.
     solutions : (n, S) array
         Solutions under the loads of `_snapshot_loads`, then the modes.
     """
-    layout = full.layout
+    layout = full_model.layout
     gauge_stations = layout["gauge_stations"]
     gauge_count = len(gauge_stations)
     main_loads = 2  # tip force and lift
@@ -212,7 +214,7 @@ def _skin_forces(full: PatchOperators, solutions: FloatArray) -> list[FloatArray
     is_near = np.abs(gauge_stations - part_middles) < NEAR_GAUGE * np.diff(edges).max()
     return [
         strip @ np.concatenate((main_solutions, of_gauges[:, near_gauges]), axis=1)
-        for strip, near_gauges in zip(full.strips, is_near, strict=True)
+        for strip, near_gauges in zip(full_model.strips, is_near, strict=True)
     ]
 
 
@@ -224,17 +226,17 @@ def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T))
 
 
-def project(full: PatchOperators, basis: FloatArray) -> PatchArrays:
+def project(full_model: PatchOperators, basis: FloatArray) -> PatchArrays:
     """Return the arrays of a wing in a basis.
 
     Parameters
     ----------
-    full : PatchOperators
+    full_model : PatchOperators
         The full model, with n free unknowns.
     basis : (n, N) array
         The basis.
     """
-    operators = full.operators
+    operators = full_model.operators
     lower = np.tril_indices(basis.shape[1])
     stiffness = np.stack([_projected(term.matrix, basis) for term in operators.stiffness_terms])
     mass = np.stack([_projected(term, basis) for term in operators.mass_terms])
@@ -250,23 +252,25 @@ def project(full: PatchOperators, basis: FloatArray) -> PatchArrays:
         regions=operators.regions,
         validity_box=np.array(list(operators.ranges.values())),
         largest_loss=LARGEST_LOSS,
-        largest_compliance=COMPLIANCE_FRACTION * tip_compliance / full.layout["load_place"] ** 2,
+        largest_compliance=COMPLIANCE_FRACTION
+        * tip_compliance
+        / full_model.layout["load_place"] ** 2,
         largest_mass=LARGEST_MASS,
         stiffness=stiffness,
         mass=mass,
         strip_stiffness=np.stack(
-            [_projected(strip, basis)[lower].astype(np.float32) for strip in full.strips]
+            [_projected(strip, basis)[lower].astype(np.float32) for strip in full_model.strips]
         ),
         start_shapes=_unit_columns(shapes * np.where(tip_row @ shapes < 0.0, -1.0, 1.0)),
-        flap_row=np.asarray(full.flap_row @ basis),
-        line_rows=np.stack([rows @ basis for rows in full.line_rows.stacked]),
+        flap_row=np.asarray(full_model.flap_row @ basis),
+        line_rows=np.stack([rows @ basis for rows in full_model.line_rows.stacked]),
         load_tip=load_tip,
         load_lift=np.asarray(operators.load_lift @ basis),
-        lift_rows=np.asarray(full.lift_rows @ basis),
-        weight=np.asarray(full.weight @ basis),
-        strain_rows=np.stack([rows @ basis for rows in full.strain_rows]),
+        lift_rows=np.asarray(full_model.lift_rows @ basis),
+        weight=np.asarray(full_model.weight @ basis),
+        strain_rows=np.stack([rows @ basis for rows in full_model.strain_rows]),
         tip_row=tip_row,
-        **full.layout,
+        **full_model.layout,
     )
 
 
@@ -312,7 +316,7 @@ def _kept_directions(arrays: PatchArrays) -> FloatArray:
 
 
 def _weighted_loads(wing: PatchedWing) -> _SnapshotLoads:
-    """Return the loads whose solutions are compressed, with their weights."""
+    """Return the loads whose solutions span the basis, with the weights of these solutions."""
     arrays = wing.arrays
     eta = arrays.stations / wing.span
     upward_rows = arrays.line_rows[2:]
@@ -320,15 +324,17 @@ def _weighted_loads(wing: PatchedWing) -> _SnapshotLoads:
     point_forces = upward_rows[:, np.searchsorted(eta, OUTBOARD_STATIONS)].reshape(-1, wing.size)
     mean_displacement = arrays.station_weights @ upward_rows[0]
     strain_along, *other_strains = arrays.strain_rows
-    main = np.vstack((arrays.load_tip, arrays.load_lift, washed_out_lifts))
-    plain = np.vstack(
+    main_loads = np.vstack((arrays.load_tip, arrays.load_lift, washed_out_lifts))
+    # The rows of an output are loads, too: their solutions make the output accurate.
+    output_loads = np.vstack(
         (arrays.weight, point_forces, strain_along, arrays.flap_row, mean_displacement)
     )
-    other = np.vstack(other_strains)
+    other_strain_loads = np.vstack(other_strains)
     weights = (MAIN_LOAD_WEIGHT, 1.0, OTHER_STRAIN_WEIGHT)
+    counts = [len(main_loads), len(output_loads), len(other_strain_loads)]
     return _SnapshotLoads(
-        columns=np.concatenate((main, plain, other)).T,
-        weights=np.repeat(weights, [len(main), len(plain), len(other)]),
+        columns=np.concatenate((main_loads, output_loads, other_strain_loads)).T,
+        weights=np.repeat(weights, counts),
     )
 
 
@@ -340,17 +346,18 @@ def _unit_columns(vectors: FloatArray) -> FloatArray:
 def _patched_state(
     wing: PatchedWing, fractions: FloatArray, *, unchanged: bool
 ) -> PatchedStructure:
-    """Return the wing at fractions of all ranges.
+    """Return a wing whose modulus, damage, masses and patch are given by fractions of their ranges.
 
     Parameters
     ----------
     wing : PatchedWing
         The wing in the working basis.
     fractions : (F,) array
-        Fractions that decide which changes there are, the fractions of the changes' ranges, and
-        those of the ranges of modulus, losses and masses.
+        Numbers from 0 to 1. The first decide which changes the wing has, by `PROBABILITIES`. The
+        next are fractions of the ranges of these changes (`_ChangeFractions`), and the last are
+        fractions of the ranges of modulus, losses and masses.
     unchanged : bool
-        Return the wing as it was, in the middle of its ranges, without damage.
+        Whether to return the wing without changes and damage, in the middle of its ranges.
     """
     arrays = wing.arrays
     draws, change_values, value_fractions = np.split(
@@ -362,7 +369,7 @@ def _patched_state(
     # modulus, losses of the regions and masses
     low, high = arrays.validity_box[:-2].T  # without load factor and tip force
     values = low + (high - low) * (0.5 if unchanged else value_fractions)
-    values[1:-2] *= has_losses
+    values[1:-2] *= has_losses  # between the modulus and the two masses
     # changes of the patch
     change = _ChangeFractions(*change_values.tolist())
     changes = (
@@ -375,7 +382,7 @@ def _patched_state(
         PointMass(change.mass * arrays.largest_mass, (0.1 + 0.9 * change.station) * wing.span),
     )
     patch = ModelPatch(
-        tuple(part for part, present in zip(changes, has_change, strict=True) if present)
+        tuple(part for part, is_present in zip(changes, has_change, strict=True) if is_present)
     )
     no_loads = (0.0, 0.0)
     return wing.structure_at(np.append(values, no_loads), patch)

@@ -59,11 +59,11 @@ def reduce_structure(
     Parameters
     ----------
     structure : AffineStructure
-        The full model.
+        The full finite element model.
     settings : StructureSettings, optional
         The accuracy that is asked for; by default that of the structure's design.
     progress : Progress, optional
-        Where to report.
+        The display of the progress.
 
     Returns
     -------
@@ -128,13 +128,13 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
     """Return the fields of the reduced model that do not depend on the reduced basis."""
     structure = terms.structure
     design = structure.design
-    chosen = (
+    variable_names = (
         *structure.parameters,
         *structure.regions,
         *structure.masses,
         *structure.controls,
     )
-    nominal = structure.parameters | structure.masses | structure.controls
+    nominal_values = structure.parameters | structure.masses | structure.controls
     return {
         "design_hash": structure.design_hash,
         "name": design.name,
@@ -146,9 +146,13 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
         "gauges": structure.gauges,
         "displacements": structure.displacements,
         "accelerations": structure.accelerations,
-        "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
+        "nominal": np.array(
+            [nominal_values.get(name, 0.0) for name in variable_names], dtype=np.float64
+        ),
         "damping": np.array((design.damping.alpha, design.damping.beta)),
-        "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
+        "validity_box": np.array(
+            [structure.ranges[name] for name in variable_names], dtype=np.float64
+        ),
         "stiffness_factors": terms.stiffness_factors,
         "load_factors": terms.load_factors,
         "dual_split": terms.splits,
@@ -192,9 +196,9 @@ def measured_errors(
     Parameters
     ----------
     structure : AffineStructure
-        The full model.
+        The full finite element model.
     model : ReducedModel
-        Its reduced model.
+        The reduced model of the structure.
     states : int
         The number of states, uniform in the ranges; each costs a factorisation.
     seed : int
@@ -245,15 +249,15 @@ class _RelativeErrors(NamedTuple):
 
 
 def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _RelativeErrors:
-    """Return the errors of a reduced model's response against the exact one."""
+    """Return errors and bounds of a reduced response, for strains and for other outputs."""
     errors = np.full(2, np.nan)
     bounds = np.full(2, np.nan)
-    for kind, outputs in enumerate((exact.strain, exact.output)):
-        if outputs.size:
-            approximation, bound = reduced.outputs_with_bounds[kind]
-            largest = np.abs(outputs).max()
-            errors[kind] = np.abs(approximation - outputs).max() / largest
-            bounds[kind] = bound / largest
+    for kind, exact_outputs in enumerate((exact.strain, exact.output)):
+        if exact_outputs.size:
+            reduced_outputs, error_bound = reduced.outputs_with_bounds[kind]
+            largest = np.abs(exact_outputs).max()
+            errors[kind] = np.abs(reduced_outputs - exact_outputs).max() / largest
+            bounds[kind] = error_bound / largest
     return _RelativeErrors(errors, bounds)
 
 

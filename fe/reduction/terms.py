@@ -27,7 +27,7 @@ of all loads, each at its largest coefficient."""
 INNER_MODAL_STATES = 10
 """States inside the box at which the working basis of the modes is refined."""
 INNER_TRAINING_STATES = 128
-"""States inside the box on the training set, beside its corners."""
+"""Number of states in the training set that lie inside the box, in addition to its corners."""
 INNER_TRAINING_STATES_MANY_REGIONS = 1024
 """The same with more than `MOST_GRID_REGIONS` regions."""
 MOST_MASS_CORNERS = 64
@@ -193,7 +193,7 @@ class ReductionTerms:
         self.loads: FloatArray = np.stack([zero_column, *load_sums.values()], axis=1)[:, 1:]
 
     def _set_outputs(self) -> None:
-        """Set the outputs and the groups in which they are judged."""
+        """Set the outputs, and the groups of outputs that are judged by a common scale."""
         rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
         self.outputs: FloatArray = np.asarray(rows.T.toarray())
         gauges = len(self.structure.gauges)

@@ -115,9 +115,9 @@ def arrays_from_bytes(
             f"{where} is not a valid archive of plain arrays ({reason}); delete it and build it "
             "again."
         ) from cause
-    missing = [name for name in required if name not in arrays]
-    if missing:
-        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it again.")
+    missing_names = [name for name in required if name not in arrays]
+    if missing_names:
+        raise ReducedModelFileError(f"{where} lacks {', '.join(missing_names)}; build it again.")
     return arrays
 
 
@@ -134,7 +134,7 @@ class StoredArrays:
     Class attributes
     ----------------
     record_name : str
-        What the record is, with its article, for sentences.
+        The noun of the record, with its article, for sentences.
     version : int
         Version of the layout of its file.
 
@@ -225,7 +225,7 @@ class StoredArrays:
         return f"{type(self).__name__}({', '.join(plain_values)})"
 
     def _error(self, fault: str) -> ReducedModelFileError:
-        """Return the error of an inconsistent record; `fault` is the rest of its sentence."""
+        """Return the error for an inconsistent record; `fault` completes the sentence."""
         name = f"{self.record_name[0].upper()}{self.record_name[1:]}"
         return ReducedModelFileError(f"{name} {fault}; build it again.")
 

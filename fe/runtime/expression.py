@@ -145,7 +145,7 @@ class Expression:
             self._check(argument)
 
     def _error(self, fault: str) -> InvalidPatchError:
-        """Return the error of an invalid expression; `fault` is the rest of its sentence."""
+        """Return the error for an invalid expression; `fault` completes the sentence."""
         return InvalidPatchError(f"{self.where}{fault}.")
 
     def value(self, values: Mapping[str, float]) -> float:

@@ -58,7 +58,7 @@ def rayleigh_coefficients(
     frequency : tuple of float
         Two different natural frequencies [Hz].
     damping_ratio : tuple of float
-        Their damping ratios [1].
+        The damping ratios of the modes [1].
 
     Returns
     -------
@@ -157,6 +157,7 @@ class ModalSystem:
         """Angular frequencies, or magnitudes of the eigenvalues, that are not zero [1/s]."""
         if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
             return self.angular_frequency
+        # Eigenvalues of zero come out as rounding errors of the largest one.
         magnitude = np.abs(self._eigenvectors.rates)
         return np.asarray(magnitude[magnitude > 1e-7 * np.max(magnitude, initial=0.0)])
 
@@ -170,12 +171,16 @@ class ModalSystem:
         if not np.linalg.cond(vectors) < LARGEST_CONDITION:
             return None
         scale = np.concatenate((np.ones_like(speed_unit), speed_unit))
-        # The two of a conjugate pair add to twice the real part of one: only that with a positive
-        # imaginary part is kept, and counted twice.
-        chosen = rates.imag >= 0.0
+        # The two rates of a conjugate pair add to twice the real part of one of them. Only the rate
+        # with a positive imaginary part is kept, and its amplitude is doubled.
+        is_upper_half = rates.imag >= 0.0
         multiplicity = np.where(rates.imag > 0.0, 2.0, 1.0)
         amplitudes = np.linalg.inv(vectors) / scale * multiplicity[:, None]
-        return _FreeModes(rates[chosen], scale[:, None] * vectors[:, chosen], amplitudes[chosen])
+        return _FreeModes(
+            rates[is_upper_half],
+            scale[:, None] * vectors[:, is_upper_half],
+            amplitudes[is_upper_half],
+        )
 
     def free_motion(
         self, q: FloatArray, v: FloatArray, time: FloatArray
@@ -203,6 +208,7 @@ class ModalSystem:
         block_begin = time
         offset = np.zeros(1)
         even_time = np.linspace(time[0], time[-1], len(time))
+        # Times count as even if they differ by rounding errors from even ones.
         if np.abs(time - even_time).max() <= 1e-9 * (even_time[-1] - even_time[0]) / len(time):
             block = math.isqrt(len(time))
             block_begin = even_time[::block]
@@ -249,7 +255,7 @@ class _Eigenvectors(NamedTuple):
 
 
 class _FreeModes(NamedTuple):
-    """Damped oscillations that free motion consists of, one for each conjugate pair.
+    """The damped oscillations that make up free motion, one for each conjugate pair of rates.
 
     Attributes
     ----------
@@ -258,7 +264,7 @@ class _FreeModes(NamedTuple):
     shapes : (2M, R) array
         Coordinates and speeds of each oscillation.
     amplitudes : (R, 2M) array
-        Amplitude of each by the coordinates and speeds at time zero.
+        Amplitude of each oscillation (row) per unit of each coordinate and speed at time zero.
     """
 
     rates: ComplexArray
@@ -284,14 +290,16 @@ class ExactSteps(NamedTuple):
 
 @lru_cache(maxsize=16)  # the same system is often moved again with other laws
 def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps:
-    """Return the exact steps of a system; bytes of arrays, so that the results can be cached.
+    """Return the exact time steps of a system of M modes under forces that are linear in time.
+
+    The arrays are passed as bytes, because the cache needs arguments with a hash.
 
     Parameters
     ----------
     stiffness : bytes of (M, M) or (M,) array
-        S, or its diagonal if nothing couples the coordinates.
+        The stiffness S, or its diagonal if nothing couples the coordinates [1/s^2].
     damping : bytes of (M, M) array
-        D.
+        The damping D [1/s].
     lengths : bytes of (S,) array
         Lengths of the steps [s].
     """
@@ -305,17 +313,17 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
         )
         return ExactSteps(steps.transition[:, 0], steps.begin[:, 0], steps.end[:, 0])
     # each coordinate by itself, as a system of one
-    single = _linear_force_exponentials(
+    single_steps = _linear_force_exponentials(
         stiffness_values[:, None, None], np.diag(damping_matrix)[:, None, None], duration
     )
     mode = np.arange(count)
     steps_count = len(duration)
     transition = np.zeros((steps_count, 2, count, 2, count))
-    transition[:, :, mode, :, mode] = single.transition.transpose(1, 0, 2, 3)
+    transition[:, :, mode, :, mode] = single_steps.transition.transpose(1, 0, 2, 3)
     begin = np.zeros((steps_count, 2, count, count))
-    begin[:, :, mode, mode] = single.begin[..., 0].transpose(0, 2, 1)
+    begin[:, :, mode, mode] = single_steps.begin[..., 0].transpose(0, 2, 1)
     end = np.zeros((steps_count, 2, count, count))
-    end[:, :, mode, mode] = single.end[..., 0].transpose(0, 2, 1)
+    end[:, :, mode, mode] = single_steps.end[..., 0].transpose(0, 2, 1)
     return ExactSteps(
         transition=transition.reshape(steps_count, 2 * count, 2 * count),
         begin=begin.reshape(steps_count, 2 * count, count),
@@ -326,15 +334,16 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
 def _linear_force_exponentials(
     stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
 ) -> ExactSteps:
-    """Return the exact steps of B systems of n coordinates, each by itself.
+    """Return the exact time steps of B independent systems, each of n coordinates.
 
-    The state (q, v) is extended by the force f and its change s over the step, which makes the
-    system homogeneous (Van Loan 1978).
+    The coordinates q and speeds v of a system are extended by the force f and its change s over the
+    step. So the equation of motion becomes homogeneous, and one matrix exponential solves it (Van
+    Loan 1978).
 
     Parameters
     ----------
     stiffness, damping : (B, n, n) array
-        S and D.
+        The stiffness S [1/s^2] and the damping D [1/s].
     lengths : (S,) array
         Lengths of the steps [s].
 
@@ -360,13 +369,15 @@ def _linear_force_exponentials(
     matrix[:, v, q] = -stiffness / speed_unit
     matrix[:, v, v] = -damping
     matrix[:, v, f] = unity / speed_unit
-    scaled = matrix * lengths[:, None, None, None]
-    scaled[:, :, f, s] = unity  # the force changes by one over the step
-    result = exponential(scaled)
+    step_matrix = matrix * lengths[:, None, None, None]
+    step_matrix[:, :, f, s] = unity  # the force changes by one over the step
+    result = exponential(step_matrix)
     # back to the units of the state
     scale = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1).repeat(count, axis=1)
     by_change = result[:, :, state, s] * scale
     by_constant = result[:, :, state, f] * scale
+    # A linear force is its value at the begin times (1 - t / h) plus its value at the end times
+    # t / h: the response to the first part is that to a constant minus that to the change.
     transition = result[:, :, state, state] * scale / scale.transpose(0, 2, 1)
     return ExactSteps(
         transition=np.ascontiguousarray(transition),
@@ -380,11 +391,11 @@ def exponential(matrix: FloatArray) -> FloatArray:
     norm = float(np.max(np.sum(np.abs(matrix), axis=-1), initial=0.0))
     # few squarings, because each doubles the rounding
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
-    scaled = matrix / 2.0**squarings
+    scaled_matrix = matrix / 2.0**squarings
     unity = np.eye(matrix.shape[-1])
     result = np.broadcast_to(unity, matrix.shape)
     for order in range(_TAYLOR_ORDER, 0, -1):
-        result = unity + scaled @ result / order
+        result = unity + scaled_matrix @ result / order
     for _ in range(squarings):
         result = result @ result
     return np.asarray(result)

@@ -53,7 +53,7 @@ class StaticSolution(NamedTuple):
 
 def static_solution(
     laws: PortLaws,
-    linear: FloatArray,
+    linear_positions: FloatArray,
     compliance: FloatArray,
     *,
     memory: FloatArray | None = None,
@@ -69,7 +69,7 @@ def static_solution(
     ----------
     laws : PortLaws
         The internal forces; damping is zero at rest.
-    linear : (L, J) array
+    linear_positions : (L, J) array
         Position of each law's port at each level without internal forces.
     compliance : (J, J) array
         Position of the port of each law (row) under a unit force at that of another (column).
@@ -85,16 +85,16 @@ def static_solution(
     SolutionError
         If a level has no solution on the path: a softening law that the structure cannot hold.
     """
-    linear = np.ascontiguousarray(linear, dtype=np.float64)
+    linear_positions = np.ascontiguousarray(linear_positions, dtype=np.float64)
     memory = laws.unloaded_memory() if memory is None else memory.copy()
-    positions = linear.copy()
-    forces = np.zeros_like(linear)
-    if not len(laws) or not len(linear):
+    positions = linear_positions.copy()
+    forces = np.zeros_like(linear_positions)
+    if not len(laws) or not len(linear_positions):
         return StaticSolution(positions, forces, memory)
     if start is None:
         start = np.zeros(len(laws))
     unsolved_level = (kernel or PLAIN_KERNEL).static_path(
-        linear,
+        linear_positions,
         np.ascontiguousarray(compliance, dtype=np.float64),
         tuple(laws.port_arrays_at_rest()),
         memory,
@@ -146,7 +146,7 @@ def integrate_motion(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     laws : PortLaws
         The laws at its ports.
     steps : StepArrays

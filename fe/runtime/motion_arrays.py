@@ -162,7 +162,7 @@ class ModalMotion(NamedTuple):
 
 
 def port_value(rows: FloatArray, j: int, q: FloatArray) -> float:
-    """Return row `j` of `rows` (J, M) times `q` (M,): position or speed of the port of a law."""
+    """Return position or speed of the port of law `j`: row `j` of `rows` (J, M) times `q` (M,)."""
     value = 0.0
     for m in range(len(q)):
         value += rows[j, m] * q[m]

@@ -143,7 +143,7 @@ def first_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes the first half of the internal impulse of step `k`, of duration `h` [s]."""
+    """Give the modes half of the laws' impulse, in step `k` of duration `h` [s]."""
     half = 0.5 * h
     mode_count = len(state.q)
     law_count = len(ports.law_number)

@@ -336,7 +336,7 @@ def _checked_values(
         if isinstance(value, bool) or not isinstance(value, _ACCEPTED_TYPES[types[name]]):
             type_name = "text" if types[name] is str else "a number"
             raise InvalidPatchError(f"{where}: {name} must be {type_name}, but is {value!r}.")
-    missing = [name for name in required if name not in row]
-    if missing:
-        raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.")
+    missing_names = [name for name in required if name not in row]
+    if missing_names:
+        raise InvalidPatchError(f"{where} lacks {', '.join(missing_names)}.")
     return {name: types[name](value) for name, value in row.items()}

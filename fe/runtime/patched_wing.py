@@ -61,7 +61,7 @@ class PatchedModes(NamedTuple):
 
 
 def solver_by_inverse(stiffness: FloatArray) -> Solver:
-    """Return the solver of a stiffness (n, n) by its inverse: NumPy has no Cholesky solution."""
+    """Return a solver by the inverse of a stiffness (n, n), as NumPy solves no Cholesky factors."""
     inverse = np.linalg.inv(stiffness)
 
     def solve(loads: FloatArray) -> FloatArray:
@@ -80,7 +80,7 @@ def motion_basis(
     static : callable
         K^-1 of loads (n, k).
     mass : (n, n) array
-        M.
+        The mass matrix M [kg].
     start : (n, r) array
         Modes of a similar structure.
     static_shapes : (n, s) array
@@ -249,9 +249,11 @@ class PatchedWing(WingRows):
         if skin is None:
             return
         changes = (skin.by_strip[arrays.strip_of] - 1.0) * theta[arrays.term_of]
-        changed = np.flatnonzero(changes)
+        changed_strips = np.flatnonzero(changes)
         lower = np.zeros_like(stiffness)
-        lower[np.tril_indices(self.size)] = changes[changed] @ arrays.strip_stiffness[changed]
+        lower[np.tril_indices(self.size)] = (
+            changes[changed_strips] @ arrays.strip_stiffness[changed_strips]
+        )
         stiffness += lower + np.tril(lower, -1).T
 
     def structure_at(
@@ -268,7 +270,7 @@ class PatchedWing(WingRows):
             Values of all inputs, in the order of `fe.runtime.state.wing_input_names`; those of the
             controls do not matter.
         patch : ModelPatch
-            The patch.
+            The primitive changes of the model.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
@@ -296,11 +298,11 @@ class PatchedStructure:
     Parameters
     ----------
     wing : PatchedWing
-        The wing.
+        The wing in its basis for patches.
     stiffness, mass : (n, n) array
-        Its matrices in this state and under this patch.
+        The matrices of the wing in this state and under this patch.
     patch : ModelPatch
-        The patch.
+        The primitive changes of the model.
 
     Attributes
     ----------

@@ -375,7 +375,10 @@ class ReducedModel(ReducedArrays):
         stiffness_loss: LossValues = (),
         **named: float,
     ) -> ReducedModes:
-        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
+        """Return the lowest undamped modes of the structure: Kapteyn et al. 2021, eq. (16).
+
+        Each tracked shape, such as the first flapwise bending, is assigned to the mode that it
+        resembles most, by the modal assurance criterion.
 
         Parameters
         ----------
@@ -392,8 +395,9 @@ class ReducedModel(ReducedArrays):
         stiffness = dense_sum(self.stiffness_coefficients(vector), self.modal_stiffness)
         mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
         frequency, shape = lowest_modes(stiffness, mass, self.mode_count)
+        # The sign of an eigenvector is arbitrary; that of the last output is made positive.
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
-        # modal assurance criterion against the tracked shapes
+        # Modal assurance criterion of each tracked shape with each mode
         weighted_shapes = self.followed_shapes @ mass
         squared_norm = np.sum(weighted_shapes * self.followed_shapes, axis=1)[:, np.newaxis]
         assurance = (weighted_shapes @ shape) ** 2 / squared_norm

@@ -53,7 +53,7 @@ class ReducedArrays(StoredArrays):
     mode_count : int
         Number of modes M that `ReducedModel.modes` returns.
     followed_shapes : (F, Nm) array
-        Shapes in the modal basis by which modes are tracked; of a wing its first two flapwise
+        Shapes in the modal basis that modes are compared with; of a wing its first two flapwise
         bendings.
     validity_box : (V, 2) array
         Least and largest value of each input, SI units.

@@ -103,7 +103,7 @@ class Sensor(Primitive):
         values : (N, C) array
             The readings without the fault, in the units of the channels.
         rates : (N, C) array
-            Their time derivatives.
+            The time derivatives of the readings.
 
         Returns
         -------

@@ -113,11 +113,11 @@ def apply_sensors(
     patch : ModelPatch
         The patch; only its sensors act, without clocks.
     record : SensorRecord
-        The record.
+        The times and signals of one recording.
     values : (N, C) array
         Readings of perfect sensors, in the units of the channels.
     rates : (N, C) array, optional
-        Their time derivatives, for dynamic trials.
+        The time derivatives of the readings, for dynamic trials.
     transverse, shear : (N, C) array, optional
         Strain across the direction of each gauge and engineering shear strain, for rotations.
     high_pass : callable
@@ -129,7 +129,7 @@ def apply_sensors(
     values : (N, C) array
         The readings.
     rates : (N, C) array or None
-        Their time derivatives, if those of the perfect readings were given.
+        The time derivatives of the readings, if those of the perfect readings were given.
 
     Raises
     ------
@@ -186,7 +186,8 @@ def _rotate_gauges(
         return
     if transverse is None or shear is None:
         raise InvalidPatchError(
-            "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
+            "A gauge is turned, but the model does not give the transverse and shear strains that "
+            "its reading depends on."
         )
     cosine = np.cos(angles[turned_columns])
     sine = np.sin(angles[turned_columns])

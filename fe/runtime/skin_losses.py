@@ -38,7 +38,7 @@ class RemainingSkin(NamedTuple):
 
 
 def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin | None:
-    """Return the fractions of its stiffness that the skin keeps under the local losses of a patch.
+    """Return the fraction of stiffness that each part of the skin keeps under local losses.
 
     Overlapping losses multiply: (1 - loss_1) (1 - loss_2). Pieces of a strip bend in series, so
     that the strip keeps the harmonic mean of their fractions. The weight is the square of the

@@ -13,9 +13,22 @@ from .arrays import FADING_POSITION, FORCE, LAGGED_FORCE, POSITION
 from .laws import speed
 from .motion_arrays import FloatArray, PortArrays, RecordFields
 
+_SMALLEST_PART = 1.0 / 256.0
+"""A load level that cannot be approached in parts of this size counts as without a solution."""
+_MOST_STATIC_STEPS = 60
+"""Largest number of steps of Newton's method for an equilibrium of all ports."""
+_SMALLEST_FRACTION = 4e-4
+"""A step of Newton's method is not shortened below about this fraction."""
+_ACCURATE = 1e-12
+"""Residual over scale at which an equilibrium counts as exact."""
+_MOST_MOTION_STEPS = 80
+"""Largest number of iterations for the position of one port in motion."""
+_UNKNOWN_END = 1e300
+"""Distance of an end of the bracket that is not known yet."""
+
 
 def static_path(
-    linear: FloatArray,
+    linear_positions: FloatArray,
     compliance: FloatArray,
     port_fields: RecordFields,
     memory: FloatArray,
@@ -25,11 +38,11 @@ def static_path(
 ) -> int:
     """Solve x + C F(x) = x_linear for load levels that follow one another.
 
-    A level that Newton's method does not reach in one step is approached in up to 256 parts.
+    A level that Newton's method does not reach from the previous one is approached in parts.
 
     Parameters
     ----------
-    linear : (L, J) array
+    linear_positions : (L, J) array
         x_linear, positions of the laws' ports without internal forces, at each level.
     compliance : (J, J) array
         C, positions of the ports (rows) under unit forces at them (columns).
@@ -52,23 +65,23 @@ def static_path(
     previous = start.copy()
     x = memory[:, POSITION].copy()
     x_forces = np.zeros(count)
-    for level in range(len(linear)):
+    for level in range(len(linear_positions)):
         # approach the level in parts; a part is halved if Newton's method fails, else doubled
-        done = 0.0
+        fraction_done = 0.0
         part = 1.0
-        while done < 1.0:
-            goal = previous + (linear[level] - previous) * min(done + part, 1.0)
+        while fraction_done < 1.0:
+            goal = previous + (linear_positions[level] - previous) * min(fraction_done + part, 1.0)
             solved, solution, x_forces = solve_static_position(goal, x, ports, memory, compliance)
             if solved:
                 x = solution
                 update_memory(ports, memory, x, x_forces)
-                done = min(done + part, 1.0)
+                fraction_done = min(fraction_done + part, 1.0)
                 part *= 2.0
             else:
                 part *= 0.5
-                if part < 1.0 / 256.0:
+                if part < _SMALLEST_PART:
                     return level
-        previous = linear[level]
+        previous = linear_positions[level]
         for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
             positions[level, j] = x[j]
             forces[level, j] = x_forces[j]
@@ -89,16 +102,16 @@ def solve_static_position(
     goal, start : (J,) array
         Linear positions of the ports, and the positions from which to begin.
     ports : PortArrays
-        The laws.
+        The laws of forces at the ports.
     memory : (J, 5 + E) array
-        Their memory; not changed.
+        The memory of the laws; not changed.
     compliance : (J, J) array
         C, positions of the ports (rows) under unit forces at them (columns).
 
     Returns
     -------
     solved : bool
-        Whether this is a solution, and a stable one.
+        Whether the positions are a solution, and a stable one.
     x, forces : (J,) array
         Positions of the ports and forces of the laws.
     """
@@ -106,18 +119,19 @@ def solve_static_position(
     x = start.copy()
     forces, slopes = static_forces(x, ports, memory)
     displaced = compliance @ forces  # a preloaded law displaces the ports even without a load
+    # The residual is judged by the largest displacement; the last term avoids a scale of zero.
     scale = np.max(np.abs(goal)) + np.max(np.abs(start)) + np.max(np.abs(displaced)) + 1e-300
     residual = x + displaced - goal
     size = np.max(np.abs(residual))
-    for _ in range(60):
-        if size <= 1e-12 * scale:
+    for _ in range(_MOST_STATIC_STEPS):
+        if size <= _ACCURATE * scale:
             break
         # The Jacobian is I + C dF/dx. The tiny multiple of I keeps a singular one invertible. `inv`
         # and not `solve`, which takes numba five seconds longer to compile.
         step = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
         fraction = 1.0
         previous_size = size
-        while size == previous_size and fraction > 4e-4:
+        while size == previous_size and fraction > _SMALLEST_FRACTION:
             candidate = x - fraction * step
             candidate_forces, candidate_slopes = static_forces(candidate, ports, memory)
             candidate_residual = candidate + compliance @ candidate_forces - goal
@@ -170,22 +184,22 @@ def update_memory(ports: PortArrays, memory: FloatArray, x: FloatArray, forces: 
 def solve_port_position(
     port: int, ports: PortArrays, memory: FloatArray, y: float, r: float, h: float
 ) -> float:
-    """Return the position x of a port in motion, where x + r sum F(x) = y.
+    """Return the position x of a port in motion at the end of a step, where x + r sum F(x) = y.
 
-    Newton's method within a bracket. If dry friction is strong enough to hold the port, the
-    position does not change at all.
+    The sum is over the laws that act at the port. The equation is solved by Newton's method within
+    a bracket. If dry friction is strong enough to hold the port, the position does not change.
 
     Parameters
     ----------
     port : int
-        Leader of the laws that act there.
+        The number of the leading law among the laws at the port.
     ports : PortArrays
-        The laws.
+        The laws of forces at the ports.
     memory : (J, 5 + E) array
-        Their memory, with the forces at the last position for laws of position. The new forces of
-        the port's laws are written to it, and nothing else.
+        The memory of the laws; that of a law of position has the force at the last position. Only
+        the new forces of the port's laws are written to it.
     y : float
-        Position of the port without these forces.
+        The position of the port without the forces of its laws.
     r : float
         Flexibility of the port with which it follows a force within the step.
     h : float
@@ -201,12 +215,12 @@ def solve_port_position(
     # the last position to which the free displacement points.
     sign = 1.0 if displacement > 0.0 else -1.0
     low = last
-    high = last + sign * 1e300
+    high = last + sign * _UNKNOWN_END  # until an iterate lies beyond the root
     x = last + sign * max(abs(displacement) - r * friction, 0.0)
     evaluated = x
     residual = 0.0
     steepest = port
-    for _ in range(80):
+    for _ in range(_MOST_MOTION_STEPS):
         total, slope, steepest = port_forces(port, ports, memory, x, r, h, sign, steepest)
         residual = x + r * total - y
         evaluated = x
@@ -223,7 +237,8 @@ def solve_port_position(
         newton = x - residual / slope if slope > 1e-6 else high
         if sign * (newton - low) > 0.0 and sign * (high - newton) > 0.0:
             x = newton
-        elif abs(high) < 1e299:  # near to the low end, where a force of speed may rise steeply
+        elif abs(high) < 0.1 * _UNKNOWN_END:
+            # near to the low end, where a force of speed may rise steeply
             x = low + 0.1 * (high - low)
         else:
             x += sign * abs(residual)
@@ -237,14 +252,14 @@ def solve_port_position(
 def forces_at_last_position(
     port: int, ports: PortArrays, memory: FloatArray, h: float
 ) -> tuple[float, float, float]:
-    """Return the forces of a port's laws at its last position, before it moves in a step.
+    """Return the forces of the laws at a port in its last position, before the port moves.
 
     The forces of laws of speed are set to zero in the memory, unless the duration `h` is zero.
 
     Returns
     -------
     force : float
-        Sum of the forces in the memory that stay.
+        The sum of the forces in the memory, without those of laws of speed.
     friction : float
         Largest force of dry friction.
     tolerance : float

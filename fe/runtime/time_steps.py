@@ -77,7 +77,7 @@ def step_boundaries(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     laws : PortLaws
         The laws at its ports.
     time : (N,) array
@@ -98,7 +98,8 @@ def step_boundaries(
         boundaries = step_boundaries(system, laws, all_times, refinement, least)
         samples = boundaries.sample_boundary[np.searchsorted(all_times, time)]
         return replace(boundaries, sample_boundary=samples)
-    # with laws, the slowest and the fastest mode set the length of a step
+    # With laws, the slowest and the fastest mode set the length of a step. A number of steps that
+    # exceeds a whole number by rounding alone is not rounded up.
     substeps = np.ones(len(time) - 1)
     if not laws.linear:
         substeps *= LEAST_SUBSTEPS
@@ -141,7 +142,7 @@ def loaded_steps(
     Parameters
     ----------
     system : ModalSystem
-        The linear system.
+        The modes of the structure, without the forces of laws.
     boundaries : Boundaries
         Boundaries of the K steps.
     begin_force, end_force : (K, M) array

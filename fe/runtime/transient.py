@@ -75,9 +75,9 @@ class ModalIntegrator:
     Attributes
     ----------
     structure : StructureInMotion
-        The structure.
+        The structure whose motion is integrated.
     modes : ModeSet
-        Its modes.
+        The modes of the structure.
     damping_ratio : (M,) array
         Damping ratios of the modes, eq. (18).
 
@@ -135,7 +135,7 @@ class ModalIntegrator:
             memory = self._laws.unloaded_memory()
             previous = TransientState(no_motion, no_motion, unloaded, memory)
         _, memory = self._law_forces_at_rest(
-            linear=self._responses.port_positions_by_loads @ loads,
+            linear_positions=self._responses.port_positions_by_loads @ loads,
             compliance=self._responses.port_compliance,
             memory=previous.memory,
             start=self._responses.port_positions_by_loads @ previous.load,
@@ -143,13 +143,17 @@ class ModalIntegrator:
         return TransientState(no_motion, no_motion, loads, memory)
 
     def _law_forces_at_rest(
-        self, linear: FloatArray, compliance: FloatArray, memory: FloatArray, start: FloatArray
+        self,
+        linear_positions: FloatArray,
+        compliance: FloatArray,
+        memory: FloatArray,
+        start: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the forces (J,) of the laws at rest, and their memory (J, 5 + E).
 
         Parameters
         ----------
-        linear, start : (J,) array
+        linear_positions, start : (J,) array
             Positions of the laws' ports without internal forces, now and before.
         compliance : (J, J) array
             Positions of the ports under unit forces at them.
@@ -160,7 +164,7 @@ class ModalIntegrator:
 
         assert self._laws is not None
         solution = static_solution(
-            self._laws, linear[np.newaxis], compliance, memory=memory, start=start
+            self._laws, linear_positions[np.newaxis], compliance, memory=memory, start=start
         )
         return solution.forces[0], solution.memory
 
@@ -208,26 +212,26 @@ class ModalIntegrator:
         SolutionError
             If laws have no equilibrium on the way.
         """
-        rest = self.equilibrium(load)
+        rest_state = self.equilibrium(load)
         response = self.structure.unit_responses[:, holding_load]
         force = offset / float(self.structure.output_rows[-1] @ response) if offset else 0.0
         if force and self._law_count:
-            rest, force = self._held_by_force(rest, force, holding_load)
+            rest_state, force = self._held_by_force(rest_state, force, holding_load)
         state = self._with_still_modes(
-            rest, self._responses.modal_coordinates[:, holding_load] * force
+            rest_state, self._responses.modal_coordinates[:, holding_load] * force
         )
         if self.structure.holding_load is not None and self._responses.beta > 0.0:
             removed_load = force * np.eye(self._responses.load_count)[self.structure.holding_load]
             state = replace(state, load=state.load + removed_load)
         if self._law_count:
-            memory = rest.memory.copy()
-            motion = self._motion_with_laws(state, rest.load, INSTANT, 0.0)
+            memory = rest_state.memory.copy()
+            motion = self._motion_with_laws(state, rest_state.load, INSTANT, 0.0)
             memory[:, LAGGED_FORCE] = motion.lagged_forces[0]
             state = replace(state, memory=memory)
         return state
 
     def _held_by_force(
-        self, rest: TransientState, force: float, holding_load: int
+        self, rest_state: TransientState, force: float, holding_load: int
     ) -> tuple[TransientState, float]:
         """Return the equilibrium of a structure with laws that is held aside, and the force.
 
@@ -237,7 +241,7 @@ class ModalIntegrator:
 
         Parameters
         ----------
-        rest : TransientState
+        rest_state : TransientState
             The equilibrium before.
         force : float
             The holding force without laws [N].
@@ -247,20 +251,20 @@ class ModalIntegrator:
         response = self.structure.unit_responses[:, holding_load]
         ports = self._responses.port_positions[:, holding_load]
         point = self.structure.unit_loads[:, holding_load] @ response
-        at_rest = self._responses.port_positions_by_loads @ rest.load
-        forces_before = rest.memory[:, LAGGED_FORCE]
+        at_rest = self._responses.port_positions_by_loads @ rest_state.load
+        forces_before = rest_state.memory[:, LAGGED_FORCE]
         start = at_rest - ports / point * (ports @ forces_before)
         forces, memory = self._law_forces_at_rest(
-            linear=start + force * ports,
+            linear_positions=start + force * ports,
             compliance=self._responses.port_compliance - np.outer(ports, ports) / point,
-            memory=rest.memory,
+            memory=rest_state.memory,
             start=start,
         )
         force += float(ports @ (forces - forces_before) / point)
         # the part of the ports' positions that fades after the release
         residual = self._responses.residual_displacements[:, holding_load]
         memory[:, FADING_POSITION] = force * (self._responses.law_loads.T @ residual)
-        return replace(rest, memory=memory), force
+        return replace(rest_state, memory=memory), force
 
     def advance(
         self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
@@ -341,14 +345,14 @@ class ModalIntegrator:
         assert self._laws is not None
         boundaries = step_boundaries(self._responses.system, self._laws, np.array([0.0, duration]))
         modal_force = self._responses.participation[:, : self._responses.load_count] @ loads
-        held = np.tile(modal_force, (len(boundaries.lengths), 1))
+        held_forces = np.tile(modal_force, (len(boundaries.lengths), 1))
         residual = self._responses.residual_displacements[:, : self._responses.load_count] @ loads
         port_residual = self._responses.law_loads.T @ residual
         steps = loaded_steps(
             self._responses.system,
             boundaries,
-            begin_force=held,
-            end_force=held,
+            begin_force=held_forces,
+            end_force=held_forces,
             residual_position=np.tile(port_residual, (len(boundaries.time), 1)),
         )
         return integrate_motion(
@@ -404,7 +408,7 @@ class ModalIntegrator:
     # ------------------------------------------------------------ change of health
 
     def take_over(self, state: TransientState, previous: "ModalIntegrator") -> TransientState:
-        """Return a state of another integrator in the modes of this one, after a change of health.
+        """Return the state of another integrator in the modes of this one, if health changes.
 
         Displacement and velocity of the structure stay what they were; they are projected on the
         new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
@@ -436,6 +440,6 @@ class ModalIntegrator:
         return TransientState(projection @ displacement, projection @ velocity, load, memory)
 
 
-def _has_same_laws(laws: "PortLaws", others: "PortLaws | None") -> bool:
+def _has_same_laws(laws: "PortLaws", other_laws: "PortLaws | None") -> bool:
     """Return whether two structures have the same laws at the same ports."""
-    return others is not None and laws.has_same_laws(others)
+    return other_laws is not None and laws.has_same_laws(other_laws)

@@ -31,6 +31,8 @@ LEAST_GAUGE_LENGTH = 1e-3
 """Length over which a gauge without a length averages [m]."""
 NO_PATCH = ModelPatch()
 
+_ARM_ROOT = 0.97
+"""Where an arm beyond the tip is attached: its direction follows from here to the tip [span]."""
 _STRAIN = re.compile(r"strain\[(?P<gauge>\d+)\](?P<component>\.transverse|\.shear)?")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
@@ -92,8 +94,9 @@ class WingRows:
     def _station_weights(self, y: float) -> FloatArray:
         """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
 
-        Within a cell of the mesh, a value is interpolated by the parabola through both ends and the
-        middle. Beyond the tip it is extrapolated linearly, as on a rigid arm.
+        The stations are the ends and the middles of the cells along the span. Within a cell, a
+        value is interpolated by the parabola through both ends and the middle. Beyond the tip, up
+        to `OVERHANG` of the span, it is extrapolated linearly, as on a rigid arm.
 
         Raises
         ------
@@ -106,7 +109,8 @@ class WingRows:
                 f"A place must lie on the wing, 0 to {self.span:g} m from the root, but is {y:g} m."
             )
         if y > self.span:
-            inboard = 0.97 * self.span
+            # The arm continues the straight line through the tip and a point close to it.
+            inboard = _ARM_ROOT * self.span
             arm = (y - inboard) / (self.span - inboard)
             at_tip = self._station_weights(self.span)
             return np.asarray(arm * at_tip + (1.0 - arm) * self._station_weights(inboard))
@@ -114,11 +118,13 @@ class WingRows:
         cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), last_cell)
         begin = stations[2 * cell]
         end = stations[2 * cell + 2]
+        # Shape functions: each is one at begin, middle or end of the cell, and zero at the others
         t = (y - begin) / (end - begin)
-        parabola = np.array((1.0 - t, 4.0 * t * (1.0 - t), t))
-        parabola[::2] *= (1.0 - 2.0 * t, 2.0 * t - 1.0)
+        at_begin = (1.0 - t) * (1.0 - 2.0 * t)
+        at_middle = 4.0 * t * (1.0 - t)
+        at_end = t * (2.0 * t - 1.0)
         weights = np.zeros(len(stations))
-        weights[2 * cell : 2 * cell + 3] = parabola
+        weights[2 * cell : 2 * cell + 3] = (at_begin, at_middle, at_end)
         return weights
 
     @property
@@ -225,8 +231,8 @@ class WingRows:
             If the exponent of a washout is negative, or a point mass lies off the wing.
         """
         arrays = self.arrays
-        linear = arrays.load_lift.copy()
-        quadratic = np.zeros(self.size)
+        linear_loads = arrays.load_lift.copy()
+        quadratic_loads = np.zeros(self.size)
         for primitive in patch:
             if isinstance(primitive, Washout):
                 if primitive.exponent < 0.0:
@@ -235,13 +241,15 @@ class WingRows:
                         f"{primitive.exponent:g}."
                     )
                 eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0)
-                quadratic -= primitive.coefficient * (eta**primitive.exponent @ arrays.lift_rows)
+                quadratic_loads -= primitive.coefficient * (
+                    eta**primitive.exponent @ arrays.lift_rows
+                )
             elif isinstance(primitive, InertiaRelief):
-                linear += primitive.fraction * arrays.weight
+                linear_loads += primitive.fraction * arrays.weight
             elif isinstance(primitive, PointMass):
                 row = self._station_weights(primitive.station) @ self._upward_rows
-                linear -= STANDARD_GRAVITY * primitive.mass * row
-        return np.stack((linear, quadratic))
+                linear_loads -= STANDARD_GRAVITY * primitive.mass * row
+        return np.stack((linear_loads, quadratic_loads))
 
     @cached_property
     def planform_stations(self) -> PlanformStations:
@@ -271,7 +279,7 @@ class WingRows:
 
     @cached_property
     def static_shape_rows(self) -> FloatArray:
-        """Rows (s, n) of the load point and of `PORTS`; a basis of motion holds their shapes."""
+        """Rows (s, n) of the load point and of `PORTS`: a basis of motion has their shapes."""
         return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
     def output_row(self, name: str) -> FloatArray | None:
@@ -306,13 +314,16 @@ class WingRows:
     def _skin_fraction(self) -> FloatArray:
         """The skin's fraction (G,) of the bending stiffness at each gauge, computed from strains.
 
-        At a given bending moment the strain goes as 1 / stiffness. If a skin of fraction s loses
-        the part d of its stiffness, the ratio of the strains before and after is 1 - s d.
+        At a given bending moment the strain is proportional to 1 / stiffness. If a skin with the
+        fraction s of the bending stiffness loses the fraction d of its own stiffness, the ratio of
+        the strains before and after is 1 - s d.
         """
+        trial_loss = 0.3  # s follows from any loss d; this one is far from rounding
         terms = len(self.arrays.stiffness)
-        all_healthy = np.ones(terms)
-        soft_skin = np.append(np.full(terms - 1, 0.7), 1.0)
-        ratio = self._strain_under_lift(all_healthy) / self._strain_under_lift(soft_skin)
+        healthy = np.ones(terms)
+        # The last term of the stiffness is not that of the skin.
+        soft_skin = np.append(np.full(terms - 1, 1.0 - trial_loss), 1.0)
+        ratio = self._strain_under_lift(healthy) / self._strain_under_lift(soft_skin)
         return np.asarray((1.0 - ratio) / (1.0 - soft_skin[0]))
 
     def _strain_under_lift(self, theta: FloatArray) -> FloatArray:
@@ -324,12 +335,12 @@ class WingRows:
     def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
         """Return factors that correct the strains of gauges for local losses within a strip.
 
-        In the stiffness, a local loss is averaged over its strip between mesh lines; a gauge reads
-        the curvature at its own section. At a given bending moment the strain of a section whose
-        skin keeps the fraction r of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's
-        fraction of the bending stiffness. The factor is the mean of that over the gauge with the
-        losses where they are, over the same with smeared losses. It is one if losses end at
-        edges of strips.
+        The stiffness of the model averages a local loss over a strip between mesh lines, but a
+        gauge reads the curvature at its own section. If the skin of a section has the fraction s of
+        the bending stiffness, and keeps the fraction r of its own, the strain at a given bending
+        moment is proportional to 1 / (1 - s (1 - r)). The factor of a gauge is the mean of this
+        strain over the gauge with the local losses, divided by the mean with averaged losses. It is
+        one if losses end at the edges of strips.
 
         Parameters
         ----------

@@ -196,7 +196,7 @@ def _coordinate_system(block: _Block) -> CoordinateSystem:
 
 
 def _add_nodes(deck: Deck, block: _Block, coordinates: CoordinateSystem) -> None:
-    """Add the nodes of a *NODE, whose coordinates are in the system of the last *SYSTEM."""
+    """Add the nodes of a *NODE; their coordinates are in the system of the last *SYSTEM."""
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
@@ -249,22 +249,22 @@ def _plain_type(name: str, where: str) -> str:
     name : str
         The type in the deck.
     where : str
-        Its file and line.
+        The file and the line that name the type.
     """
-    same = _SAME_STIFFNESS.fullmatch(name)
+    same_stiffness = _SAME_STIFFNESS.fullmatch(name)
     if name in _TYPES_OF_MESHIO:
-        plain = _TYPES_OF_MESHIO[name]
-    elif same:
-        plain = same[1]
+        built_type = _TYPES_OF_MESHIO[name]
+    elif same_stiffness:
+        built_type = same_stiffness[1]
     else:
-        plain = name
-    if plain not in _ELEMENT_TYPES:
+        built_type = name
+    if built_type not in _ELEMENT_TYPES:
         _refuse_type(name, where)
-    return plain
+    return built_type
 
 
 def _refuse_type(name: str, where: str) -> NoReturn:
-    """Refuse a type of elements; of a variant of a known type, the message says how it differs."""
+    """Refuse a type of elements; for a variant of a known type, the message says how it differs."""
     readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
     variant = _VARIANT.fullmatch(name)
     if variant is None or variant[1] not in _ELEMENT_TYPES:

@@ -84,7 +84,7 @@ class AffineStructure:
     Attributes
     ----------
     design : StructureDesign
-        The design.
+        The design, as read from its file.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
     control_units : dict of str to str
@@ -141,7 +141,7 @@ class AffineStructure:
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
-    """Number of the load by which two modes are followed: those that add most to its compliance."""
+    """Number of the load whose compliance chooses the two tracked modes, which add most to it."""
 
     @property
     def unknowns(self) -> int:
@@ -189,13 +189,13 @@ class AffineStructure:
         return affine_sum([*factors.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
-        """Return the value of a load's control at which the load is examined alone.
+        """Return the value of a load's control for an examination of this load alone.
 
         That is the nominal value, or one if the nominal value is zero, at which there is no load.
         It is one for a constant load.
         """
-        nominal = self._nominal_control(load)
-        return 1.0 if nominal == 0.0 else nominal
+        nominal_value = self._nominal_control(load)
+        return 1.0 if nominal_value == 0.0 else nominal_value
 
     def _nominal_control(self, load: str) -> float:
         """Return the nominal value of the control of a load, one for a constant load."""
@@ -232,14 +232,14 @@ class AffineStructure:
         values : mapping of str to float
             Parameters, losses, free masses and controls; the others are nominal, and healthy.
         """
-        chosen = self.split_values(values)
+        values_by_kind = self.split_values(values)
         total_load: FloatArray = np.zeros(self.unknowns)
         for name, control in self.loads.items():
             control_value = None if control is None else values.get(control)
-            total_load = total_load + self.load(name, control_value, chosen.masses)
+            total_load = total_load + self.load(name, control_value, values_by_kind.masses)
         return SystemMatrices(
-            stiffness=self.stiffness(chosen.parameters, chosen.losses),
-            mass=self.mass(chosen.masses),
+            stiffness=self.stiffness(values_by_kind.parameters, values_by_kind.losses),
+            mass=self.mass(values_by_kind.masses),
             load=total_load,
         )
 
@@ -273,13 +273,13 @@ class AffineStructure:
             ),
         )
 
-    def full_displacement(self, free: FloatArray) -> FloatArray:
+    def full_displacement(self, free_unknowns: FloatArray) -> FloatArray:
         """Return the displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
-        return np.asarray(self.expansion @ free).reshape(-1, 3)
+        return np.asarray(self.expansion @ free_unknowns).reshape(-1, 3)
 
 
 def _values_with_changes(
-    nominal: dict[str, float], changed: Values | None, kind: str
+    nominal_values: dict[str, float], changed_values: Values | None, kind: str
 ) -> dict[str | None, float]:
     """Return the values of all parameters or masses, of which some differ from their nominal value.
 
@@ -288,27 +288,27 @@ def _values_with_changes(
 
     Parameters
     ----------
-    nominal : dict of str to float
+    nominal_values : dict of str to float
         The nominal values by name.
-    changed : mapping of str to float, optional
+    changed_values : mapping of str to float, optional
         The values that differ from the nominal ones, by name.
     kind : str
-        What is named in error messages: "parameter" or "free mass".
+        The noun of the values in error messages: "parameter" or "free mass".
 
     Raises
     ------
     InvalidStateError
-        If a name in `changed` is not a name in `nominal`.
+        If a name in `changed_values` is not a name in `nominal_values`.
     """
-    changes = dict(changed or {})
-    unknown_names = set(changes) - set(nominal)
+    changes = dict(changed_values or {})
+    unknown_names = set(changes) - set(nominal_values)
     if unknown_names:
         raise InvalidStateError(
             f"The structure has no {kind} named {min(unknown_names)!r}; there are "
-            f"{comma_list(nominal)}."
+            f"{comma_list(nominal_values)}."
         )
     values: dict[str | None, float] = {None: 1.0}
-    values.update(nominal | changes)
+    values.update(nominal_values | changes)
     return values
 
 
@@ -340,7 +340,7 @@ def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
 
     Returns
     -------
@@ -371,7 +371,7 @@ def static_response(structure: AffineStructure, values: Mapping[str, float]) -> 
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
     values : mapping of str to float
         Parameters, losses, free masses and controls; the others are nominal, and healthy.
 
@@ -421,7 +421,7 @@ def natural_frequencies(
     Parameters
     ----------
     structure : AffineStructure
-        The structure.
+        The affine operators of the structure.
     count : int
         The number of modes.
     values : mapping of str to float, optional

@@ -67,7 +67,7 @@ def affine_fields(
     Parameters
     ----------
     design : StructureDesign
-        The design.
+        The design, as read from its file.
     expansion : csr (full, n)
         Free unknowns to all unknowns.
     mass : csr (full, full)
@@ -121,7 +121,7 @@ def affine_fields(
 
 
 def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
-    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold it."""
+    """Raise `InvalidDesignError` if the supports hold a port, whose row (n,) is then zero."""
     for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
         if not row.any():
             raise InvalidDesignError(
@@ -134,11 +134,11 @@ def _masses_by_name(
     design: StructureDesign, mass: sparse.csr_array, point_masses: Iterable[sparse.csr_array]
 ) -> dict[str | None, sparse.csr_array]:
     """Return the mass with fixed point masses under None, and 1 kg of each free mass by name."""
-    fixed = mass
-    free: dict[str | None, sparse.csr_array] = {}
+    fixed_mass = mass
+    free_masses: dict[str | None, sparse.csr_array] = {}
     for part, matrix in zip(design.mass, point_masses, strict=True):
         if part.free:
-            free[part.name] = matrix
+            free_masses[part.name] = matrix
         else:
-            fixed = fixed + part.mass * matrix
-    return {None: fixed} | free
+            fixed_mass = fixed_mass + part.mass * matrix
+    return {None: fixed_mass} | free_masses

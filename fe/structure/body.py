@@ -26,7 +26,7 @@ class MassAtPoints(NamedTuple):
     Attributes
     ----------
     name : str
-        Its name.
+        The name of the point mass.
     mass : float
         The mass at each point [kg].
     weights : (k, nodes) array
@@ -47,7 +47,7 @@ class Body(Generic[Mesh]):
     mesh : CellMesh
         Nodes and nc cells.
     supports : Supports
-        What is held, sprung and rigid; n unknowns are free.
+        The nodes that are held, sprung and rigid; n unknowns are free.
     elasticity : (nc, 6, 6) array
         Elasticity of the cells in space, nominal and undamaged [Pa].
     density : (nc,) array

@@ -34,15 +34,17 @@ class CoordinateSystem:
 
     def to_space(self, coordinates: ArrayLike) -> FloatArray:
         """Return the points in space (..., 3) of coordinates (..., 3)."""
-        local = np.asarray(coordinates, dtype=np.float64)
+        local_points = np.asarray(coordinates, dtype=np.float64)
         if self.kind == "S":
-            radius, polar_degrees, azimuth_degrees = np.moveaxis(local, -1, 0)
+            radius, polar_degrees, azimuth_degrees = np.moveaxis(local_points, -1, 0)
             polar = np.deg2rad(polar_degrees)
-            local = _from_cylinder(radius * np.sin(polar), azimuth_degrees, radius * np.cos(polar))
+            local_points = _from_cylinder(
+                radius * np.sin(polar), azimuth_degrees, radius * np.cos(polar)
+            )
         elif self.kind == "C":
-            radius, azimuth_degrees, height = np.moveaxis(local, -1, 0)
-            local = _from_cylinder(radius, azimuth_degrees, height)
-        return np.asarray(self.origin + local @ self.axes)
+            radius, azimuth_degrees, height = np.moveaxis(local_points, -1, 0)
+            local_points = _from_cylinder(radius, azimuth_degrees, height)
+        return np.asarray(self.origin + local_points @ self.axes)
 
 
 def _from_cylinder(

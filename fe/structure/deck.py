@@ -36,7 +36,7 @@ class SurfaceRow(NamedTuple):
 
 
 class Face(NamedTuple):
-    """The nodes of a face or a flat element, of which the first so many are corners."""
+    """The nodes of a face or a flat element, the corners first, and the number of corners."""
 
     nodes: list[int]
     corner_count: int
@@ -57,7 +57,7 @@ class Deck:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     words : DeckWords, optional
         The words of the dialect of a deck, in which the case of a name does not count.
 
@@ -99,7 +99,7 @@ class Deck:
         word : str
             A word of the dialect; one that is not known gets a remark.
         where : str
-            Its file and line.
+            The file and the line that name the set.
         """
         assert self.words is not None
         if word in self.words.refused:
@@ -116,7 +116,7 @@ class Deck:
         kind : {"NSET", "ELSET"}
             A set of nodes, or of elements.
         name : str
-            Its name.
+            The name of the set.
         """
         key = name.casefold() if self.words else name
         return self._sets[kind].setdefault(key, _NamedSet(name, [])).members
@@ -138,7 +138,7 @@ class Deck:
         return self.counted(where, members)
 
     def counted(self, where: str, members: Sequence[int]) -> list[int]:
-        """Return members of a set as a list; refuse more of them than any mesh has."""
+        """Return the members of a set as a list; refuse more members than any mesh has."""
         self._members_left -= len(members)
         if self._members_left < 0:
             fail(where, f"the sets hold more than {_MOST_MEMBERS:,} members together.")
@@ -150,9 +150,9 @@ class Deck:
         Parameters
         ----------
         where : str
-            Its file and line.
+            The file and the line of the node.
         number : int
-            Its number; a node that is there twice must be at one point.
+            The number of the node; a node that is there twice must be at one point.
         coordinates : sequence of float
             x, y and z [unit of length of the file].
         """
@@ -166,11 +166,11 @@ class Deck:
         Parameters
         ----------
         where : str
-            Its file and line.
+            The file and the line of the element.
         number : int
-            Its number.
+            The number of the element.
         element_type : str
-            Its type in meshio.
+            The type of the element in meshio.
         nodes : list of int
             The numbers of its nodes.
         """
@@ -215,7 +215,7 @@ class Deck:
         for name, members in self._sets["NSET"].values():
             indices = self._node_indices(members, f"the set {name!r}")
             node_sets[name] = new_index[_sorted_once(indices)]
-        # sets of elements hold cells, or else faces
+        # a set of elements holds cells, or flat elements that stand for faces
         faces_by_name = {}
         for name, rows in self.surfaces.items():
             faces_by_name[name] = list(self._surface_faces(rows, kind, solids))
@@ -300,12 +300,12 @@ class Deck:
             is_known = solid_type in DECK_KINDS
             name = DECK_KINDS[solid_type].name if is_known else solid_type
             found_kinds.append(f"{count} {name}")
-        found = ", ".join(found_kinds) or "none that is solid"
+        found_list = ", ".join(found_kinds) or "none that is solid"
         line_of_last_type = [str(self.path), *self._first_of_solid_type.values()][-1]
         fail(
             line_of_last_type,
             f"a whole mesh of one kind of elements is expected ({known_names}), but the mesh has "
-            f"{found}; mesh it with tetrahedra alone.",
+            f"{found_list}; mesh it with tetrahedra alone.",
         )
 
     def _node_indices(self, numbers: Iterable[int], owner: str) -> list[int]:
@@ -320,7 +320,7 @@ class Deck:
         return {number: index for index, number in enumerate(self.nodes)}
 
     def _flat_faces(self, name: str, members: list[int]) -> list[Face]:
-        """Return the flat elements of a set as faces; refuse those that bear loads.
+        """Return the flat elements of a set as faces; refuse elements that bear loads.
 
         Parameters
         ----------

@@ -46,7 +46,7 @@ class DeckWords(NamedTuple):
     read : dict of str to list of str
         Words that are read, each with the parameters that are read.
     flat : dict of str to str
-        Types of elements in `FLAT`, by which other programs write lines and surfaces.
+        Types of elements in `FLAT` with which other programs write lines and surfaces.
     """
 
     mark: str
@@ -59,14 +59,14 @@ class DeckWords(NamedTuple):
 def words_of(dialect: str) -> DeckWords:
     """Return the words of "abaqus" or "nastran"."""
     table = _WORDS_FILE[dialect]
-    refused = {}
+    remedies = {}
     for group in table["refused"]:
         for word in group["words"]:
-            refused[word] = group["remedy"]
+            remedies[word] = group["remedy"]
     return DeckWords(
         mark=table["mark"],
         harmless=frozenset(table["harmless"]),
-        refused=refused,
+        refused=remedies,
         read=table.get("read", {}),
         flat=table["flat"],
     )
@@ -89,7 +89,7 @@ def lines_of(
     files : tuple of Path
         The files that include one another, the one to be read last.
     comment : pattern
-        Matches comments.
+        The pattern of a comment.
     include : pattern
         Matches a line that includes a file, whose name is its group.
 

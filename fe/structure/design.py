@@ -370,7 +370,7 @@ def structure_hash(
     Parameters
     ----------
     design : StructureDesign
-        The structure.
+        The design of the structure, as read from its file.
     folder : Path
         Folder of its files.
     with_ports : bool

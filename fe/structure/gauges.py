@@ -59,7 +59,7 @@ def gauge_rows(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     gauges : tuple of Gauge
         The gauges.
 
@@ -91,14 +91,14 @@ def gauge_rows(
             local_direction = _projected_direction(direction, surface_point.normal, where)
             # the mean of the points, and of the cells that meet at each of them
             weight = 1.0 / (len(surface_points) * len(surface_point.cell))
-            for cell, local in zip(surface_point.cell, surface_point.local, strict=True):
-                strains.append(_GaugeStrain(number, weight, cell, local, local_direction))
+            for cell, local_position in zip(surface_point.cell, surface_point.local, strict=True):
+                strains.append(_GaugeStrain(number, weight, cell, local_position, local_direction))
         moved.append(middle.distance)
     rows = mesh.strain_rows(
         row=np.array([strain.gauge for strain in strains]),
         weight=np.array([strain.weight for strain in strains]),
         cells=np.array([strain.cell for strain in strains]),
-        local=np.array([strain.local for strain in strains]),
+        local_positions=np.array([strain.local for strain in strains]),
         direction=np.array([strain.direction for strain in strains]),
     )
     return rows, np.array(moved)
@@ -117,13 +117,13 @@ def _averaging_points(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     gauge : Gauge
         The gauge.
     point, direction, normal : (3,) array
-        Its middle [m], and unit vectors along it and normal to the surface.
+        The middle of the gauge [m], and unit vectors along it and normal to the surface.
     where : str
-        Its name in sentences.
+        The name of the gauge in sentences.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     count : int
         The largest number of rosettes; there are fewer if several would lie on one face.
 

@@ -52,11 +52,11 @@ class _Parametrisation(NamedTuple):
     Attributes
     ----------
     cells : (n,) array of int
-        The cells.
+        The numbers of the cells.
     origin : (n, 3) array
         Local positions where the coordinates are zero.
     tangents : (n, t, 3) array
-        Their derivatives by the coordinates.
+        The derivatives of the local positions by the coordinates.
     """
 
     cells: IntArray
@@ -87,14 +87,14 @@ Restriction = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, FloatArray]:
-    """Find a point in the structure, or close to its surface.
+    """Return the cell of a point in the structure or close to its surface, and its local position.
 
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     where : str
         The beginning of the message on a point that lies outside.
 
@@ -110,7 +110,7 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     InvalidDesignError
         If the point lies outside.
     """
-    # cells that may hold the point, by the spheres around them
+    # cells that may hold the point: those whose bounding spheres do
     distance = np.linalg.norm(mesh.centres - point, axis=1)
     cells = np.flatnonzero(distance <= 1.001 * mesh.cell_radius)
     # the nearest local position in each of them: the cell holds the point if nothing remains
@@ -120,12 +120,12 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
         tangents=np.tile(np.eye(3), (len(cells), 1, 1)),
     )
     centres = np.tile(mesh.kind.centre, (len(cells), 1))
-    nearest = _nearest_points(mesh, point, whole_cells, centres, _clip_near_cell)
-    coincides = np.linalg.norm(nearest.residual, axis=1) <= 1e-9 * mesh.size
-    is_inside = mesh.kind.contains(nearest.local, _INSIDE) & coincides
+    nearest_points = _nearest_points(mesh, point, whole_cells, centres, _clip_near_cell)
+    coincides = np.linalg.norm(nearest_points.residual, axis=1) <= 1e-9 * mesh.size
+    is_inside = mesh.kind.contains(nearest_points.local, _INSIDE) & coincides
     if is_inside.any():
         first = int(is_inside.argmax())
-        return int(cells[first]), nearest.local[first]
+        return int(cells[first]), nearest_points.local[first]
     # outside: the nearest point of the surface, if it is near enough
     surface_point = on_surface(mesh, point, where)
     return int(surface_point.cell[0]), surface_point.local[0]
@@ -148,9 +148,9 @@ def _nearest_points(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     parametrisation : _Parametrisation
         The allowed positions in n cells, by t coordinates.
     start : (n, t) array
@@ -163,9 +163,9 @@ def _nearest_points(
     coordinates = start
     largest_change = np.inf
     for step in range(_MOST_STEPS + 1):
-        # positions, residuals and derivatives at the present coordinates
-        local = origin + np.einsum("nt,ntj->nj", coordinates, tangents)
-        values, gradients = mesh.kind.shape_functions(local)
+        # local positions, residuals and derivatives at the present coordinates
+        local_positions = origin + np.einsum("nt,ntj->nj", coordinates, tangents)
+        values, gradients = mesh.kind.shape_functions(local_positions)
         residual = point - np.einsum("na,nai->ni", values, nodes)
         edges = np.einsum("nai,naj,ntj->nti", nodes, gradients, tangents)
         if step == _MOST_STEPS or largest_change < 1e-14:
@@ -179,7 +179,7 @@ def _nearest_points(
         previous = coordinates
         coordinates = restrict(coordinates + change, metric)
         largest_change = float(np.abs(coordinates - previous).max(initial=0.0))
-    return _NearestPoints(local, residual, edges)
+    return _NearestPoints(local_positions, residual, edges)
 
 
 def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoint:
@@ -188,34 +188,34 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     where : str
         Begins the sentence on a point that lies too far off.
 
     Raises
     ------
     InvalidDesignError
-        If the point lies farther off than `FARTHEST`.
+        If the point lies farther from the surface than `FARTHEST` times the size of a face.
     """
     spheres = mesh.face_spheres
     centre_distance = np.linalg.norm(spheres.centre - point, axis=1)
     faces = np.flatnonzero(centre_distance - 1.1 * spheres.radius <= centre_distance.min())
     cells = mesh.boundary.cell[faces]
-    nearest = _nearest_on_faces(mesh, point, cells, mesh.boundary.face[faces])
+    nearest_points = _nearest_on_faces(mesh, point, cells, mesh.boundary.face[faces])
     # the nearest of all faces
-    along_first, along_second = np.moveaxis(nearest.edges, 1, 0)
+    along_first, along_second = np.moveaxis(nearest_points.edges, 1, 0)
     normal = unit_vector(np.cross(along_first, along_second))
-    distance = np.linalg.norm(nearest.residual, axis=1)
+    distance = np.linalg.norm(nearest_points.residual, axis=1)
     best = int(distance.argmin())
     size = float(spheres.radius[faces[best]])
     if distance[best] > FARTHEST * size:
-        side = ", inside" if float(nearest.residual[best] @ normal[best]) < 0.0 else ""
+        side = ", inside" if float(nearest_points.residual[best] @ normal[best]) < 0.0 else ""
         raise InvalidDesignError(
             f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
             f"{mesh.source}{side}; the nearest point of the surface is "
-            f"{mesh.place(point - nearest.residual[best])}."
+            f"{mesh.place(point - nearest_points.residual[best])}."
         )
     # all faces of one smooth surface that meet there
     meets = distance <= distance[best] + _SAME_PLACE * size
@@ -223,7 +223,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     meeting_faces = meets & is_same_side
     return SurfacePoint(
         cell=cells[meeting_faces],
-        local=nearest.local[meeting_faces],
+        local=nearest_points.local[meeting_faces],
         normal=unit_vector(normal[meeting_faces].mean(axis=0)),
         distance=float(distance[best]),
     )
@@ -237,9 +237,9 @@ def _nearest_on_faces(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (3,) array
-        The point [m].
+        The position of the point [m].
     cells, face_numbers : (n,) array of int
         The cell of each face, and its number in the cell.
     """

@@ -47,11 +47,11 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     Parameters
     ----------
     design : MatrixDesign
-        The design.
+        The design, as read from its file.
     folder : Path
         The folder of its files.
     design_hash : str
-        Its hash.
+        The hash of the design and its files.
 
     Raises
     ------
@@ -62,26 +62,28 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     files = MatrixFiles(folder, _places(design, folder), design.unit)
     stiffness = sum(files.matrix(name, "stiffness_matrix") for name in design.stiffness_matrix)
     mass = sum(files.matrix(name, "mass_matrix") for name in design.mass_matrix)
-    free = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
-    if not len(free):
+    free_rows = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
+    if not len(free_rows):
         raise MeshError(
             f"{folder}: the matrices have no row that is free and has stiffness or mass."
         )
-    free_places = [files.places[row] for row in free]
-    _check_structure(stiffness[free][:, free], mass[free][:, free], free_places)
-    fields = _fields(design, files, mass, free)
+    free_places = [files.places[row] for row in free_rows]
+    _check_structure(stiffness[free_rows][:, free_rows], mass[free_rows][:, free_rows], free_places)
+    fields = _fields(design, files, mass, free_rows)
     # The expansion of the model gives displacements of nodes, not the rows of the matrices.
-    fields["expansion"] = _nodal_displacements(files)[:, free]
+    fields["expansion"] = _nodal_displacements(files)[:, free_rows]
     return AffineStructure(
         design=design,
         **fields,
-        stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
+        stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free_rows)),
         design_hash=design_hash,
     )
 
 
 def _places(design: MatrixDesign, folder: Path) -> list[Place]:
-    """Return node and component of each row: of the file of unknowns, or of the stiffness itself.
+    """Return node and component of each row of the stiffness matrices.
+
+    The file of unknowns names them; without such a file, the stiffness matrices do.
 
     Raises
     ------
@@ -103,7 +105,17 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
 
 
 def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -> IntArray:
-    """Return the rows that can move (n,) and are not held by the design."""
+    """Return the numbers of the rows that can move and that no support of the design holds.
+
+    Parameters
+    ----------
+    design : MatrixDesign
+        The design, as read from its file.
+    files : MatrixFiles
+        The matrix files of the design, with R rows.
+    can_move : (R,) array of bool
+        Whether a row has stiffness or mass.
+    """
     is_free = can_move.copy()
     for label, support in design.numbered("support"):
         for node, motion in itertools.product(support.nodes, support.hold):
@@ -113,9 +125,9 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 
 
 def _fields(
-    design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free: IntArray
+    design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free_rows: IntArray
 ) -> AffineFields:
-    """Return the fields of the affine model, whose expansion selects the free rows."""
+    """Return the fields of the affine model; its expansion enters the free rows into all rows."""
     size = len(files.places)
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
     loads = (_load(load, files, label) for label, load in design.numbered("load"))
@@ -129,7 +141,7 @@ def _fields(
 
     return affine_fields(
         design,
-        expansion=sparse.eye_array(size, format="csc")[:, free].tocsr(),
+        expansion=sparse.eye_array(size, format="csc")[:, free_rows].tocsr(),
         mass=mass,
         point_masses=point_masses,
         loads=loads,
@@ -156,7 +168,7 @@ def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_
 
 
 def _load(load: MatrixLoad, files: MatrixFiles, where: str) -> FloatArray:
-    """Return the vector (n,) of a load [N], or of the field of an acceleration [m/s^2]."""
+    """Return the vector (n,) of a load [N], or of an acceleration [m/s^2] at all rows."""
     if load.acceleration is not None:
         return files.uniform_field(load.acceleration, where)
     if load.node is not None and load.force is not None:
@@ -193,34 +205,48 @@ def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:
 
 
 def _stiffness_terms(
-    design: MatrixDesign, files: MatrixFiles, whole: sparse.csr_array, free: IntArray
+    design: MatrixDesign, files: MatrixFiles, whole_stiffness: sparse.csr_array, free_rows: IntArray
 ) -> Iterator[StiffnessTerm]:
-    """Yield the parts of the stiffness (n, n), then the remainder; each is at least semidefinite.
+    """Yield a stiffness term for each part of the design, then one for the rest of the structure.
+
+    Each term is at least positive semidefinite, and the terms add up to the whole stiffness.
+
+    Parameters
+    ----------
+    design : MatrixDesign
+        The design, as read from its file.
+    files : MatrixFiles
+        The matrix files of the design, with R rows.
+    whole_stiffness : sparse (R, R) array
+        The stiffness of the whole structure.
+    free_rows : (n,) array of int
+        The rows that are not held; the terms have these alone.
 
     Raises
     ------
     MeshError
-        If a part has no stiffness or takes some away, or the parts are stiffer than the whole.
+        If the stiffness of a part is zero or indefinite, or if all parts together are stiffer than
+        the whole structure.
     """
-    nominal = {parameter.name: parameter.nominal for parameter in design.parameter}
-    remainder = whole
+    nominal_values = {parameter.name: parameter.nominal for parameter in design.parameter}
+    remainder = whole_stiffness
     for label, part in design.numbered("part"):
-        matrix = _part_matrix(part, files, whole, label)
+        matrix = _part_matrix(part, files, whole_stiffness, label)
         remainder = remainder - matrix
         free_part = _free_part(
-            whole,
+            whole_stiffness,
             matrix,
-            free,
+            free_rows,
             refusal=f"{label} takes stiffness away somewhere; its file is of another run or part.",
         )
         if not free_part.nnz:
             raise MeshError(f"{label} has no stiffness: its matrix changes nothing that is free.")
-        scale = nominal.get(part.scaled_by or "", 1.0)
+        scale = nominal_values.get(part.scaled_by or "", 1.0)
         yield StiffnessTerm(free_part / scale, part.scaled_by, part.damage)
     free_remainder = _free_part(
-        whole,
+        whole_stiffness,
         remainder,
-        free,
+        free_rows,
         refusal="the parts are together stiffer than the whole; two parts must not overlap.",
     )
     if free_remainder.nnz:
@@ -228,37 +254,53 @@ def _stiffness_terms(
 
 
 def _part_matrix(
-    part: StiffnessPart, files: MatrixFiles, whole: sparse.csr_array, where: str
+    part: StiffnessPart, files: MatrixFiles, whole_stiffness: sparse.csr_array, where: str
 ) -> sparse.csr_array:
-    """Return the stiffness (n, n) of a part, its own or from a whole with a changed modulus."""
+    """Return the stiffness (R, R) of a part.
+
+    A part has a matrix of its own, or a matrix of the whole structure in which the modulus of the
+    part is multiplied by a factor.
+    """
     if part.changed is not None and part.times is not None:
-        changed_whole = files.matrix(part.changed, where)
-        return (whole - changed_whole) / (1.0 - part.times)
+        # whole - changed = (1 - factor) * part
+        changed_stiffness = files.matrix(part.changed, where)
+        return (whole_stiffness - changed_stiffness) / (1.0 - part.times)
     return files.matrix(str(part.matrix), where, partial=True)
 
 
 def _free_part(
-    whole: sparse.csr_array, part: sparse.csr_array, free: IntArray, *, refusal: str
+    whole_stiffness: sparse.csr_array, part: sparse.csr_array, free_rows: IntArray, *, refusal: str
 ) -> sparse.csr_array:
-    """Return the free rows of a part without entries that are rounding of the whole.
+    """Return the free rows and columns (n, n) of a part's stiffness.
+
+    Entries that are rounding errors of the whole stiffness are left out.
+
+    Parameters
+    ----------
+    whole_stiffness, part : sparse (R, R) array
+        The stiffness of the whole structure and of the part.
+    free_rows : (n,) array of int
+        The rows that are not held.
+    refusal : str
+        The sentence with which an indefinite part is refused.
 
     Raises
     ------
     MeshError
-        If the part is indefinite; with the sentence of `refusal`.
+        If the part is indefinite.
     """
     entries = part.tocoo()
-    size = np.sqrt(np.abs(whole.diagonal()))
-    is_rounding = np.abs(entries.data) <= _ROUNDING * size[entries.row] * size[entries.col]
+    scale = np.sqrt(np.abs(whole_stiffness.diagonal()))
+    is_rounding = np.abs(entries.data) <= _ROUNDING * scale[entries.row] * scale[entries.col]
     entries.data[is_rounding] = 0.0
-    free_part = entries.tocsr()[free][:, free]
+    free_part = entries.tocsr()[free_rows][:, free_rows]
     free_part.eliminate_zeros()
-    _check_definite(free_part + _INDEFINITE * whole[free][:, free], refusal)
+    _check_definite(free_part + _INDEFINITE * whole_stiffness[free_rows][:, free_rows], refusal)
     return free_part
 
 
 def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:
-    """Raise `MeshError` with a sentence if a matrix is not positive definite."""
+    """Raise `MeshError` with the sentence `refusal` if a matrix is not positive definite."""
     try:
         Factorisation(sparse.csr_array(matrix))
     except SolutionError:
@@ -298,13 +340,23 @@ def _check_structure(
 
 
 def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
-    """Raise `MeshError` if a row (m,) is faulty; it names the first one."""
+    """Raise `MeshError` if any of the m rows is faulty; the message names the first such row.
+
+    Parameters
+    ----------
+    places : list of Place
+        The node and component of each row.
+    is_faulty : (m,) array of bool
+        Whether a row has the fault.
+    fault : str
+        The fault of the row, as the object of "has": "a negative mass".
+    """
     count = int(is_faulty.sum())
     if not count:
         return
     first = place_in_words(places[int(is_faulty.argmax())])
-    further = f" ({count} rows are like it)" if count > 1 else ""
-    raise MeshError(f"{first} has {fault}{further}.")
+    count_text = f" ({count} rows are like it)" if count > 1 else ""
+    raise MeshError(f"{first} has {fault}{count_text}.")
 
 
 def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:

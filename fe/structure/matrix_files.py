@@ -74,7 +74,7 @@ class MatrixFiles:
         place : (int, int)
             Node and component.
         where : str
-            What names them, for sentences.
+            The key of the design that names the node, for sentences.
 
         Raises
         ------
@@ -85,10 +85,10 @@ class MatrixFiles:
             return self.rows[place]
         node, component = place
         components = [str(other) for number, other in sorted(self.rows) if number == node]
-        known = f"its components {', '.join(components)}" if components else "no such node"
+        known_rows = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
             f"{where}: node {node} has no component {component} in the matrices, which have "
-            f"{known}; components that were held or tied when the matrices were written are "
+            f"{known_rows}; components that were held or tied when the matrices were written are "
             "missing: name another node."
         )
 
@@ -135,7 +135,14 @@ class MatrixFiles:
         return np.asarray(np.sum(components, axis=0))
 
     def uniform_field(self, field: Vector, where: str) -> FloatArray:
-        """Return the vector (n,) of the same shift of all nodes.
+        """Return the values (n,) of a vector field, such as an acceleration, equal at all nodes.
+
+        Parameters
+        ----------
+        field : (3,) tuple
+            The components of the field along the axes; rotations are zero.
+        where : str
+            The key that needs the field, for messages.
 
         Raises
         ------
@@ -144,9 +151,9 @@ class MatrixFiles:
         """
         if len(self.rows) < len(self.places):
             raise MeshError(
-                f"{where}: several rows of the matrices carry one name, as those of expanded "
-                "shells and beams do, and rows that turn cannot be told from rows that shift; "
-                "give the load as a vector."
+                f"{where}: several rows of the matrices have the same name, as for shells and "
+                "beams that were expanded to solids, so that rotations cannot be distinguished "
+                "from displacements; give the load as a vector."
             )
         no_rotations = (0.0, 0.0, 0.0)
         values = (*field, *no_rotations)

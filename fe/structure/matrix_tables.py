@@ -204,7 +204,7 @@ def _read(path: Path, array_name: str) -> _FileContent:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     array_name : str
         The array or matrix in it; empty if it has one only.
     """
@@ -279,18 +279,19 @@ def _dmig_table(path: Path, matrix_name: str) -> FloatArray:
                 row = (card.whole(first), max(card.whole(first + 1), 1))
                 (value,) = card.reals(first + 2, 1)
                 matrices[name].entries.append((*row, *column, value))
-    chosen = matrix_name.upper()
-    if not chosen and len(matrices) == 1:
-        (chosen,) = matrices
-    if chosen not in matrices or not matrices[chosen].entries:
+    chosen_name = matrix_name.upper()
+    if not chosen_name and len(matrices) == 1:
+        (chosen_name,) = matrices
+    if chosen_name not in matrices or not matrices[chosen_name].entries:
         fail(
             str(path),
             f"one of its matrices is expected, as FILE:MATRIX; it has {', '.join(matrices)}.",
         )
-    matrix = matrices[chosen]
+    matrix = matrices[chosen_name]
     if matrix.form not in _SQUARE_FORMS:
         fail(
             str(path),
-            f"a square or symmetric matrix is expected, but {chosen} is of form {matrix.form}.",
+            f"a square or symmetric matrix is expected, but {chosen_name} is of form "
+            f"{matrix.form}.",
         )
     return np.array(matrix.entries)

@@ -62,7 +62,7 @@ class StructureMesh(CellMesh):
     unit : float
         Metres in a unit of length of the file.
     unit_name : str
-        Its name.
+        The name of the unit.
     node_numbers : (nn,) array of int
         Numbers of the nodes in the file, or from 1 if it has none.
     cell_numbers : (nc,) array of int
@@ -150,7 +150,7 @@ class StructureMesh(CellMesh):
         return self._members(sets, name, "cells", "cell", where)
 
     def nodes_of(self, name: str, where: str) -> IntArray:
-        """Return the nodes (m,) of a set of nodes or faces; parameters are those of `cells_of`.
+        """Return the nodes (m,) of a set of nodes or of faces; the parameters are as in `cells_of`.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class StructureMesh(CellMesh):
     def _members(
         self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str
     ) -> _Content:
-        """Return the members of a set; raises `MeshError` if there is no such set, or it is empty.
+        """Return the members of a set that a design names.
 
         Parameters
         ----------
@@ -178,9 +178,14 @@ class StructureMesh(CellMesh):
         name : str
             Name of the set.
         kind, member : str
-            What the sets hold, and one member, for sentences.
+            The word for the content of the sets, and that for one member, in sentences.
         where : str
             The key in the design that names the set.
+
+        Raises
+        ------
+        MeshError
+            If there is no such set, or if it is empty.
         """
         members = _set_named(sets, name)
         if members is None:
@@ -211,7 +216,7 @@ class StructureMesh(CellMesh):
         return surface
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
-        """Return the faces of a set of faces, or else those whose corners are all among nodes.
+        """Return the faces of a set, or the surface faces with all corners among some nodes.
 
         Parameters
         ----------
@@ -220,15 +225,15 @@ class StructureMesh(CellMesh):
         nodes : (m,) array of int
             The nodes that are used if there is no set of faces.
         """
-        outer = self.outer_faces
+        outer_faces = self.outer_faces
         face_set = _set_named(self.face_sets, name)
         if face_set is None:
             no_corner = -1  # stands before the corners of a triangle
-            is_inside = np.isin(outer.corners, [no_corner, *nodes]).all(axis=1)
+            is_inside = np.isin(outer_faces.corners, [no_corner, *nodes]).all(axis=1)
         else:
-            faces = (tuple(row[row >= 0].tolist()) for row in outer.corners)
+            faces = (tuple(row[row >= 0].tolist()) for row in outer_faces.corners)
             is_inside = np.array([face in face_set for face in faces])
-        return Surface(outer.cell[is_inside], outer.number[is_inside])
+        return Surface(outer_faces.cell[is_inside], outer_faces.number[is_inside])
 
 
 def _set_named(sets: dict[str, _Content], name: str) -> _Content | None:

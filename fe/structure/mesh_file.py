@@ -61,8 +61,8 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         )
     if not path.stat().st_size:
         raise MeshError(f"The mesh file {path} is empty; write it again.")
-    read = _READERS.get(path.suffix.lower(), read_by_meshio)
-    mesh = read(path).mesh(unit, unit_name)
+    reader = _READERS.get(path.suffix.lower(), read_by_meshio)
+    mesh = reader(path).mesh(unit, unit_name)
     _check_edges(mesh)
     _check_jacobians(mesh)
     _check_connected(mesh)
@@ -140,7 +140,7 @@ def memory_estimate(mesh: StructureMesh) -> float:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     limit : float, optional
         The allowed memory [bytes]; by default what the machine has left.
 
@@ -179,18 +179,19 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     MeshError
         If it would take more.
     """
-    allowed = available_memory() if limit is None else limit
+    allowed_memory = available_memory() if limit is None else limit
     # An upper estimate first, which takes no time; four times as many entries as remain when they
     # are summed.
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]
     matrix_bytes = _MATRIX_COUNT * _ENTRY_BYTES * entries / 4.0
     upper_estimate = _PROGRAM_BYTES + matrix_bytes + _FACTOR_BYTES * mesh.unknowns ** (4.0 / 3.0)
-    if upper_estimate <= allowed:
+    if upper_estimate <= allowed_memory:
         return
-    needed = memory_estimate(mesh)
-    if needed > allowed:
+    needed_memory = memory_estimate(mesh)
+    if needed_memory > allowed_memory:
         origin = "left on this machine" if limit is None else "allowed"
         raise MeshError(
-            f"{mesh.source}: {mesh.unknowns:,} unknowns would take about {needed / GIB:.1f} GiB, "
-            f"but {allowed / GIB:.1f} GiB are {origin}; coarsen the mesh."
+            f"{mesh.source}: {mesh.unknowns:,} unknowns would take about "
+            f"{needed_memory / GIB:.1f} GiB, but {allowed_memory / GIB:.1f} GiB are {origin}; "
+            "coarsen the mesh."
         )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from meshio import Mesh
 
 _MOST_VALUES = 1000
-"""Most values of an array of integers by which it is read as sets."""
+"""Largest number of distinct values for which an array of integers is read as sets."""
 
 _LEFT_OUT = 0
 """Number that no element has: they are counted from one."""
@@ -38,7 +38,7 @@ def read_by_meshio(path: Path) -> Deck:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
 
     Raises
     ------
@@ -107,14 +107,14 @@ def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
 
 
 def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
-    """Return the nodes (E, n) of a block of elements; none for elements of an unknown type.
+    """Return the nodes (E, n) of a block of elements, or no nodes if the type is unknown.
 
     Parameters
     ----------
     block_type : str
         The type of the elements in meshio.
     data : (E, n) array
-        Their nodes as meshio has read them.
+        The nodes of the elements as meshio has read them.
     suffix : str
         The ending of the file: MED has an order of nodes of its own.
     """
@@ -142,7 +142,7 @@ def _add_sets(
     deck : Deck
         The deck that they are added to.
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     kind : {"NSET", "ELSET"}
         Sets of nodes, or of elements.
     numbers : (n,) array
@@ -175,7 +175,7 @@ def _sets_of_values(
     Parameters
     ----------
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     label : str
         The name of the array, such as "gmsh:physical" or "cell_tags".
     arrays : sequence of (n,) array
@@ -213,7 +213,7 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
     Parameters
     ----------
     mesh : meshio.Mesh
-        The mesh.
+        The mesh as meshio read it, in the unit of the file.
     label : str
         The name of the array.
     value : int
@@ -282,19 +282,19 @@ def _check_element_lines(path: Path) -> None:
 
 
 def _mesh_of_meshio(path: Path) -> Mesh:
-    """Return the mesh that meshio reads from a file, or say in one sentence why it does not."""
-    printed = io.StringIO()
+    """Return the mesh that meshio reads from a file; if it fails, say in one sentence why."""
+    printed_text = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program if it fails.
         with (
             contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(printed),
+            contextlib.redirect_stderr(printed_text),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
             return meshio_with_wedges().read(path)
     except SystemExit:
-        reason = printed.getvalue().removeprefix("Error: ")
+        reason = printed_text.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         reason = getattr(error, "strerror", None) or str(error) or "its format is not known"
         # version 4 of Gmsh's format, where some blocks of elements have groups and others do not

@@ -44,9 +44,9 @@ class _Card(NamedTuple):
     word : str
         The word that it begins with.
     where : str
-        Its file and line.
+        The file and the line of the entry.
     fields : list of str
-        Its fields from the second on, with those of its continuations.
+        The fields of the entry from the second on, with those of its continuations.
     """
 
     word: str
@@ -218,17 +218,17 @@ class _Line(NamedTuple):
 
     @property
     def is_continuation(self) -> bool:
-        """Whether it continues another line."""
+        """Whether the line continues another one."""
         return not self.head or self.head[0] in "+*"
 
     @property
     def name(self) -> str:
-        """The marker of the line that it continues; empty where that is the one before."""
+        """The marker of the line that this one continues; empty if that is the line before."""
         return self.head[1:].upper()
 
 
 def cards(path: Path) -> list[_Card]:
-    """Return the entries of the bulk data of a file, each with the fields of its continuations.
+    """Return the entries of a file's bulk data, each with the fields on its continuation lines.
 
     A continuation without a name belongs to the line above it. One with a name belongs to the line
     that ends with this name as its marker, which may stand above or below.
@@ -304,7 +304,7 @@ def _refuse_continuation(line: _Line) -> NoReturn:
 
 
 def _fields(where: str, text: str) -> list[str]:
-    """Return the fields of a line: its word, four or eight fields, the marker of what continues it.
+    """Return the fields of a line: its word, four or eight values, the marker of its continuation.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
     Parameters
     ----------
     mesh : CellMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     surface : Surface
         The faces.
     """
@@ -46,8 +46,8 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
         cells = surface.cell[surface.face == number]
         rule = kind.face_rule(number)
         tangents = frames.tangents[number]
-        local = frames.corner[number] + rule.points @ tangents
-        values, gradients = kind.shape_functions(local)
+        local_positions = frames.corner[number] + rule.points @ tangents
+        values, gradients = kind.shape_functions(local_positions)
         edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], gradients, tangents, optimize=True)
         along_first, along_second = np.moveaxis(edges, 2, 0)
         normals = np.cross(along_first, along_second) * rule.weights[:, None]
@@ -65,11 +65,11 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     load : MeshLoad
         The load.
     where : str
-        Its name in sentences.
+        The name of the load in sentences.
 
     Returns
     -------
@@ -99,11 +99,11 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     port : MeshPort
         The port.
     where : str
-        Its name in sentences.
+        The name of the port in sentences.
 
     Raises
     ------
@@ -136,11 +136,11 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     point : (float, float, float)
         The point, in the unit of length of the mesh.
     where : str
-        What it is of, for sentences.
+        The name of the point's owner in sentences, such as a load.
 
     Raises
     ------
@@ -148,8 +148,8 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
         If the point lies outside.
     """
     position = mesh.unit * np.asarray(point)
-    cell, local = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
-    (values,), _ = mesh.kind.shape_functions(local[None])
+    cell, local_position = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
+    (values,), _ = mesh.kind.shape_functions(local_position[None])
     weights = np.zeros(len(mesh.points))
     weights[mesh.cells[cell]] = values
     return weights

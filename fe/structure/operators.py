@@ -43,9 +43,9 @@ class Structure(AffineStructure):
     Attributes
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     body : Body
-        Its mesh with materials and supports.
+        The mesh of the structure, with materials and supports.
     material_of : (nc,) array of int
         Number of the material of each cell.
     region_of : (nc,) array of int
@@ -72,9 +72,9 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     Parameters
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     file : Path
-        Its file; the design may name the mesh relative to it.
+        The path of the design's file; the design may name the mesh relative to it.
 
     Raises
     ------
@@ -102,11 +102,11 @@ def _part_of_cells(
     Parameters
     ----------
     mesh : StructureMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     labelled : list of (str, Material or Damage)
         The parts, each with its key in the file.
     kind : str
-        What the parts are, for sentences.
+        The noun of the parts in sentences.
 
     Raises
     ------
@@ -116,12 +116,13 @@ def _part_of_cells(
     part_of_cell = np.full(len(mesh.cells), -1, dtype=np.int64)
     for number, (label, part) in enumerate(labelled):
         cells = mesh.cells_of(part.set, label)
-        shared = cells[part_of_cell[cells] >= 0]
-        if len(shared):
-            _, other = labelled[part_of_cell[shared[0]]]
+        shared_cells = cells[part_of_cell[cells] >= 0]
+        if len(shared_cells):
+            _, other_part = labelled[part_of_cell[shared_cells[0]]]
             raise MeshError(
-                f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} "
-                f"elements, such as {mesh.cell(shared[0])}; their sets must not overlap."
+                f"{label}: the {kind}s {part.name!r} and {other_part.name!r} share "
+                f"{len(shared_cells)} elements, such as {mesh.cell(shared_cells[0])}; their sets "
+                "must not overlap."
             )
         part_of_cell[cells] = number
     return part_of_cell
@@ -168,7 +169,7 @@ def load_and_assemble(
     Parameters
     ----------
     file : Path or str
-        The structure file.
+        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
     mass_as_stiffness : bool
@@ -220,11 +221,11 @@ def load_and_assemble(
 
 def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
     """Raise `MeshError` if a cell has no material."""
-    bare = np.flatnonzero(material_of < 0)
-    if len(bare):
+    cells_without_material = np.flatnonzero(material_of < 0)
+    if len(cells_without_material):
         raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among "
-            f"them {mesh.cell(bare[0])}."
+            f"{mesh.source}: {len(cells_without_material)} of {len(mesh.cells)} elements have no "
+            f"material, among them {mesh.cell(cells_without_material[0])}."
         )
 
 
@@ -261,7 +262,7 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
     Parameters
     ----------
     file : Path or str
-        The structure file.
+        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
 
@@ -319,7 +320,7 @@ def write_structure_vtu(
     path : Path or str
         The file to write.
     structure : Structure
-        The structure.
+        The mesh, matrices and loads of the structure.
     values : mapping of str to float, optional
         Parameters, losses, free masses and controls by name; the others are nominal, and healthy.
 
@@ -331,10 +332,10 @@ def write_structure_vtu(
         If the file cannot be written.
     """
     mesh = structure.mesh
-    chosen = dict(values or {})
-    response = static_response(structure, chosen)
+    chosen_values = dict(values or {})
+    response = static_response(structure, chosen_values)
     displacement = structure.full_displacement(response.displacement)
-    losses = [chosen.get(name, 0.0) for name in structure.regions]
+    losses = [chosen_values.get(name, 0.0) for name in structure.regions]
     losses.append(0.0)  # of no region, whose number is -1
     write_vtu(
         path,
@@ -366,7 +367,7 @@ def write_vtu(
     Parameters
     ----------
     path : Path or str
-        The file.
+        The path of the file.
     points : (nn, 3) array
         Positions of the nodes [m].
     cells : (str, (nc, k) array of int)

@@ -1,4 +1,4 @@
-"""Supports of a mesh: what is held, sprung and rigid, and whether the structure is free to move."""
+"""Supports of a mesh: held, sprung and rigid nodes, and whether the structure is free to move."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -63,22 +63,22 @@ class Supports(NamedTuple):
 
 
 def supports(
-    points: FloatArray, held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
+    points: FloatArray, is_held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
 ) -> Supports:
-    """Return the free unknowns of nodes, of which some are held, sprung or rigid.
+    """Return the free unknowns of a structure, some of whose nodes are held, sprung or rigid.
 
     Parameters
     ----------
     points : (nodes, 3) array
         Positions of the nodes [m].
-    held : (nodes, 3) array of bool
+    is_held : (nodes, 3) array of bool
         Whether each displacement is held.
     springs : (nodes, 3) array
         Springs to the ground of nodes that belong to no rigid set [N/m].
     bodies : iterable of RigidSet
-        The rigid sets.
+        The sets of nodes that move as rigid bodies.
     """
-    is_free = ~held
+    is_free = ~is_held
     body_expansions = []
     body_springs = []
     for body in bodies:
@@ -129,9 +129,9 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
     Parameters
     ----------
     design : MeshDesign
-        The design.
+        The design, as read from its file.
     mesh : StructureMesh
-        Its mesh.
+        The mesh of the structure, with its nodes in metres.
 
     Raises
     ------
@@ -163,12 +163,12 @@ def _check_no_shared_nodes(
     """Raise `MeshError` if a node of a rigid set, by its label, belongs to another support, too."""
     is_supported = np.any(nodal.resists, axis=1)
     for label, body in bodies.items():
-        shared = body.nodes[is_supported[body.nodes]]
-        if len(shared):
-            place = mesh.place(mesh.points[shared[0]])
+        shared_nodes = body.nodes[is_supported[body.nodes]]
+        if len(shared_nodes):
+            place = mesh.place(mesh.points[shared_nodes[0]])
             raise MeshError(
-                f"{label}: {len(shared)} nodes of the rigid set belong to another support, too, "
-                f"such as that at {place}; say what holds it in its own table."
+                f"{label}: {len(shared_nodes)} nodes of the rigid set belong to another support, "
+                f"too, such as that at {place}; say what holds it in its own table."
             )
         is_supported[body.nodes] = True
 
@@ -236,11 +236,12 @@ def _check_rigid_motions(
     # all six directions.
     rows = np.vstack((*resisted, np.zeros((6, 6))))
     _, values, directions = np.linalg.svd(rows, full_matrices=False)
-    free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
-    if len(free):
+    free_motions = directions[values <= _FREE * max(float(values[0]), 1e-300)]
+    if len(free_motions):
         raise MeshError(
-            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among "
-            f"them {_motion_in_words(free[0], mesh, centre)}; hold further directions."
+            f"{mesh.source}: the supports leave {len(free_motions)} of the six rigid motions free, "
+            f"among them {_motion_in_words(free_motions[0], mesh, centre)}; hold further "
+            "directions."
         )
 
 

@@ -70,8 +70,8 @@ class AlternativeKeys(DesignSection):
         for way in self.alternatives:
             keys_present.update(key for key in way if getattr(self, key) is not None)
         is_one_way = any(keys_present == set(way) for way in self.alternatives)
-        expected = ", or ".join(" and ".join(way) for way in self.alternatives)
-        yield not is_one_way, f"either {expected} is expected"
+        expected_keys = ", or ".join(" and ".join(way) for way in self.alternatives)
+        yield not is_one_way, f"either {expected_keys} is expected"
 
 
 class Ranged(Named):
@@ -139,8 +139,7 @@ class LoadControl(Ranged):
         yield from super().faults()
         yield (
             not any(self.range),
-            "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it "
-            "takes",
+            "with its nominal value 0 it would always be 0; give its `minimum` and `maximum`",
         )
 
 
@@ -293,7 +292,7 @@ class StructureDesign(DesignSection):
     def wrong_ties(
         self, table: str, key: str, named_table: str, *, tied: str, untied: str
     ) -> Iterator[Fault]:
-        """Yield faults of ties to names that another table lacks, and of names without a tie.
+        """Yield the faults of ties: names that the other table lacks, and names without a tie.
 
         Parameters
         ----------

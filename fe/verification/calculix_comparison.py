@@ -65,7 +65,7 @@ class _PrintedResults(NamedTuple):
 
 
 def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
-    """Solve each load of a model alone, and its lowest modes, by both codes.
+    """Solve each load of a model alone, and its lowest modes, by our code and by CalculiX.
 
     Parameters
     ----------
@@ -73,21 +73,21 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
         The model in one state. A structure is to be assembled with `mass_as_stiffness`, so that
         frequencies can be compared.
     folder : Path
-        Where CalculiX works.
+        The folder in which CalculiX writes its files.
     modes : int
-        Number of modes.
+        The number of lowest modes to compare.
 
     Raises
     ------
     CalculixError
         If CalculiX is not installed or fails.
     """
-    printed = _static_results(deck, folder)
+    printed_results = _static_results(deck, folder)
     our_frequencies, _ = natural_frequencies(deck.structure, modes, deck.values)
     their_frequencies = _calculix_frequencies(deck, folder, modes)
     factors = Factorisation(deck.structure.system_at(deck.values).stiffness)
     differences = {}
-    for (name, step), results in zip(deck.loads.items(), printed, strict=True):
+    for (name, step), results in zip(deck.loads.items(), printed_results, strict=True):
         differences[name] = _differences(deck, factors.solve(step.load), results)
     return Agreement(differences, our_frequencies, their_frequencies)
 
@@ -98,7 +98,13 @@ def _prints_strains(deck: CalculixDeck) -> bool:
 
 
 def _static_results(deck: CalculixDeck, folder: Path) -> list[_PrintedResults]:
-    """Return the results that CalculiX prints for each load; raises `CalculixError` if it fails."""
+    """Run CalculiX for each load alone, and return the results that it prints.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX fails, or prints results for another number of loads.
+    """
     if not deck.loads:
         return []
     prints = ["*NODE PRINT, NSET=NALL", "U"]
@@ -113,13 +119,17 @@ def _static_results(deck: CalculixDeck, folder: Path) -> list[_PrintedResults]:
         raise CalculixError(
             f"CalculiX printed {count} static solutions instead of {len(deck.loads)}."
         )
-    none = np.empty((0, 0))
     results = []
     for number in range(count):
-        # rows begin with the node, or with the element and the point
+        # A row of nodal results begins with the number of the node.
         displacements = tables["NALL"][number][:, 1:]
-        probes = tables["NPROBES"][number][:, 1:].ravel() if len(deck.probes) else none.ravel()
-        strains = tables["EALL"][number][:, 2:] if _prints_strains(deck) else none
+        probes = np.empty(0)
+        if len(deck.probes):
+            probes = tables["NPROBES"][number][:, 1:].ravel()
+        # A row of strains begins with the numbers of the element and of its integration point.
+        strains = np.empty((0, 0))
+        if _prints_strains(deck):
+            strains = tables["EALL"][number][:, 2:]
         results.append(_PrintedResults(displacements, probes, strains))
     return results
 
@@ -134,7 +144,7 @@ def _calculix_frequencies(deck: CalculixDeck, folder: Path, modes: int) -> Float
 
 
 def _differences(
-    deck: CalculixDeck, displacement: FloatArray, printed: _PrintedResults
+    deck: CalculixDeck, displacement: FloatArray, printed_results: _PrintedResults
 ) -> dict[str, float]:
     """Return the relative differences between our solution and that of CalculiX for one load.
 
@@ -143,9 +153,9 @@ def _differences(
     deck : CalculixDeck
         The model of n unknowns that both solved.
     displacement : (n,) array
-        Our solution.
-    printed : _PrintedResults
-        What CalculiX printed.
+        Our solution for the free unknowns [m].
+    printed_results : _PrintedResults
+        The results of CalculiX for the same load.
 
     Returns
     -------
@@ -154,7 +164,9 @@ def _differences(
     """
     our_probes = deck.probes @ displacement
     our_nodes = deck.structure.full_displacement(displacement)
-    differences = {"nodal displacements": _relative_difference(printed.displacements, our_nodes)}
+    differences = {
+        "nodal displacements": _relative_difference(printed_results.displacements, our_nodes)
+    }
     gauge_count = len(deck.structure.gauges)
     probes_by_quantity = {
         "gauge strains": slice(0, gauge_count),
@@ -162,11 +174,13 @@ def _differences(
     }
     for quantity, probe_rows in probes_by_quantity.items():
         if len(our_probes[probe_rows]):
-            difference = _relative_difference(printed.probes[probe_rows], our_probes[probe_rows])
+            difference = _relative_difference(
+                printed_results.probes[probe_rows], our_probes[probe_rows]
+            )
             differences[quantity] = difference
     if _prints_strains(deck):
         our_strains = deck.body.mesh.strains(our_nodes, INTEGRATION_POINTS).reshape(-1, 6)
         our_strains[:, 3:] *= 0.5  # engineering to tensor shear strains, as CalculiX prints them
-        difference = _relative_difference(printed.strains, our_strains[:, CALCULIX_STRAINS])
+        difference = _relative_difference(printed_results.strains, our_strains[:, CALCULIX_STRAINS])
         differences["strains at integration points"] = difference
     return differences

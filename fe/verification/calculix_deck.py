@@ -67,11 +67,11 @@ class Step(NamedTuple):
     load : (n,) array
         The load [N], which replaces that of the step before; empty if that stays.
     lines : iterable of str
-        Loads that CalculiX applies itself, and what is printed.
+        Loads that CalculiX applies itself, and the printed results.
     nodal : bool
         Whether the load is given as nodal forces, and not by lines.
     procedure : tuple of str
-        Lines that say what is solved.
+        Lines that say which problem is solved.
     """
 
     load: FloatArray = np.empty(0)
@@ -149,7 +149,7 @@ class CalculixDeck:
     body : Body
         Its mesh with materials and supports; the n free unknowns are in the order of its supports.
     values : mapping of str to float
-        Its state by name; the other values are nominal, and healthy.
+        The state of the structure by name; all other values are nominal, and healthy.
     loads : mapping of str to Step
         Static steps of its loads, each alone.
     grading : Grading, optional
@@ -169,13 +169,13 @@ class CalculixDeck:
     @property
     def _materials(self) -> Iterator[Material]:
         """The materials of the deck in this state: equal cells share one."""
-        chosen = self.structure.split_values(self.values)
-        theta = self.structure.theta(chosen.parameters, chosen.losses)
+        values_by_kind = self.structure.split_values(self.values)
+        theta = self.structure.theta(values_by_kind.parameters, values_by_kind.losses)
         constants = self.body.elasticity[:, _ANISOTROPIC_ROWS, _ANISOTROPIC_COLUMNS]
-        scaled = theta[self.body.part][:, None] * constants
-        no_cells = np.zeros(len(scaled))
+        scaled_constants = theta[self.body.part][:, None] * constants
+        no_cells = np.zeros(len(scaled_constants))
         graded = no_cells if self.grading is None else self.grading.cells
-        properties = np.column_stack((scaled, self.body.density, graded))
+        properties = np.column_stack((scaled_constants, self.body.density, graded))
         rows, material_of_cell = np.unique(properties, axis=0, return_inverse=True)
         for number, (*material_constants, density, is_graded) in enumerate(rows):
             course = [(0.0, 1.0)]
@@ -266,9 +266,9 @@ class CalculixDeck:
         """Yield the equations of displacements that follow the motions of a rigid set."""
         supports = self.body.supports
         moving = np.flatnonzero(np.diff(supports.expansion.indptr))
-        for unknown in np.setdiff1d(moving, supports.free_displacements).tolist():
-            (row,) = supports.expansion[[unknown]].toarray()
-            node, direction = _node_and_direction(unknown)
+        for displacement_number in np.setdiff1d(moving, supports.free_displacements).tolist():
+            (row,) = supports.expansion[[displacement_number]].toarray()
+            node, direction = _node_and_direction(displacement_number)
             yield [Term(node, direction, -1.0), *self.terms(row)]
 
     @cached_property
@@ -277,13 +277,13 @@ class CalculixDeck:
         first_motion = self.body.mesh.unknowns
         motions = range(first_motion, first_motion + self._motion_count)
         unknowns = (*self.body.supports.free_displacements.tolist(), *motions)
-        return [_node_and_direction(unknown) for unknown in unknowns]
+        return [_node_and_direction(unknown_number) for unknown_number in unknowns]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield a term for each nonzero entry of a row (n,) on the free unknowns."""
-        for unknown in np.flatnonzero(values).tolist():
-            node, direction = self.places[unknown]
-            yield Term(node, direction, float(values[unknown]))
+        for unknown_number in np.flatnonzero(values).tolist():
+            node, direction = self.places[unknown_number]
+            yield Term(node, direction, float(values[unknown_number]))
 
 
 def _template() -> Template:
@@ -299,7 +299,7 @@ def _template() -> Template:
 
 
 def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
-    """Yield the equations by which the corners of a block move with the point of its mass."""
+    """Yield the equations that make the corners of a block move with the point of its mass."""
     nodes = np.flatnonzero(block.weights).tolist()
     for corner, direction in itertools.product(block.corners, (1, 2, 3)):
         weighted = [Term(node + 1, direction, float(block.weights[node])) for node in nodes]
@@ -311,9 +311,9 @@ def _groups_of_three(count: int) -> int:
     return -(-count // 3)
 
 
-def _node_and_direction(unknown: int) -> tuple[int, int]:
+def _node_and_direction(unknown_number: int) -> tuple[int, int]:
     """Return node and direction, both from 1, of an unknown."""
-    return unknown // 3 + 1, unknown % 3 + 1
+    return unknown_number // 3 + 1, unknown_number % 3 + 1
 
 
 def number_line(values: ArrayLike) -> str:
@@ -327,7 +327,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
     Parameters
     ----------
     structure : Structure
-        The structure.
+        The mesh, matrices and loads of the structure.
 
     Raises
     ------
@@ -367,9 +367,9 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     state : DigitalState
-        Its state.
+        The state of the wing.
     """
     mesh = operators.wing_mesh
     design = mesh.design

@@ -101,7 +101,7 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
     Parameters
     ----------
     text : str
-        The input.
+        The content of the input file.
     folder : Path
         Where input, results and messages (`NAME.log`) are written; it is made if it is missing.
     name : str

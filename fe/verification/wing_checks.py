@@ -73,7 +73,7 @@ class Balance(NamedTuple):
     value, expected : float
         The sums.
     unit : str
-        Their unit.
+        The unit of both sums.
     """
 
     value: float
@@ -87,7 +87,7 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     load_factor : float
         The load factor of the turn.
 
@@ -153,7 +153,7 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     refinements : sequence of float
         The refinements of the meshes.
 
@@ -206,6 +206,7 @@ def observed_order(ratio: float, values: Sequence[float]) -> float:
     if earlier_change * last_change <= 0.0:
         return math.nan
     order = math.log(earlier_change / last_change) / math.log(ratio)
+    # Any other order is an accident of rounding or of meshes too coarse to converge.
     return order if 0.05 < order < 12.0 else math.nan
 
 
@@ -216,7 +217,7 @@ class Check:
     Attributes
     ----------
     group, name : str
-        What is checked.
+        The group of the check, and the quantity that is checked.
     value : float
         The figure.
     limit : float, optional
@@ -238,14 +239,14 @@ class Check:
 
 
 def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[Check]:
-    """Return every check of a design; those against CalculiX if it is installed.
+    """Return all checks of a design, with those against CalculiX if CalculiX is installed.
 
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     jobs : Path
-        Where CalculiX works.
+        The folder in which CalculiX writes its files.
     quick : bool
         Use coarser meshes.
     """
@@ -269,7 +270,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
 
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
-    """Yield checks of the forces, masses and energies of the wing, at the load factor of its lift.
+    """Yield the checks of the wing's forces, masses and energies, at the load factor of its lift.
 
     First, rigid motions must cause no elastic force. The figure is the largest entry of K r,
     for all rigid motions r that the root allows and without the springs of the root, relative to
@@ -279,7 +280,7 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()
@@ -311,7 +312,7 @@ def convergence_checks(
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
     limited : bool
@@ -351,9 +352,9 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     jobs : Path
-        Where CalculiX works.
+        The folder in which CalculiX writes its files.
     """
     damaged = tuple(
         DAMAGED_LOSSES[number % len(DAMAGED_LOSSES)] for number in range(len(operators.regions))

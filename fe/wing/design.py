@@ -28,7 +28,7 @@ _NAMES = Path(__file__).with_name("names.toml")
 
 
 def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
-    """Return the structure design of a wing: names and ranges of its inputs, names of its outputs.
+    """Return the names and ranges of a wing's inputs, and the names of its outputs, as a design.
 
     Parameters
     ----------
@@ -261,11 +261,13 @@ def _region_faults(design: WingDesign) -> Iterator[Fault]:
         )
 
 
-def _overlap(defect: parts.Defect, other: parts.Defect) -> bool:
+def _overlap(defect: parts.Defect, other_defect: parts.Defect) -> bool:
     """Return whether two damage regions overlap, along the span and along the chord."""
-    along_span = min(defect.span_end, other.span_end) > max(defect.span_start, other.span_start)
-    along_chord = min(defect.chord_end, other.chord_end) > max(
-        defect.chord_start, other.chord_start
+    along_span = min(defect.span_end, other_defect.span_end) > max(
+        defect.span_start, other_defect.span_start
+    )
+    along_chord = min(defect.chord_end, other_defect.chord_end) > max(
+        defect.chord_start, other_defect.chord_start
     )
     return along_span and along_chord
 
@@ -327,7 +329,7 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
     content : dict
         The content of the file.
     source : str
-        Its name in sentences.
+        The name of the design in sentences.
 
     Raises
     ------
@@ -346,7 +348,7 @@ def load_design(path: Path | str | None = None) -> WingDesign:
     Parameters
     ----------
     path : Path or str, optional
-        The file.
+        The path of the file.
 
     Raises
     ------

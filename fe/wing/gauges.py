@@ -67,7 +67,7 @@ class _SkinPoint(NamedTuple):
     cell : int
         The cell of the point.
     local : (3,) array
-        Its local position in the cell.
+        The local position of the point in the cell.
     """
 
     gauge: int
@@ -86,7 +86,7 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
     Parameters
     ----------
     mesh : WingMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     angle : float
         Direction of the gauges in the plane of the skin: the angle [rad] from the spanwise
         direction, positive towards the trailing edge.
@@ -100,16 +100,16 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
     for gauge in range(len(mesh.design.gauges.positions)):
         points += _gauge_points(mesh, gauge)
     cells = np.array([point.cell for point in points])
-    local = np.array([point.local for point in points])
+    local_positions = np.array([point.local for point in points])
     weights = np.array([point.weight for point in points])
     if mesh.design.gauges.surface == "middle":
-        local[:, -1] = 0.5
-    along, aft = _directions_in_skin(mesh, cells, local)
+        local_positions[:, -1] = 0.5
+    along, aft = _directions_in_skin(mesh, cells, local_positions)
     return mesh.strain_rows(
         row=np.array([point.gauge for point in points]),
         weight=-weights,  # positive in compression
         cells=cells,
-        local=local,
+        local_positions=local_positions,
         direction=np.cos(angle) * along + np.sin(angle) * aft,
     )
 
@@ -137,32 +137,32 @@ def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
         )
         positions = zip(chord_points.positions, chord_points.weights, strict=True)
         for distance_aft, chord_weight in positions:
-            cell, local = mesh.skin_point(station, distance_aft)
+            cell, local_position = mesh.skin_point(station, distance_aft)
             weight = station_weight * chord_weight
-            points.append(_SkinPoint(gauge, weight, cell, local))
+            points.append(_SkinPoint(gauge, weight, cell, local_position))
     return points
 
 
 def _directions_in_skin(
-    mesh: WingMesh, cells: IntArray, local: FloatArray
+    mesh: WingMesh, cells: IntArray, local_positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return unit directions in the skin, along the span and aft.
 
     Parameters
     ----------
     mesh : WingMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     cells : (p,) array of int
         Cells.
-    local : (p, 3) array
-        One local position in each of them.
+    local_positions : (p, 3) array
+        A local position in each of the cells.
 
     Returns
     -------
     along, aft : (p, 3) arrays
         The directions.
     """
-    along_chord, along_span, _ = np.moveaxis(mesh.jacobians_at(cells, local), 2, 0)
+    along_chord, along_span, _ = np.moveaxis(mesh.jacobians_at(cells, local_positions), 2, 0)
     normal = unit_vector(np.cross(along_chord, along_span))
     _, span_component, _ = np.split(normal, 3, axis=1)
     span_direction = np.array([0.0, 1.0, 0.0])

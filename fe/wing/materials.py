@@ -20,19 +20,19 @@ _SPANWISE = 1  # of the local axes, and of the strains in them
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
     """Return the elasticity (nc, 6, 6) [Pa] in space of every cell, at e = 1, without damage."""
-    local = np.empty((len(mesh.cells), 6, 6))
-    _set_skin_elasticity(mesh, local)
+    elasticities = np.empty((len(mesh.cells), 6, 6))
+    _set_skin_elasticity(mesh, elasticities)
     for index, web in enumerate(mesh.design.webs):
         compliance = orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
-        local[mesh.web == index] = np.linalg.inv(compliance)
+        elasticities[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(mesh.design.ribs):
         compliance = isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        local[mesh.rib == index] = np.linalg.inv(compliance)
-    _add_rod_stiffness(mesh, local)
-    return rotate_elasticity(local, cell_axes(mesh))
+        elasticities[mesh.rib == index] = np.linalg.inv(compliance)
+    _add_rod_stiffness(mesh, elasticities)
+    return rotate_elasticity(elasticities, cell_axes(mesh))
 
 
-def _set_skin_elasticity(mesh: WingMesh, local: FloatArray) -> None:
+def _set_skin_elasticity(mesh: WingMesh, elasticities: FloatArray) -> None:
     """Set the elasticity of the skin and of the leading-edge wall in local axes (nc, 6, 6) [Pa].
 
     The local axes are chordwise (1), spanwise (2) and across (3). The wall stands upright: its
@@ -54,10 +54,10 @@ def _set_skin_elasticity(mesh: WingMesh, local: FloatArray) -> None:
     unit_elasticities = np.where(
         is_wall[:, np.newaxis, np.newaxis], wall_unit_elasticity, skin_unit_elasticity
     )
-    local[is_skin] = unit_elasticities * modulus[:, np.newaxis, np.newaxis]
+    elasticities[is_skin] = unit_elasticities * modulus[:, np.newaxis, np.newaxis]
 
 
-def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
+def _add_rod_stiffness(mesh: WingMesh, elasticities: FloatArray) -> None:
     """Add the flapwise bending stiffness of rods to their webs, in local axes (nc, 6, 6) [Pa]."""
     for rod in mesh.design.rods:
         has_rod = _cells_with_rod(mesh, rod)
@@ -65,7 +65,7 @@ def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
         thickness = mesh.design.webs[rod.web].thickness
         # an additional spanwise modulus E with E I = the rod's bending stiffness, I that of the web
         second_moment = thickness * height**3 / 12.0
-        local[has_rod, _SPANWISE, _SPANWISE] += rod.bending_stiffness / second_moment
+        elasticities[has_rod, _SPANWISE, _SPANWISE] += rod.bending_stiffness / second_moment
 
 
 def _cells_with_rod(mesh: WingMesh, rod: Rod) -> BoolArray:

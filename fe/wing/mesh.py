@@ -149,7 +149,7 @@ class WingMesh(CellMesh):
 
 
 def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
-    """Return the interval of lines that contains a position, and the local coordinate in it."""
+    """Return the interval between mesh lines that contains a position, and the position in it."""
     last_interval = len(lines) - 2
     line = np.searchsorted(lines, position, side="right") - 1
     interval = int(np.clip(line, 0, last_interval))
@@ -222,7 +222,7 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
 
 
 def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return moments of the gap between the airfoil and straight edges through its mesh points.
+    """Return moments of the gap between the airfoil and the straight edges of its mesh.
 
     For each mesh line, the gap times the linear shape function (hat) of the line is integrated over
     the chord, by Gauss-Legendre quadrature in each cell.
@@ -266,7 +266,7 @@ def _grid_points(
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
     across : (ny + 1,) array
         Mesh lines across the span [m].
     along : tuple of MeshLine
@@ -283,14 +283,14 @@ def _grid_points(
     thickness_ratio = design.airfoil.thickness_ratio
     chord = planform.chord(across / planform.semi_span)
     behind = np.array([line.at(chord) for line in along])
-    outer = straight_edged(behind, chord, thickness_ratio)
+    outer_surface = straight_edged(behind, chord, thickness_ratio)
     # The skin's thickness is measured normal to it, and the grid line is vertical: a slope makes
     # the vertical thickness larger by sqrt(1 + slope^2).
     slope = four_digit_slope(behind / chord, thickness_ratio)
-    inner = outer - design.skin.thickness * np.sqrt(1.0 + slope**2)
+    inner_surface = outer_surface - design.skin.thickness * np.sqrt(1.0 + slope**2)
     levels = np.linspace(-1.0, 1.0, height_cells + 1)
-    upper_surface = outer[..., np.newaxis]
-    inner_levels = inner[..., np.newaxis] * levels
+    upper_surface = outer_surface[..., np.newaxis]
+    inner_levels = inner_surface[..., np.newaxis] * levels
     z = np.concatenate([-upper_surface, inner_levels, upper_surface], axis=2)
     x = (behind - planform.straight_chord_line * chord)[..., np.newaxis]
     y = across[np.newaxis, :, np.newaxis]
@@ -355,7 +355,7 @@ def build_mesh(design: WingDesign) -> WingMesh:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------

@@ -22,11 +22,11 @@ class MeshLine(NamedTuple):
     Attributes
     ----------
     fraction : float
-        Its position as a fraction of the local chord; zero for a line across the span.
+        The position of the line as a fraction of the local chord; zero across the span.
     offset : float
-        Its distance from there [m].
+        The distance of the line from this position [m].
     label : str
-        Its name in sentences.
+        The name of the line in sentences.
     """
 
     fraction: float
@@ -104,12 +104,12 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
 
 
 def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
-    """Return whether a line can be added between others.
+    """Return whether a new line keeps its distance from all others.
 
     It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
     the chords.
     """
-    gaps = line.at(chords) - np.array([other.at(chords) for other in lines])
+    gaps = line.at(chords) - np.array([other_line.at(chords) for other_line in lines])
     is_behind = (gaps > 0.0).all(axis=1)
     is_ahead = (gaps < 0.0).all(axis=1)
     lies_between = bool(is_behind.any() and is_ahead.any())
@@ -164,12 +164,12 @@ def span_lines(design: WingDesign) -> FloatArray:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Returns
     -------
     (ny + 1,) array
-        Their distances from the root [m].
+        The distances of the lines from the root [m].
 
     Raises
     ------
@@ -238,7 +238,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return the interval in which the middle of each cell between mesh lines lies.
+    """Return for each cell between mesh lines the interval that contains its middle.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
     Parameters
     ----------
     mesh : WingMesh
-        The mesh.
+        The mesh, with its nodes in metres.
     distance : float
         Distance from the root [m].
     chord_fraction : float
@@ -159,8 +159,8 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
     distance_aft = chord_fraction * planform.chord(distance / planform.semi_span)
     weights = np.zeros(len(mesh.points))
     for upper in (True, False):
-        cell, local = mesh.skin_point(distance, distance_aft, upper=upper)
-        (values,), _ = mesh.kind.shape_functions(local[np.newaxis])
+        cell, local_position = mesh.skin_point(distance, distance_aft, upper=upper)
+        (values,), _ = mesh.kind.shape_functions(local_position[np.newaxis])
         weights[mesh.cells[cell]] += 0.5 * values
     return weights
 
@@ -228,11 +228,11 @@ def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None
     # integration points on the outer faces
     face = gauss_points(4, 2)
     local_height = 1.0 if upper else 0.0
-    local = np.column_stack([face.points, np.full(len(face.points), local_height)])
+    local_positions = np.column_stack([face.points, np.full(len(face.points), local_height)])
     cells = mesh.skin_cells(upper=upper)
-    shape_values, _ = mesh.kind.shape_functions(local)
-    x, y, _ = np.moveaxis(mesh.positions(cells, local), 2, 0)
-    jacobian = jacobians(mesh.kind, mesh.nodes[cells], local)
+    shape_values, _ = mesh.kind.shape_functions(local_positions)
+    x, y, _ = np.moveaxis(mesh.positions(cells, local_positions), 2, 0)
+    jacobian = jacobians(mesh.kind, mesh.nodes[cells], local_positions)
     area = np.linalg.det(jacobian[..., :2, :2])  # in the plan view
     # pressure at these points
     station = np.clip(y / planform.semi_span, 0.0, 1.0)
@@ -302,7 +302,7 @@ def _assemble_wing(design: WingDesign) -> AffineOperators:
     Parameters
     ----------
     design : WingDesign
-        The design.
+        The design, as read from its file.
 
     Raises
     ------
@@ -340,7 +340,7 @@ def wing_values(
     Parameters
     ----------
     wing : AffineWing
-        The wing.
+        The affine operators of the wing.
     young_modulus_factor, stiffness_loss
         As in `fe.runtime.state.DigitalState`.
     **others : float
@@ -359,7 +359,7 @@ def flapwise_bending_modes(wing: AffineWing, modes: NaturalModes) -> IntArray:
     Parameters
     ----------
     wing : AffineWing
-        The wing.
+        The affine operators of the wing.
     modes : NaturalModes
         At least three modes, from `natural_frequencies`.
 

@@ -353,12 +353,12 @@ class MeshSettings(DesignSection):
 
 
 def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
-    """Return the mean of the chord and of an elliptic distribution of its area (Schrenk 1940).
+    """Return Schrenk's lift distribution: the mean of the chord and of an ellipse of equal area.
 
     Parameters
     ----------
     planform : Planform
-        The half-wing.
+        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
 
@@ -385,7 +385,7 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
     Parameters
     ----------
     planform : Planform
-        The half-wing.
+        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
     terms : int

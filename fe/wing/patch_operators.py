@@ -90,9 +90,9 @@ class PatchOperators:
     Attributes
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     layout : WingLayout
-        What has no unknowns.
+        The places and lengths of a wing, which no unknown changes.
     line_rows : LineRows
         Displacements of the lines along the span.
     strain_rows : StrainRows
@@ -182,7 +182,7 @@ def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The finite element operators of the wing.
     """
     mesh = operators.wing_mesh
     design = mesh.design

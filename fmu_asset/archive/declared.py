@@ -363,7 +363,7 @@ class FmuDescription(FmuIdentity):
         return self.units
 
     def exchange_kind(self, variable: VariableInfo) -> str:
-        """Return the base type in which a variable is set and read: enumerations are integers."""
+        """Return the base type by which a variable is set and read; enumerations are integers."""
         if variable.kind != "Enumeration":
             return variable.kind
         return "Int64" if self.major_version == 3 else "Integer"
@@ -390,7 +390,7 @@ def describe_fmu(description: FmuDescription) -> dict[str, Any]:
 
 
 def _with_visible_texts(record: Mapping[str, object]) -> dict[str, Any]:
-    """Return a record whose texts have no control characters that a terminal would obey."""
+    """Return a record with all control characters in its texts, which a terminal obeys, escaped."""
     visible_record = {}
     for name, value in record.items():
         visible_record[name] = visible(value) if isinstance(value, str) else value

@@ -59,7 +59,7 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     Parameters
     ----------
     path : path-like
-        The FMU.
+        The path of the FMU file.
     interface : {"co-simulation", "model-exchange"}, optional
         The interface to be used; by default co-simulation if the FMU offers it.
 
@@ -91,14 +91,14 @@ def inspect_fmu(
     Parameters
     ----------
     path : path-like
-        The FMU.
+        The path of the FMU file.
     interface : {"co-simulation", "model-exchange"}, optional
         The interface to be used; by default co-simulation if the FMU offers it.
 
     Returns
     -------
     description : FmuDescription
-        What the FMU declares.
+        The declarations of the FMU.
     obstacle : str
         A sentence that says why it has no binary for this platform; empty if it has one.
 
@@ -180,7 +180,7 @@ def _missing_binary_sentence(
     Parameters
     ----------
     file : Path
-        The FMU.
+        The path of the FMU file.
     entry_names : set of str
         The names of the files in it.
     binary : str
@@ -266,14 +266,14 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
 def check_archive(
     file: Path, size: int, archive_kind: str = "FMU", remedy: str = "build"
 ) -> set[str]:
-    """Check structure, checksums, names and sizes of an archive; return the names of its files.
+    """Check an archive (structure, checksums, names and sizes), and return the names of its files.
 
     Parameters
     ----------
     file : Path
-        The archive.
+        The path of the archive.
     size : int
-        Its size [bytes].
+        The size of the archive [bytes].
     archive_kind : str
         The kind of file that the archive should be, for the message.
     remedy : str

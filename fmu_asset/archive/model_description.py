@@ -63,9 +63,9 @@ def read_declared(
         If the FMU does not offer the interface.
     """
     offered = _offered_interfaces(declared, file.path, interface)
-    chosen = next(iter(offered)) if interface is None else interface
-    declared_interface = offered[chosen]
-    capabilities = _capabilities(declared, declared_interface, root, chosen)
+    interface_name = next(iter(offered)) if interface is None else interface
+    declared_interface = offered[interface_name]
+    capabilities = _capabilities(declared, declared_interface, root, interface_name)
     _read_missing_ranges(declared, root)
     _remove_inverse_display_units(declared, root)
     dependencies = _declared_dependencies(declared)
@@ -92,7 +92,7 @@ def read_declared(
         can_interpolate_inputs=capabilities.can_interpolate_inputs,
         variables=tuple(variables),
         units=tuple(_unit_info(unit) for unit in declared.unitDefinitions),
-        interface=chosen,
+        interface=interface_name,
         interfaces=tuple(offered),
         needs_tool=bool(declared_interface.needsExecutionTool) or runs_in_tool,
         once_per_process=bool(once_per_process),
@@ -108,7 +108,7 @@ def read_declared(
 
 
 def _offered_interfaces(
-    declared: ModelDescription, file: Path, wanted: Interface | None
+    declared: ModelDescription, file: Path, interface: Interface | None
 ) -> dict[Interface, CoSimulation | ModelExchange]:
     """Return fmpy's record of each interface that an FMU offers, co-simulation first.
 
@@ -124,10 +124,10 @@ def _offered_interfaces(
             f"{file} offers neither co-simulation nor model exchange (scheduled execution is not "
             "supported); export it for co-simulation."
         )
-    if wanted is not None and wanted not in offered:
+    if interface is not None and interface not in offered:
         raise FmuUnsupportedError(
-            f"{file} offers {comma_list(offered)} only, but the binding asks for {wanted}; change "
-            "`interface` there, or export the FMU anew."
+            f"{file} offers {comma_list(offered)} only, but the binding asks for {interface}; "
+            "change `interface` there, or export the FMU anew."
         )
     return offered
 
@@ -190,10 +190,10 @@ def _remove_inverse_display_units(declared: ModelDescription, root: Element) -> 
 def _declared_dependencies(declared: ModelDescription) -> dict[str, tuple[str, ...]]:
     """Return the declared names of the variables that each output depends on."""
     dependencies: dict[str, tuple[str, ...]] = {}
-    for unknown in declared.outputs:
-        if unknown.variable is not None and unknown.dependencies is not None:
-            names = tuple(str(variable.name) for variable in unknown.dependencies)
-            dependencies[unknown.variable.name] = names
+    for output in declared.outputs:
+        if output.variable is not None and output.dependencies is not None:
+            names = tuple(str(variable.name) for variable in output.dependencies)
+            dependencies[output.variable.name] = names
     return dependencies
 
 

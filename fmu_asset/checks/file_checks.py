@@ -108,11 +108,12 @@ def _check_units(description: FmuDescription) -> list[CheckResult]:
         count = len(without_unit)
         sentences.append(f"{count} real variables have no unit: {_listed(without_unit)}.")
     defined = {unit.name for unit in description.units if unit.exponents is not None}
-    used = {variable.unit for variable in reals if variable.unit}
-    unknown = [unit for unit in sorted(used - defined) if meaning_of(unit) is None]
-    if unknown:
+    used_units = {variable.unit for variable in reals if variable.unit}
+    unknown_units = [unit for unit in sorted(used_units - defined) if meaning_of(unit) is None]
+    if unknown_units:
         sentences.append(
-            f"Nothing can be converted to {_listed(unknown)}: the FMU does not define it in SI."
+            f"Nothing can be converted to {_listed(unknown_units)}: the FMU does not define it in "
+            "SI."
         )
     if not sentences:
         text = "All real variables have units, and these have their usual meaning."
@@ -122,12 +123,12 @@ def _check_units(description: FmuDescription) -> list[CheckResult]:
 
 def _check_ranges(description: FmuDescription) -> list[CheckResult]:
     """Check that real inputs have ranges, and that no range is empty."""
-    empty = []
+    names_of_empty_ranges = []
     for variable in description.variables:
         low = variable.minimum
         high = variable.maximum
         if low is not None and high is not None and low > high:
-            empty.append(variable.name)
+            names_of_empty_ranges.append(variable.name)
     inputs = [
         variable
         for variable in description.variables
@@ -137,8 +138,10 @@ def _check_ranges(description: FmuDescription) -> list[CheckResult]:
         variable.name for variable in inputs if variable.minimum is None or variable.maximum is None
     ]
     results = []
-    if empty:
-        results.append(CheckResult("problem", f"The range of {_listed(empty)} is empty."))
+    if names_of_empty_ranges:
+        results.append(
+            CheckResult("problem", f"The range of {_listed(names_of_empty_ranges)} is empty.")
+        )
     if unlimited:
         text = f"{len(unlimited)} inputs have no range: {_listed(unlimited)}."
         results.append(CheckResult("warning", text))

@@ -20,7 +20,7 @@ class Finding:
     verdict : {"ok", "warning", "problem", "skipped"}
         A warning is allowed but makes an FMU harder to use.
     text : str
-        One sentence.
+        The finding as one sentence.
     """
 
     check: str
@@ -40,7 +40,7 @@ class CheckResult(NamedTuple):
 
 
 def one_line(error: FmuError) -> str:
-    """Return the message of an error and the last message of the FMU, as one line of text."""
+    """Return in one line the message of an error, and the last message that the FMU logged."""
     text = error.sentence
     if error.messages:
         text += f" The FMU says: {error.messages[-1]}"

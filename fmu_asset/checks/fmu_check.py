@@ -24,7 +24,7 @@ class FmuCheck:
     Attributes
     ----------
     path : Path
-        The FMU.
+        The path of the FMU file.
     findings : tuple of Finding
         Findings in the order in which they were made.
     """
@@ -58,7 +58,7 @@ def check_fmu(
     Parameters
     ----------
     path : path-like
-        Any FMU.
+        The path of any FMU file.
     binding : Binding or path-like, optional
         The binding with which the FMU is run; by default it is drafted from the model description.
     cycles : int
@@ -69,7 +69,7 @@ def check_fmu(
     step_timeout, memory_limit : float, optional
         Limits of the workers, as in `FmiAsset`.
     progress : Progress, optional
-        Where progress is shown.
+        The display of the progress.
 
     Returns
     -------
@@ -112,10 +112,10 @@ def check_fmu(
 
 
 def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
-    """Return a binding of the whole FMU, drafted from its model description.
+    """Return the binding with which an FMU is checked, drafted from its model description.
 
-    It has the stop time of the FMU's default experiment, unless the steps of the checks would run
-    beyond that time.
+    The binding has all inputs and outputs, and the stop time of the FMU's default experiment. The
+    stop time is left out if the steps of the checks would run beyond it.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def drafted_binding(description: FmuDescription, step_size: float | None) -> Bin
         If the FMU has no numeric output to observe, or the step size is not positive.
     """
     binding = whole_binding(description, step_size=step_size)
-    end = description.stop_time
+    stop_time = description.stop_time
     end_of_checks = binding.binding.start_time + RUN_STEPS * binding.interval
-    if end is None or end < end_of_checks:
+    if stop_time is None or stop_time < end_of_checks:
         return binding
-    return binding.with_header(stop_time=end)
+    return binding.with_header(stop_time=stop_time)

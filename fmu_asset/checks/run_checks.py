@@ -55,9 +55,9 @@ class RunChecks:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     binding : Binding
-        The binding.
+        The binding of the FMU.
     step_timeout, memory_limit : float or None
         Limits of the workers, as in `FmiAsset`.
 
@@ -92,7 +92,7 @@ class RunChecks:
         cycles : int
             Number of instances that are made one after the other; 0 skips that check.
         progress : Progress
-            Where progress is shown.
+            The display of the progress.
         """
         checks: dict[str, Callable[[], CheckResult]] = {
             "determinism": self._check_determinism,
@@ -201,17 +201,18 @@ class RunChecks:
             _outputs_of_steps(asset, _STEPS_BEFORE_SAVING)
             state = asset.save_state()
             method = asset.state_method
-            expected = _outputs_of_steps(asset, steps_after)
+            expected_outputs = _outputs_of_steps(asset, steps_after)
         with closing(self._asset()) as resumed_asset:
             resumed_asset.restore_state(state)
-            resumed = _outputs_of_steps(resumed_asset, steps_after)
-        if resumed.tobytes() != expected.tobytes():
+            resumed_outputs = _outputs_of_steps(resumed_asset, steps_after)
+        if resumed_outputs.tobytes() != expected_outputs.tobytes():
             cause = "its outputs are not a function of its inputs"
             if method == "serialised":
                 cause = partial_state_sentence("keeps part of its state elsewhere")
             text = (
                 "A flight that goes on from a saved state in a new process differs from the one "
-                f"that was not interrupted ({_first_difference(expected, resumed)}): {cause}."
+                "that was not interrupted "
+                f"({_first_difference(expected_outputs, resumed_outputs)}): {cause}."
             )
             return CheckResult("problem", text)
         if method == "serialised":
@@ -258,14 +259,14 @@ class RunChecks:
         step : float
             The step size that it refuses [s].
         error : FmuCallError
-            Its error.
+            The error of the step.
         """
         if self._description.can_vary_step:
             text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
             return CheckResult("problem", text)
         text = (
-            f"It takes {self._binding.binding.step_size:g} s only; `decimation` observes every "
-            "n-th step."
+            f"It accepts only the step size {self._binding.binding.step_size:g} s; `decimation` "
+            "observes every n-th step."
         )
         return CheckResult("warning", text)
 
@@ -328,7 +329,7 @@ class RunChecks:
         cycles : int
             The number of instances.
         progress : Progress
-            Where progress is shown.
+            The display of the progress.
         """
         half_of_cycles = cycles // 2
         number = 0

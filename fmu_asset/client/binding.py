@@ -136,17 +136,17 @@ class Binding(Section):
     control, health, load : dict of str to InputBinding
         Inputs by role and by the caller's name.
     observation : dict of str to VectorBinding
-        What is measured, in order.
+        The measured quantities, in order.
     parameter : dict of str to ParameterBinding
         Parameters by the caller's name.
     monitor : dict of str to ScalarBinding
         Further scalars to be recorded.
     port : dict of str to PortBinding
-        Where other FMUs can be coupled.
+        The ports at which other FMUs can be coupled.
     record : RecordBinding
         Further variables to be recorded, in the FMU's units.
     limits : WorkerLimits
-        What the worker may take.
+        The time and memory that the worker may take, and its permissions.
     """
 
     binding: BindingHeader
@@ -198,7 +198,7 @@ class Binding(Section):
         return tuple(name for vector in self.observation.values() for name in vector.variables)
 
     def observation_slice(self, name: str) -> slice:
-        """Return the positions of an observation in `Observation.values`.
+        """Return the slice of the array `Observation.values` that holds an observation.
 
         Parameters
         ----------
@@ -234,9 +234,9 @@ class Binding(Section):
         InvalidChoiceError
             If a word is not one of those that the table may have.
         """
-        for name, allowed in _HEADER_WORDS.items():
+        for name, allowed_words in _HEADER_WORDS.items():
             if name in changes:
-                require_one_of(changes[name], allowed, name)
+                require_one_of(changes[name], allowed_words, name)
         header = self.binding.model_copy(update=changes)
         return self.model_copy(update={"binding": header})
 
@@ -276,16 +276,16 @@ class Binding(Section):
             for number, name in enumerate(names, 1):
                 label = key if len(names) == 1 else f"{key}[{number}]"
                 monitor[label] = scalar.model_copy(update={"variable": name})
-        recorded: list[str] = []
+        recorded_names: list[str] = []
         for name in self.record.variables:
-            recorded += elements(name)
+            recorded_names += elements(name)
         observation = {key: vector.by_element(elements) for key, vector in self.observation.items()}
         return self.model_copy(
             update={
                 "observation": observation,
                 "monitor": monitor,
                 "port": {key: port.by_element(elements) for key, port in self.port.items()},
-                "record": self.record.model_copy(update={"variables": tuple(recorded)}),
+                "record": self.record.model_copy(update={"variables": tuple(recorded_names)}),
             }
         )
 
@@ -296,7 +296,7 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
     Parameters
     ----------
     path : path-like
-        The file.
+        The path of the file.
 
     Raises
     ------
@@ -309,14 +309,14 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
 
 
 def parse_binding(content: Mapping[str, object], *, where: str = "the binding") -> Binding:
-    """Return the binding in the content of a TOML file, checked.
+    """Return the checked binding that the content of a TOML file describes.
 
     Parameters
     ----------
     content : mapping of str to object
-        The content.
+        The tables and keys of the file.
     where : str
-        Where it comes from, for messages.
+        The origin of the content, which begins messages: the path of the file.
 
     Raises
     ------

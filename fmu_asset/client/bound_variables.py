@@ -189,7 +189,7 @@ class PortBinding(Section):
     """Velocity or angular velocity of the port."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of a port: no motion, or a unit that its quantity cannot have."""
+        """Yield the faults of a port: a missing motion, or a unit that does not fit a quantity."""
         has_motion = self.displacement is not None or self.velocity is not None
         yield not has_motion, "a port needs a displacement or a velocity beside its force"
         for name, vector in self.quantities.items():
@@ -199,7 +199,7 @@ class PortBinding(Section):
                 continue
             units = PORT_QUANTITIES[name]
             # a unit that is not understood (None) is accepted
-            is_wrong = all(same_dimension(unit, allowed) is False for allowed in units)
+            is_wrong = all(same_dimension(unit, allowed_unit) is False for allowed_unit in units)
             yield is_wrong, f"{name} is in {unit!r}, but must be in {' or '.join(units)}"
 
     @property
@@ -214,10 +214,10 @@ class PortBinding(Section):
 
     def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
         """Return the port with each array replaced by its elements; see `VectorBinding`."""
-        changed = {}
+        changed_vectors = {}
         for name, vector in self.quantities.items():
-            changed[name] = vector.by_element(elements)
-        return self.model_copy(update=changed)
+            changed_vectors[name] = vector.by_element(elements)
+        return self.model_copy(update=changed_vectors)
 
 
 class RecordBinding(Section):

@@ -40,14 +40,14 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     """Return a binding file for an FMU, to be corrected by somebody who knows its model.
 
     Inputs are controls, unless their name or unit indicates health or load. Real outputs are
-    observations, numbered ones together; other outputs are recorded beside them. A force input with
+    observations, numbered ones together; other outputs are recorded in addition. A force input with
     a displacement or velocity output of the same stem becomes a port. The text is checked against
     the FMU before it is returned.
 
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     step_size : float, optional
         Communication step size [s]; that of the FMU's default experiment, or 1.
 
@@ -57,15 +57,15 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         If the FMU has no number to observe.
     """
     bindable_variables = [variable for variable in description.variables if bindable(variable)]
-    observed = _variables_to_observe(description, bindable_variables)
+    observed_variables = _variables_to_observe(description, bindable_variables)
     ports = _ports([v for v in bindable_variables if v.causality in ("input", "output")])
     port_names = {variable.name for port in ports.values() for variable in port.values()}
     inputs = [v for v in bindable_variables if v.causality == "input" and v.name not in port_names]
     parameters = [
         v for v in bindable_variables if v.causality == "parameter" and v.variability != "constant"
     ]
-    observed_names = {variable.name for variable in observed}
-    recorded = [
+    observed_names = {variable.name for variable in observed_variables}
+    recorded_variables = [
         v for v in bindable_variables if v.causality == "output" and v.name not in observed_names
     ]
     usable_names = {variable.name for variable in bindable_variables}
@@ -76,10 +76,12 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         name=keys.key("binding", description.model_name),
         step_size=description.step_of(step_size),
         inputs=[(_role(v), keys.key(_role(v), v.name), v) for v in inputs],
-        observed=[(keys.key("observation", _stem(group)), group) for group in _groups(observed)],
+        observed=[
+            (keys.key("observation", _stem(group)), group) for group in _groups(observed_variables)
+        ],
         parameters=[(keys.key("parameter", v.name), v) for v in parameters],
         ports=[(keys.key("port", stem or "port"), port) for stem, port in ports.items()],
-        recorded=_groups(recorded),
+        recorded=_groups(recorded_variables),
         others=[v.name for v in bindable_variables if v.causality in _INTERNAL],
         left_out=[
             v.name
@@ -112,7 +114,7 @@ def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> l
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     usable : sequence of VariableInfo
         Variables that a binding can name.
 
@@ -196,7 +198,7 @@ def _ports(variables: Sequence[VariableInfo]) -> dict[str, PortVariables]:
 
 
 def _is_port(variables: PortVariables) -> bool:
-    """Return whether variables form a port: the force is the only one of its causality."""
+    """Return whether variables form a port: one force, and motions of the other causality."""
     if len(variables) < 2 or "force" not in variables:
         return False
     causalities = [variable.causality for variable in variables.values()]
@@ -228,7 +230,7 @@ class _NumberedName(NamedTuple):
 
 
 def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
-    """Return the parts of the name of a scalar with a number in its name; None for another."""
+    """Return the name of a scalar, split at the number in it; None for any other variable."""
     if variable.shape:
         return None
     match = _NUMBERED.fullmatch(variable.name)
@@ -238,16 +240,16 @@ def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
-    """Return variables in groups: those with successive numbers and equal units form one."""
+    """Return variables in groups; a group has successive numbers and equal units."""
     groups: list[list[VariableInfo]] = []
-    expected: _NumberedName | None = None
+    expected_name: _NumberedName | None = None
     for variable in variables:
         name = _numbered_name(variable)
-        if name is not None and name == expected:
+        if name is not None and name == expected_name:
             groups[-1].append(variable)
         else:
             groups.append([variable])
-        expected = None if name is None else name.next()
+        expected_name = None if name is None else name.next()
     return groups
 
 

@@ -24,9 +24,9 @@ class Exchange:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     binding : Binding
-        The binding.
+        The binding of the FMU.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Exchange:
     outputs : OutputTable
         Outputs that are read from the reply block.
     recorded_units : dict of str to str
-        Units of what is read beside the observations, by name.
+        Units of the outputs that are read in addition to the observations, by name.
     output_names : list of str
         Names of all values of the reply block.
     sent, read : tuple of VariableInfo
@@ -75,8 +75,10 @@ class Exchange:
             messages = resolver.misfits()
             if len(messages) < 2:
                 raise
-            title = f"{len(messages)} entries of the binding {binding.title} do not fit the FMU:"
-            raise BindingError("\n".join([title, *messages])) from None
+            title = f"{len(messages)} entries of the binding {binding.title} do not fit the FMU."
+            # The title names the binding and its file, so that each message need not.
+            short = [text.replace(f" of the binding {binding.title}", "") for text in messages]
+            raise BindingError(" ".join([title, *short])) from None
 
     def _resolve(self, resolver: BindingResolver, configuration: list[InitialValue]) -> None:
         """Lay out what is exchanged with the FMU.
@@ -177,7 +179,7 @@ class Exchange:
 
 
 def _check_version(description: FmuDescription, binding: Binding) -> None:
-    """Refuse an FMU of another version of FMI than the binding states."""
+    """Refuse an FMU whose version of FMI is not the one that the binding states."""
     version = binding.binding.fmi_version
     if version is not None and version[0] != description.fmi_version[0]:
         raise BindingError(

@@ -58,7 +58,7 @@ def default_experiment(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     stop_time : float, optional
         The end [s]. By default it is the FMU's own, or one second after the start.
     step_size : float, optional
@@ -110,7 +110,7 @@ def _values_of_variables(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     values : mapping of str to float, str or list
         The values or their texts, by variable name.
     settable : sequence of str
@@ -141,7 +141,7 @@ def _selected(values: Mapping[str, PlainValue], names: Collection[str]) -> dict[
 
 
 def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
-    """Return the value that a text, such as one typed by a user, means for a variable.
+    """Convert a text, such as a user's input, to a value of a variable.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
     Raises
     ------
     FmuInputError
-        If the text is not such a value.
+        If the text is not a value of the variable's type.
     """
     if variable.is_text_parameter or text in variable.items:
         return text
@@ -165,8 +165,10 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
         try:
             numbers.append(float(variable.items.get(number_text, number_text)))
         except ValueError:
-            wanted = f"one of {variable.item_list}" if variable.items else "a number"
-            raise FmuInputError(f"{variable.name} must be {wanted}, but is {text!r}.") from None
+            expected_value = f"one of {variable.item_list}" if variable.items else "a number"
+            raise FmuInputError(
+                f"{variable.name} must be {expected_value}, but is {text!r}."
+            ) from None
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -210,11 +212,11 @@ def _bound_variables(
     variables: Sequence[VariableInfo], causality: str, kind: type[_Bound]
 ) -> dict[str, _Bound]:
     """Return the variables of a causality, bound under their own names and units."""
-    bound = {}
+    bound_variables = {}
     for variable in variables:
         if variable.causality == causality:
-            bound[variable.name] = kind(variable=variable.name, unit=variable.unit or "1")
-    return bound
+            bound_variables[variable.name] = kind(variable=variable.name, unit=variable.unit or "1")
+    return bound_variables
 
 
 def _steps_until(start: float, end: float, size: float | None) -> tuple[int, float]:
@@ -257,7 +259,7 @@ def ending_with_histories(binding: Binding, steps: int) -> Binding:
     Parameters
     ----------
     binding : Binding
-        The binding.
+        The binding of the FMU.
     steps : int
         The number of rows of the file.
     """
@@ -280,7 +282,7 @@ def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> Obs
     Parameters
     ----------
     asset : FmiAsset
-        The asset.
+        The asset, which steps the FMU.
     steps : int
         The number of rows, N.
     histories : dict of str to dict of str to (N,) or (N, n) ndarray
@@ -330,26 +332,26 @@ def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) ->
     FmuError
         As `FmiAsset.simulate`.
     """
-    present = asset.observe()
-    later = asset.simulate(**histories, steps=steps, progress=None)
+    present_outputs = asset.observe()
+    later_outputs = asset.simulate(**histories, steps=steps, progress=None)
     extra_histories = {}
-    for name, values in later.extra.items():
-        extra_histories[name] = np.concatenate(([present.extra[name]], values))
+    for name, values in later_outputs.extra.items():
+        extra_histories[name] = np.concatenate(([present_outputs.extra[name]], values))
     return ObservationHistory(
-        time=np.concatenate(([present.time], later.time)),
-        values=np.vstack((present.values, later.values)),
+        time=np.concatenate(([present_outputs.time], later_outputs.time)),
+        values=np.vstack((present_outputs.values, later_outputs.values)),
         extra=extra_histories,
-        ended=later.ended,
+        ended=later_outputs.ended,
     )
 
 
 def run_experiment(asset: FmiAsset, experiment: FmuExperiment) -> ObservationHistory:
-    """Return the outputs of an asset at the start of an experiment and after each of its steps.
+    """Return the outputs of an asset at the start of an experiment, and after each step.
 
     Parameters
     ----------
     asset : FmiAsset or CoupledAsset
-        The asset.
+        The asset, which steps the FMU.
     experiment : FmuExperiment
         Steps, parameters and inputs; the inputs hold already during the initialisation.
 

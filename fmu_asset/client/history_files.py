@@ -52,7 +52,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     binding : Binding
         The binding, with the names and units of the inputs.
 
@@ -72,10 +72,10 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
             continue
         input_name, number = _column_meaning(column, known_names)
         if input_name is None:
-            known = [name.full for name in dict.fromkeys(known_names.values())]
+            full_names = [name.full for name in dict.fromkeys(known_names.values())]
             raise FmuInputError(
                 f"The column {column!r} of {path} is not an input of the binding {binding.name}; "
-                f"it has {comma_list(known)}."
+                f"it has {comma_list(full_names)}."
             )
         elements = columns_of_input.setdefault(input_name, {})
         mixes_forms = bool(elements) and (number == _WHOLE or _WHOLE in elements)
@@ -93,13 +93,13 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
 
 def _check_times(time: Float, path: Path, binding: Binding) -> None:
     """Refuse times (N,) [s] that are not those at which the steps of a binding begin."""
-    expected = binding.binding.start_time + binding.interval * np.arange(len(time))
-    wrong_steps = np.flatnonzero(np.abs(time - expected) > _TIME_TOLERANCE * binding.interval)
+    expected_times = binding.binding.start_time + binding.interval * np.arange(len(time))
+    wrong_steps = np.flatnonzero(np.abs(time - expected_times) > _TIME_TOLERANCE * binding.interval)
     if len(wrong_steps):
         step = int(wrong_steps[0])
         raise FmuInputError(
             f"{path} has the time {time[step]:.12g} s where step {step} begins at "
-            f"{expected[step]:.12g} s: the binding {binding.name} starts at "
+            f"{expected_times[step]:.12g} s: the binding {binding.name} starts at "
             f"{binding.binding.start_time:g} s and goes on by {binding.interval:g} s. Resample the "
             "inputs, or change `step_size` or `start_time` in the binding."
         )
@@ -147,7 +147,7 @@ def _column_meaning(
 
 
 def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: Path) -> Float:
-    """Return the history of an input, from one column or from those of its elements.
+    """Return the history of an input from its own column, or from the columns of its elements.
 
     Returns
     -------
@@ -156,10 +156,10 @@ def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: P
     """
     if _WHOLE in elements:
         return elements[_WHOLE]
-    missing = {*range(1, len(elements) + 1)} - elements.keys()
-    if missing:
+    missing_numbers = {*range(1, len(elements) + 1)} - elements.keys()
+    if missing_numbers:
         raise FmuInputError(
-            f"{path} lacks the column {input_name.full}[{min(missing)}]; count from 1."
+            f"{path} lacks the column {input_name.full}[{min(missing_numbers)}]; count from 1."
         )
     return np.column_stack([elements[number] for number in sorted(elements)])
 
@@ -174,13 +174,13 @@ def write_history(
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     asset : FmiAsset
         The asset that was simulated.
     source : (str, str)
         Name and SHA-256 of its FMU file.
     history : ObservationHistory
-        The outputs.
+        The outputs of the FMU in each step.
 
     Raises
     ------
@@ -191,10 +191,10 @@ def write_history(
         atomic_write_bytes(path, _netcdf(asset, source, history))
         return
     names = asset.binding.observation_variables
-    observed = dict(zip(names, history.values.T, strict=True))
-    observed[_TIME] = history.time
+    observed_columns = dict(zip(names, history.values.T, strict=True))
+    observed_columns[_TIME] = history.time
     # time first, then observations, then extras of other names
-    columns = {_TIME: history.time, **observed, **(history.extra | observed)}
+    columns = {_TIME: history.time, **observed_columns, **(history.extra | observed_columns)}
     atomic_write_text(path, table_text(columns))
 
 
@@ -206,16 +206,16 @@ def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistor
     observation_units = [unit for vector in binding.observation.values() for unit in vector.units]
     extra_names = [*history.extra]
     extra_units = [asset.recorded_units[name] for name in extra_names]
-    extra = np.empty((len(history.time), 0))
+    extra_values = np.empty((len(history.time), 0))
     if extra_names:
-        extra = np.column_stack([*history.extra.values()])
+        extra_values = np.column_stack([*history.extra.values()])
     observation_names = np.array(binding.observation_variables, dtype=str)
     file_name, file_hash = source
     data = xr.Dataset(
         {
             "observation": (("time", "observation_name"), history.values),
             "observation_unit": ("observation_name", np.array(observation_units, dtype=str)),
-            "extra": (("time", "extra_name"), extra),
+            "extra": (("time", "extra_name"), extra_values),
             "extra_unit": ("extra_name", np.array(extra_units, dtype=str)),
         },
         coords={

@@ -64,15 +64,17 @@ class InitialValueTable:
 
         Returns
         -------
-        sent : dict of str to mapping or None
+        sent_health : dict of str to mapping or None
             The same without health that is set at a start.
         health : mapping of str to float
             That health.
         """
         health = inputs.get("health") or {}
         at_start = {name: value for name, value in health.items() if name in self.health_slots}
-        sent = {name: value for name, value in health.items() if name not in self.health_slots}
-        return {**inputs, "health": sent}, at_start
+        sent_health = {
+            name: value for name, value in health.items() if name not in self.health_slots
+        }
+        return {**inputs, "health": sent_health}, at_start
 
     def initial_values(
         self,
@@ -142,7 +144,7 @@ class InitialValueTable:
     # ------------------------------------------------------------------ names
 
     def _parameter_slot(self, name: str) -> InputSlot:
-        """Return the slot of a numeric parameter by its name in the binding, or else in the FMU."""
+        """Return the slot of a numeric parameter, named as in the binding or as in the FMU."""
         if name in self._parameter_slots:
             return self._parameter_slots[name]
         resolver = self._resolver
@@ -157,11 +159,11 @@ class InitialValueTable:
         return resolver.start_slot(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
-        """Return the text parameter of a name in the binding, or else in the FMU, if it is one."""
+        """Return the text parameter that the binding or the FMU has by a name; None without one."""
         if name in self._text_parameters or name in self._parameter_slots:
             return self._text_parameters.get(name)
         variable = self._resolver.description.variable(name)
         if variable is None or not variable.is_text_parameter:
             return None
-        bound_variables = {bound.name for bound in self._text_parameters.values()}
+        bound_variables = {parameter.name for parameter in self._text_parameters.values()}
         return None if name in bound_variables else variable

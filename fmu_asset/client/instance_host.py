@@ -35,12 +35,12 @@ class ExtractedFmu:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
 
     Attributes
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     users : int
         The number of instances that run from it.
 
@@ -62,9 +62,9 @@ class InstanceHost:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     plan : Plan
-        What is exchanged; its folder is still empty.
+        The variables that each call exchanges with the FMU; the folder is still empty.
     limits : WorkerLimits
         Limits of the worker.
     isolated : bool
@@ -75,7 +75,7 @@ class InstanceHost:
     instance : FmuInstance, WorkerInstance or None
         The instance, if there is one.
     reset_trial : ResetTrial
-        What is known about restarts of the FMU.
+        The knowledge about restarts of the FMU.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class InstanceHost:
         return method >= trial.method and not cannot_be_verified
 
     def _instance_restarted_by(self, restart: Callable[[], Instance]) -> Instance | None:
-        """Return the instance after a restart, or None if its first step shows that this failed.
+        """Return the instance after a restart, or None if the first step shows a failed restart.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class InstanceHost:
         return None
 
     def _reset_instance(self) -> Instance:
-        """Reset the instance by the FMU's own function; record it if the FMU refuses."""
+        """Reset the instance by the FMU's own function; record the refusal if the FMU refuses."""
         assert self.instance is not None
         try:
             self.instance.reset()
@@ -301,11 +301,11 @@ def _release(instance: Instance, extracted: ExtractedFmu) -> None:
 
 def _check_grants(grants: Grants, folder: str) -> None:
     """Refuse grants of the sandbox that name a missing file or folder."""
-    missing = missing_path(grants, folder)
-    if missing:
+    missing_file = missing_path(grants, folder)
+    if missing_file:
         raise FmuInputError(
-            f"The table [limits] of the binding grants {missing!r}, which does not exist; correct "
-            "it."
+            f"The table [limits] of the binding grants {missing_file!r}, which does not exist; "
+            "correct it."
         )
 
 

@@ -43,7 +43,7 @@ def find_variable(
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     name : str
         A variable, or an element of an array such as `p[3]`.
     label : str
@@ -150,7 +150,7 @@ class BlockLayout:
     Parameters
     ----------
     description : FmuDescription
-        The FMU.
+        The variables and abilities that the FMU declares.
     variables : sequence of VariableInfo
         Variables that are exchanged. A variable that is named twice is in the block once.
     begin : int
@@ -181,8 +181,8 @@ class BlockLayout:
             moves = linear and variable.continuous and variable.causality == "input"
             return _GroupKey(not moves, number, kind)
 
-        unique = {variable.name: variable for variable in variables if variable.size}
-        self.variables = tuple(sorted(unique.values(), key=group_key))
+        variable_of_name = {variable.name: variable for variable in variables if variable.size}
+        self.variables = tuple(sorted(variable_of_name.values(), key=group_key))
         begins = accumulate((variable.size for variable in self.variables), initial=begin)
         names = (variable.name for variable in self.variables)
         self._begins = dict(zip(names, begins, strict=False))

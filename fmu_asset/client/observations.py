@@ -53,14 +53,14 @@ class ObservationHistory:
 
 
 def joined_histories(parts: Sequence[ObservationHistory]) -> ObservationHistory:
-    """Return the history of steps that were made in several parts, one after the other."""
-    extra = {}
+    """Return one history from histories of consecutive steps."""
+    extra_histories = {}
     for name in parts[0].extra:
-        extra[name] = np.concatenate([part.extra[name] for part in parts])
+        extra_histories[name] = np.concatenate([part.extra[name] for part in parts])
     return ObservationHistory(
         time=np.concatenate([part.time for part in parts]),
         values=np.vstack([part.values for part in parts]),
-        extra=extra,
+        extra=extra_histories,
         ended=parts[-1].ended,
     )
 
@@ -106,8 +106,8 @@ class OutputTable:
         values = self._converted(block[self._index])
         extra_values = values[self._observation_count :].tolist()
         # The lengths are equal by construction; checking them would double the time of this line.
-        extra = dict(zip(self._extra_names, extra_values))  # noqa: B905
-        return Observation(values[: self._observation_count], time, extra)
+        extra_outputs = dict(zip(self._extra_names, extra_values))  # noqa: B905
+        return Observation(values[: self._observation_count], time, extra_outputs)
 
     def history(self, time: Float, blocks: Float, ended: str = "") -> ObservationHistory:
         """Return the history in reply blocks.
@@ -122,10 +122,10 @@ class OutputTable:
             How the FMU ended the simulation by itself, if it did.
         """
         values = self._converted(blocks[:, self._index])
-        observed = np.ascontiguousarray(values[:, : self._observation_count])
+        observed_values = np.ascontiguousarray(values[:, : self._observation_count])
         extra_values = np.ascontiguousarray(values[:, self._observation_count :].T)
-        extra = dict(zip(self._extra_names, extra_values, strict=True))
-        return ObservationHistory(time, observed, extra, ended)
+        extra_histories = dict(zip(self._extra_names, extra_values, strict=True))
+        return ObservationHistory(time, observed_values, extra_histories, ended)
 
 
 def _slice_or_index(

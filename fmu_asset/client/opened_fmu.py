@@ -92,10 +92,10 @@ class OpenedFmu:
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
     def _chosen_state_method(self) -> StateMethod:
-        """Return how states are saved: as the binding says, or else as the FMU is able to."""
-        chosen = self.binding.binding.state
-        if chosen != "auto":
-            return chosen
+        """Return how states are saved: as the binding says, or as the FMU supports it best."""
+        state_method = self.binding.binding.state
+        if state_method != "auto":
+            return state_method
         description = self.description
         can_serialise = description.can_get_and_set_state and description.can_serialise_state
         # a state in model exchange would have to hold our solver as well
@@ -258,21 +258,21 @@ class OpenedFmu:
         BindingError, FmuInputError
             If a parameter is unknown or lies outside its range.
         """
-        other = copy(self)
-        other._host = self._host.sibling()
-        other._phase = "new"
-        other.step_index = 0
-        other._first_index = 0
-        other._start_inputs = b""
-        other._record = []
-        other._log = deque(maxlen=_LOG_LENGTH)
-        other._health = {}
+        sibling = copy(self)
+        sibling._host = self._host.sibling()
+        sibling._phase = "new"
+        sibling.step_index = 0
+        sibling._first_index = 0
+        sibling._start_inputs = b""
+        sibling._record = []
+        sibling._log = deque(maxlen=_LOG_LENGTH)
+        sibling._health = {}
         if parameters is not None:
-            other._set_parameters(parameters)
+            sibling._set_parameters(parameters)
         elif self._health:
             # the copied settings hold the health of this asset
-            other._set_parameters(self._parameters)
-        return other
+            sibling._set_parameters(self._parameters)
+        return sibling
 
     # ------------------------------------------------------------------ starts
 
@@ -365,13 +365,13 @@ class OpenedFmu:
         self._phase = "ready"
 
     def _use_instance(self, instance: Instance) -> None:
-        """Use an instance, through views of its two blocks that are fast to write and read."""
+        """Take an instance into use, with fast views of the blocks of its request and its reply."""
         self._instance = instance
         self._request = memoryview(instance.request).cast("B").cast("d")
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
 
     def _replaced_instance(self, request: bytes, reply: Float) -> Instance | None:
-        """Return another instance if the first step shows that the reset of this one did not work.
+        """Return a new instance if the first step shows that the reset of the present one failed.
 
         Parameters
         ----------
@@ -408,8 +408,8 @@ class OpenedFmu:
             needs_no_start_values = (
                 self.binding.binding.structural_parameters and not self._linear_count
             )
-            sent = inputs if needs_no_start_values and inputs is not None else {}
-            request = self._exchange.request.start_values(sent)
+            sent_inputs = inputs if needs_no_start_values and inputs is not None else {}
+            request = self._exchange.request.start_values(sent_inputs)
             self._start_instance(request, with_inputs=False)
         return self._instance
 
@@ -455,9 +455,9 @@ class OpenedFmu:
         Parameters
         ----------
         error : FmuError
-            The error.
+            The error that the FMU or its worker raised.
         action : str
-            What was done, such as "the start".
+            The action that failed, such as "the start".
         """
         for message in error.messages:
             self._log.append(("Error", message))

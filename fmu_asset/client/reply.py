@@ -92,16 +92,16 @@ class ReplyBlock:
             to_fmu = conversion(unit, selection.variable, definitions, where=place)
             outputs.append(_ResolvedOutput(self.layout.positions(selection)[0], unit, to_fmu))
         # of several extra outputs with the same name, the last one is kept
-        observed = outputs[: len(observations)]
+        observed_outputs = outputs[: len(observations)]
         extra_outputs: dict[str, _ResolvedOutput] = {}
         for request, output in zip(extras, outputs[len(observations) :], strict=True):
             extra_outputs[request.name] = output
-        chosen = [*observed, *extra_outputs.values()]
+        reply_outputs = [*observed_outputs, *extra_outputs.values()]
         self.table = OutputTable(
-            observation_count=len(observed),
+            observation_count=len(observed_outputs),
             extra_names=[*extra_outputs],
-            positions=[output.position for output in chosen],
-            conversions=[output.conversion for output in chosen],
+            positions=[output.position for output in reply_outputs],
+            conversions=[output.conversion for output in reply_outputs],
         )
         self.extra_units = {name: output.unit for name, output in extra_outputs.items()}
 
@@ -116,7 +116,7 @@ def _observations(resolver: BindingResolver) -> list[_RequestedOutput]:
 
 
 def _extras(resolver: BindingResolver, ports: Sequence[PortQuantity]) -> list[_RequestedOutput]:
-    """Return the outputs that are read beside the observations.
+    """Return the outputs that are read in addition to the observations.
 
     These are monitors, recorded variables and outputs of ports.
     """

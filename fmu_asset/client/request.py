@@ -91,16 +91,20 @@ class RequestBlock:
     def __init__(self, resolver: BindingResolver, ports: Sequence[PortQuantity]) -> None:
         self._resolver = resolver
         bound_inputs = self._role_inputs() + self._port_inputs(ports)
-        variables = [selection.variable for bound in bound_inputs for selection in bound.selections]
+        variables = [
+            selection.variable
+            for bound_input in bound_inputs
+            for selection in bound_input.selections
+        ]
         is_linear = resolver.binding.binding.interpolation == "linear"
         self.layout = BlockLayout(resolver.description, variables, begin=2, linear=is_linear)
         if is_linear:
             self._check_linear_interpolation()
         self._slots: dict[str, dict[str, InputSlot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         user_of_position: dict[int, str] = {}
-        for bound in bound_inputs:
-            slot = self._slot(bound, user_of_position)
-            self._slots[bound.role][bound.name] = slot
+        for bound_input in bound_inputs:
+            slot = self._slot(bound_input, user_of_position)
+            self._slots[bound_input.role][bound_input.name] = slot
         self._plain_inputs = {role: _plain_inputs(slots) for role, slots in self._slots.items()}
 
     # ------------------------------------------------------------------ resolving
@@ -129,12 +133,12 @@ class RequestBlock:
             bound_inputs.append(_BoundInput("port", quantity.name, input_binding, selections))
         return bound_inputs
 
-    def _slot(self, bound: _BoundInput, user_of_position: dict[int, str]) -> InputSlot:
+    def _slot(self, bound_input: _BoundInput, user_of_position: dict[int, str]) -> InputSlot:
         """Return the slot of an input, and enter its positions in the list of users.
 
         Parameters
         ----------
-        bound : _BoundInput
+        bound_input : _BoundInput
             The input.
         user_of_position : dict of int to str
             The label of the input that sets each position; extended in place.
@@ -149,28 +153,28 @@ class RequestBlock:
             len(
                 {
                     (selection.variable.unit, selection.variable.kind)
-                    for selection in bound.selections
+                    for selection in bound_input.selections
                 }
             )
             > 1
         ):
             raise BindingError(
-                f"The variables of {resolver.place_in_binding(bound.label)} have different units "
-                "or types in the FMU; make one port of each."
+                f"The variables of {resolver.place_in_binding(bound_input.label)} have different "
+                "units or types in the FMU; make one port of each."
             )
-        variable = bound.selections[0].variable
+        variable = bound_input.selections[0].variable
         positions: list[int] = []
-        for selection in bound.selections:
+        for selection in bound_input.selections:
             positions += self.layout.positions(selection)
         for position in positions:
             if position in user_of_position:
                 raise BindingError(
-                    f"In the binding {resolver.binding.title}, {bound.label} and "
+                    f"In the binding {resolver.binding.title}, {bound_input.label} and "
                     f"{user_of_position[position]} set the same value of {variable.name!r}; keep "
                     "one."
                 )
-            user_of_position[position] = bound.label
-        return resolver.slot(bound.label, bound.input_binding, variable, positions)
+            user_of_position[position] = bound_input.label
+        return resolver.slot(bound_input.label, bound_input.input_binding, variable, positions)
 
     def _check_linear_interpolation(self) -> None:
         """Refuse linear interpolation if the FMU, or all of its inputs, cannot follow it."""
@@ -331,7 +335,7 @@ def _plain_inputs(slots: Mapping[str, InputSlot]) -> dict[str, _PlainInput]:
     return plain_inputs
 
 
-def unknown_input(binding: str, role: str, name: str, known: Sequence[str]) -> BindingError:
+def unknown_input(binding: str, role: str, name: str, known_names: Sequence[str]) -> BindingError:
     """Return the error for an input that a binding does not have.
 
     Parameters
@@ -340,10 +344,10 @@ def unknown_input(binding: str, role: str, name: str, known: Sequence[str]) -> B
         Name of the binding.
     role, name : str
         Role and name of the input.
-    known : sequence of str
+    known_names : sequence of str
         Names that the binding has in this role.
     """
-    names = ", ".join(known) or "none"
+    names = ", ".join(known_names) or "none"
     return BindingError(f"The binding {binding} has no {role} {name!r}; it has {names}.")
 
 
@@ -376,8 +380,8 @@ def step_count(histories: Sequence[tuple[InputSlot, Float]], steps: int | None) 
             source = slot.label
         elif len(numbers) != count:
             raise FmuInputError(
-                f"{slot.label} has {len(numbers)} steps, but {source} says {count}; give as many "
-                "of each."
+                f"{slot.label} has {len(numbers)} steps, but {source} has {count}; give the same "
+                "number for both."
             )
     if not count:
         raise FmuInputError(

@@ -166,8 +166,8 @@ class ResetTrial:
         reply : (n,) ndarray
             The outputs after the same step.
         """
-        expected = first_step.reply
-        is_equal = (reply == expected) | (np.isnan(reply) & np.isnan(expected))
+        expected_reply = first_step.reply
+        is_equal = (reply == expected_reply) | (np.isnan(reply) & np.isnan(expected_reply))
         if is_equal.all():
             if method == RestartMethod.RESET:
                 self.works = True
@@ -184,8 +184,8 @@ class ResetTrial:
             doubt = " Flights that began by a reset before may be wrong."
         self.fault = (
             f"{_FAULTS[method]} (an output is {reply[output]:.9g} where that of a new instance is "
-            f"{expected[output]:.9g}); every start takes a new {_NEXT_PLACES[method]} instead."
-            f"{doubt}"
+            f"{expected_reply[output]:.9g}); every start takes a new {_NEXT_PLACES[method]} "
+            f"instead.{doubt}"
         )
         self.works = False
         self.lies = True

@@ -144,9 +144,10 @@ class FmuRuns:
         self._assets.clear()
 
     def probing_amplitude(self, name: str) -> float:
-        """Return an amplitude by which tests of linearity can vary an input in both directions.
+        """Return an amplitude by which a test of linearity can vary a load in both directions.
 
-        It is 1 in the binding's unit, or a tenth of the smaller limit of the range.
+        The amplitude is 1 in the binding's unit, or a tenth of the smaller limit of the load's
+        range if that is less.
         """
         low, high = self.asset.input_range("load", name)
         return min(1.0, 0.1 * abs(low), 0.1 * abs(high))
@@ -164,7 +165,7 @@ class FmuRuns:
         asset : FmiAsset
             The instance at its start; if there are initial offsets, at rest under them.
         outputs : (C,) ndarray
-            Its outputs.
+            The outputs of the instance at the start.
         inputs : dict of str to (steps,) ndarray
             The value of every input in each step.
 

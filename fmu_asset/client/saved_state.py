@@ -134,17 +134,18 @@ class SavedState(PackedState):
             return
         if len(outputs) != len(self.outputs):
             raise FmuStateError("The state was saved with another binding; use that one.")
-        saved = np.frombuffer(self.outputs)
-        present = np.frombuffer(outputs)
+        saved_outputs = np.frombuffer(self.outputs)
+        present_outputs = np.frombuffer(outputs)
         # compare bits: 0.0 and -0.0 are equal numbers
-        has_other_bits = present.view(np.int64) != saved.view(np.int64)
+        has_other_bits = present_outputs.view(np.int64) != saved_outputs.view(np.int64)
         output = int(np.flatnonzero(has_other_bits)[0])
         cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
         if self.method == "serialised":
             cause = partial_state_sentence("does not restore all of its state")
         raise FmuStateError(
             f"After the state was restored the FMU gives {names[output]} = "
-            f"{float(present[output])!r} instead of {float(saved[output])!r}: {cause}."
+            f"{float(present_outputs[output])!r} instead of {float(saved_outputs[output])!r}: "
+            f"{cause}."
         )
 
 
@@ -154,7 +155,7 @@ def partial_state_sentence(fault: str) -> str:
     Parameters
     ----------
     fault : str
-        What the FMU does wrong, such as "does not restore all of its state".
+        The fault of the FMU, such as "does not restore all of its state".
     """
     return (
         f'it declares canGetAndSetFMUstate but {fault}; write `state = "replay"` into the table '

@@ -122,21 +122,21 @@ class FmiAsset(SteppedFmu):
         FmuCallError, FmuWorkerError, FmuTimeoutError
             If the FMU fails.
         """
-        saved = SavedState.from_bytes(content)
-        self._refuse_foreign(saved)
-        replays = saved.method == "replay"
+        saved_state = SavedState.from_bytes(content)
+        self._refuse_foreign(saved_state)
+        replays = saved_state.method == "replay"
         # An instance that was started in the same way takes a serialised state as it is, which
         # makes ensembles fast.
-        if replays or not self._was_started_like(saved):
-            self._start_as_saved(saved)
+        if replays or not self._was_started_like(saved_state):
+            self._start_as_saved(saved_state)
         try:
             if replays:
-                self._replay(saved)
+                self._replay(saved_state)
             else:
-                self._instance.restore(saved.body)
-                self.step_index = saved.index
-            self._request.cast("B")[HEAD_BYTES:] = saved.inputs
-            saved.refuse_other_outputs(self._present_outputs(), self._exchange.output_names)
+                self._instance.restore(saved_state.body)
+                self.step_index = saved_state.index
+            self._request.cast("B")[HEAD_BYTES:] = saved_state.inputs
+            saved_state.refuse_other_outputs(self._present_outputs(), self._exchange.output_names)
         except FmuError as error:
             self._phase = "broken"
             # an `FmuStateError` gives this advice itself
@@ -144,22 +144,22 @@ class FmiAsset(SteppedFmu):
                 error = _with_advice_to_replay(error)
             self._raise_located(error, "restoring the state")
 
-    def _was_started_like(self, saved: SavedState) -> bool:
+    def _was_started_like(self, saved_state: SavedState) -> bool:
         """Return whether the instance runs and had the same start as that of a saved state."""
         if self._phase != "ready" or self._instance.lost:
             return False
         return (
-            saved.parameters == self._parameters
-            and saved.start_inputs == self._start_inputs
-            and saved.health == self._health
-            and saved.first_index == self._first_index
+            saved_state.parameters == self._parameters
+            and saved_state.start_inputs == self._start_inputs
+            and saved_state.health == self._health
+            and saved_state.first_index == self._first_index
         )
 
-    def _start_as_saved(self, saved: SavedState) -> None:
+    def _start_as_saved(self, saved_state: SavedState) -> None:
         """Start an instance with the parameters and inputs of a saved state's start."""
-        self._health = dict(saved.health)
-        self._set_parameters(saved.parameters)
-        start_inputs = saved.start_inputs
+        self._health = dict(saved_state.health)
+        self._set_parameters(saved_state.parameters)
+        start_inputs = saved_state.start_inputs
         if not start_inputs and self.binding.binding.structural_parameters:
             # The start values of resized arrays may not fit. Zeros fill the block instead; they
             # are not sent to the FMU.
@@ -168,14 +168,14 @@ class FmiAsset(SteppedFmu):
             request = [0.0, 0.0, *np.frombuffer(start_inputs).tolist()]
         else:
             request = self._exchange.request.start_values({})
-        with_inputs = bool(saved.start_inputs)
-        self._start_instance(request, with_inputs=with_inputs, index=saved.first_index)
+        with_inputs = bool(saved_state.start_inputs)
+        self._start_instance(request, with_inputs=with_inputs, index=saved_state.first_index)
 
-    def _replay(self, saved: SavedState) -> None:
+    def _replay(self, saved_state: SavedState) -> None:
         """Repeat the steps of a saved state from its start."""
         bytes_per_step = self._bytes_of_inputs()
-        for index in range(saved.steps_since_start):
-            inputs = saved.body[index * bytes_per_step : (index + 1) * bytes_per_step]
+        for index in range(saved_state.steps_since_start):
+            inputs = saved_state.body[index * bytes_per_step : (index + 1) * bytes_per_step]
             self._request[0] = self.time
             self._request[1] = self._step_size
             self._request.cast("B")[HEAD_BYTES:] = inputs
@@ -208,25 +208,27 @@ class FmiAsset(SteppedFmu):
         """Return the size of the inputs of one step in a request block [bytes]."""
         return 8 * self._exchange.plan.input_count
 
-    def _refuse_foreign(self, saved: SavedState) -> None:
-        """Refuse a saved state that belongs to another FMU or binding, or is damaged."""
-        if saved.fmu != self.description.sha256:
+    def _refuse_foreign(self, saved_state: SavedState) -> None:
+        """Refuse a saved state that another FMU or binding has made, or that is damaged."""
+        if saved_state.fmu != self.description.sha256:
             raise FmuStateError(
                 f"The state was saved with another FMU than {self.description.label} (its hash "
                 "differs); use that one."
             )
-        if saved.step_size != self._interval or saved.start_time != self._start_time:
+        if saved_state.step_size != self._interval or saved_state.start_time != self._start_time:
             raise FmuStateError(
                 "The state was saved with another step size or start time; use that binding."
             )
         bytes_of_inputs = self._bytes_of_inputs()
-        replays = saved.method == "replay"
+        replays = saved_state.method == "replay"
         is_sound = (
-            saved.method == self.state_method
-            and len(saved.inputs) == bytes_of_inputs
-            and len(saved.start_inputs) in (0, bytes_of_inputs)
-            and saved.first_index <= saved.index
-            and not (replays and len(saved.body) != bytes_of_inputs * saved.steps_since_start)
+            saved_state.method == self.state_method
+            and len(saved_state.inputs) == bytes_of_inputs
+            and len(saved_state.start_inputs) in (0, bytes_of_inputs)
+            and saved_state.first_index <= saved_state.index
+            and not (
+                replays and len(saved_state.body) != bytes_of_inputs * saved_state.steps_since_start
+            )
         )
         if not is_sound:
             raise FmuStateError(

@@ -74,10 +74,10 @@ class InputSlot(NamedTuple):
         with np.errstate(all="ignore"):
             converted = self._converted(rows_of_steps)
             clipped = np.clip(converted, self.low, self.high)
-            refused = np.argwhere(~self._acceptable(converted, clipped))
-        if len(refused):
+            refused_positions = np.argwhere(~self._acceptable(converted, clipped))
+        if len(refused_positions):
             # name the first value that is refused, as the caller gave it
-            step, element = refused[0].tolist()
+            step, element = refused_positions[0].tolist()
             value = (
                 values if isinstance(values, int | float) else rows_of_steps[step, element].item()
             )
@@ -120,8 +120,10 @@ class InputSlot(NamedTuple):
         try:
             return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            wanted = "numbers" if history else "a number"
-            raise FmuInputError(f"{self.label} must be {wanted}, but is {values!r}.") from error
+            expected_value = "numbers" if history else "a number"
+            raise FmuInputError(
+                f"{self.label} must be {expected_value}, but is {values!r}."
+            ) from error
 
     def _varies(self, history: Float) -> bool:
         """Return whether a history (N, n), or (N,) for one value, has values for each step.
@@ -133,14 +135,15 @@ class InputSlot(NamedTuple):
         if history.shape == shape_of_one_step:
             return False
         if history.shape[1:] not in (shape_of_one_step, (count,)):
-            wanted = "a number, or one" if count == 1 else f"{count} values, or as many"
+            expected_values = "a number, or one" if count == 1 else f"{count} values, or as many"
             raise FmuInputError(
-                f"{self.label} must be {wanted} for each step, but has the shape {history.shape}."
+                f"{self.label} must be {expected_values} for each step, but has the shape "
+                f"{history.shape}."
             )
         return True
 
     def _check_count(self, array: Float, values: npt.ArrayLike) -> None:
-        """Refuse an array of another number of values than the input has."""
+        """Refuse an array whose number of values is not that of the input."""
         count = len(self.positions)
         if array.size == count:
             return
@@ -170,7 +173,8 @@ class InputSlot(NamedTuple):
             The same values, limited to the range. A value that differs from these by no more than
             the rounding error of a conversion of units is accepted.
         """
-        is_near_range = np.abs(clipped - values) <= 1e-12 * np.maximum(np.abs(clipped), 1.0)
+        rounding_error = 1e-12 * np.maximum(np.abs(clipped), 1.0)
+        is_near_range = np.abs(clipped - values) <= rounding_error
         acceptable = np.isfinite(values) & is_near_range
         if self.takes_whole_numbers:
             acceptable &= np.floor(values) == values

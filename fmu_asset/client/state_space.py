@@ -24,6 +24,10 @@ SPEED_JUMP = 1e-2
 coarse solver steps of an FMU give a little of such a jump."""
 MOST_STATES = 40
 """Largest order of a linear system that is realised from records."""
+_EXTRA_TRIPLETS = 16
+"""Triplets beyond those used, without which the last ones of a randomised SVD are inaccurate."""
+_ROUNDING_OF_MATRIX = 1e-13
+"""Singular values below this fraction of the largest are rounding errors."""
 HANKEL_ROWS = 64
 """Block rows of the Hankel matrix: samples of one column."""
 HANKEL_COLUMNS = 160
@@ -369,14 +373,15 @@ def _hankel_matrices(records: FloatArray) -> HankelMatrices:
 
 
 def _sufficient_triplets(matrix: FloatArray) -> SingularTriplets:
-    """Return the largest singular triplets of a matrix, down to its rounding if possible.
+    """Return the singular triplets of a matrix, the largest first, as many as a system may need.
 
-    A few are computed first, since that is fast and suffices for systems of few states.
+    A quarter of them is computed first, which is fast. They suffice if the last one is as small as
+    the rounding error of the matrix, because all further ones are rounding errors, too.
     """
-    few = _largest_triplets(matrix, MOST_STATES // 4 + 16)
-    if few.values[-1] <= 1e-13 * few.values[0]:
-        return few
-    return _largest_triplets(matrix, MOST_STATES + 16)
+    first_triplets = _largest_triplets(matrix, MOST_STATES // 4 + _EXTRA_TRIPLETS)
+    if first_triplets.values[-1] <= _ROUNDING_OF_MATRIX * first_triplets.values[0]:
+        return first_triplets
+    return _largest_triplets(matrix, MOST_STATES + _EXTRA_TRIPLETS)
 
 
 def _largest_triplets(matrix: FloatArray, count: int) -> SingularTriplets:
@@ -433,6 +438,7 @@ def _system_of_order(
     left_vectors = triplets.left[:, :order]
     right_vectors = triplets.right[:order]
     transition = (left_vectors / root).T @ matrices.shifted @ (right_vectors.T / root)
+    # A growing mode is wrong for the recorded system, which is stable; rounding is allowed.
     if np.max(np.abs(np.linalg.eigvals(transition))) > 1.0 + 1e-9:
         return None
     # The first block column of the controllability matrix is s(1) = transition s(0), since the
@@ -482,7 +488,7 @@ def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> 
 def _in_continuous_time(
     system: DiscreteSystem, first_outputs: FloatArray, step: float
 ) -> FmuStateSpace:
-    """Return the continuous-time system whose samples are those of a discrete-time system.
+    """Return the continuous-time system that has the samples of a discrete-time system.
 
     Forces are constant during a step (zero-order hold).
 

@@ -82,7 +82,7 @@ class SteppedFmu(OpenedFmu):
         return self._observation()
 
     def _repeat_first_step_if_contradicted(self) -> None:
-        """Repeat the first step in a new instance, if it shows that the reset has not worked.
+        """Repeat the first step in a new instance, if the step shows that the reset has failed.
 
         The host replaces the instance until it has one that was properly at its start.
         """
@@ -137,22 +137,22 @@ class SteppedFmu(OpenedFmu):
         steps: int | None = None,
         progress: Progress | None = None,
     ) -> ObservationHistory:
-        """Make many communication steps under prescribed inputs, from where the asset is.
+        """Make many communication steps under prescribed inputs, from the present state on.
 
-        The result is that of as many calls of `step`, to the bit. All inputs are checked before the
-        first step. If a step fails, the steps before it are made and the asset is where it was
-        before that one. If the FMU ends its simulation, the result ends there and says so in
-        `ended`.
+        The result equals, bit by bit, that of as many calls of `step`. All inputs are checked
+        before the first step. If a step fails, the asset stays in the state after the step before.
+        If the FMU ends its simulation, the result ends there, and its attribute `ended` says so.
 
         Parameters
         ----------
         control, health, load, port : mapping of str to (N,) array-like or float
-            Inputs by the binding's names and in its units: one for each step, or one for all; (N,
-            n) or (n,) for an array. One that is not given keeps its last value.
+            Inputs by the binding's names and in its units: a value for each step, or one for all
+            steps. An array of n values is (N, n) or (n,). An input that is not given keeps its last
+            value.
         steps : int, optional
-            Number of steps N; that of the histories if absent.
+            The number of steps N; if left out, the length of the histories.
         progress : Progress, optional
-            Where progress is shown.
+            The display of the progress.
 
         Raises
         ------
@@ -169,6 +169,7 @@ class SteppedFmu(OpenedFmu):
             "load": load,
             "port": port,
         }
+        # Health that an FMU takes only at its start can change only by a restart.
         if self._exchange.health_slots:
             return self._simulate_with_restarts(histories, steps, progress)
         return self._simulate(histories, steps, progress)
@@ -201,18 +202,18 @@ class SteppedFmu(OpenedFmu):
             self._set_begins_of_lines(requests)
         replies = np.full((count, len(self._reply)), np.nan)
         first_index = self.step_index
-        ended = self._run_in_blocks(requests, replies, progress)
-        if ended is None:
+        early_end = self._run_in_blocks(requests, replies, progress)
+        if early_end is None:
             return self._exchange.outputs.history(times[1:], replies)
         steps_made = self.step_index - first_index
-        if ended.time is not None and ended.time > times[steps_made]:
+        if early_end.time is not None and early_end.time > times[steps_made]:
             # The FMU ended within the next step: its last outputs, at the time at which it ended,
             # are added.
             steps_made += 1
-            times[steps_made] = ended.time
+            times[steps_made] = early_end.time
             replies[steps_made - 1] = np.frombuffer(self._present_outputs())
         return self._exchange.outputs.history(
-            times[1 : steps_made + 1], replies[:steps_made], ended.sentence
+            times[1 : steps_made + 1], replies[:steps_made], early_end.sentence
         )
 
     def _set_begins_of_lines(self, requests: Float) -> None:
@@ -239,7 +240,7 @@ class SteppedFmu(OpenedFmu):
         replies : (N, n_outputs) ndarray
             Filled with the reply block of each step.
         progress : Progress, optional
-            Where progress is shown.
+            The display of the progress.
 
         Returns
         -------
@@ -251,9 +252,9 @@ class SteppedFmu(OpenedFmu):
         with reporter(progress).stage("Simulating", total=total, unit="steps") as stage:
             for first in range(0, total, length):
                 block = slice(first, first + length)
-                ended = self._run_block(requests[block], replies[block], stage)
-                if ended is not None:
-                    return ended
+                early_end = self._run_block(requests[block], replies[block], stage)
+                if early_end is not None:
+                    return early_end
         return None
 
     def _run_block(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
@@ -285,7 +286,7 @@ class SteppedFmu(OpenedFmu):
     def _run_and_check_start(
         self, requests: Float, replies: Float, counter: _StepCounter
     ) -> FmuError | None:
-        """Make a block of steps; repeat it in a new instance if a reset proves not to have worked.
+        """Make a block of steps; repeat it in a new instance if a reset proves to have failed.
 
         Parameters
         ----------
@@ -344,7 +345,7 @@ class _StepCounter:
     Parameters
     ----------
     stage : Stage
-        Where progress is shown.
+        The stage that shows the progress.
 
     Attributes
     ----------
@@ -356,7 +357,7 @@ class _StepCounter:
         self._stage = stage
         self.made = 0
 
-    def report(self, made: int) -> None:
+    def report(self, steps_made: int) -> None:
         """Set the number of steps made so far, and show the progress since the last call."""
-        self._stage.advance(made - self.made)
-        self.made = made
+        self._stage.advance(steps_made - self.made)
+        self.made = steps_made

@@ -87,8 +87,10 @@ def conversion(
 def _conversion_from_display_unit(
     display_unit: str, unit: str, definitions: Sequence[UnitInfo]
 ) -> Conversion | None:
-    """Return the conversion from a display unit of a unit to that unit; None if it is none."""
-    definition = next((known for known in definitions if known.name == unit), None)
+    """Return the conversion from a display unit to its unit; None if the unit does not have it."""
+    definition = next(
+        (unit_definition for unit_definition in definitions if unit_definition.name == unit), None
+    )
     if definition is None:
         return None
     # the FMU states: displayed value = factor * value + offset
@@ -102,22 +104,24 @@ def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
     """Return a sentence for every unit that an FMU defines otherwise than is common."""
     sentences = []
     for definition in definitions:
-        common = meaning_of(definition.name)
-        if common is None or definition.exponents is None:
+        common_meaning = meaning_of(definition.name)
+        if common_meaning is None or definition.exponents is None:
             continue
         # Radians are a dimension in FMI, but not in SI; "1/s" and "rad/s" are mixed up everywhere.
-        if definition.exponents[:-1] != common.exponents[:-1]:
+        if definition.exponents[:-1] != common_meaning.exponents[:-1]:
             sentences.append(
                 f"The unit {definition.name!r} is defined with another dimension than usual."
             )
             continue
-        same_factor = math.isclose(definition.factor, common.factor, rel_tol=1e-6)
-        same_offset = math.isclose(definition.offset, common.offset, rel_tol=1e-6, abs_tol=1e-9)
+        same_factor = math.isclose(definition.factor, common_meaning.factor, rel_tol=1e-6)
+        same_offset = math.isclose(
+            definition.offset, common_meaning.offset, rel_tol=1e-6, abs_tol=1e-9
+        )
         if not (same_factor and same_offset):
             sentences.append(
                 f"The unit {definition.name!r} is defined with the factor {definition.factor:g} "
-                f"and the offset {definition.offset:g}; usual are {common.factor:g} and "
-                f"{common.offset:g}."
+                f"and the offset {definition.offset:g}; usual are {common_meaning.factor:g} and "
+                f"{common_meaning.offset:g}."
             )
     return sentences
 
@@ -154,7 +158,7 @@ def between(
 
 
 def meaning(unit: str, definitions: Sequence[UnitInfo]) -> Meaning | None:
-    """Return the meaning of a unit in SI: by its definition if there is one, else as is common.
+    """Return the meaning of a unit in SI: that of the FMU's definition, or else the common one.
 
     None if the unit is unknown.
     """

@@ -32,9 +32,9 @@ class Inputs(TypedDict, total=False):
 
 
 def inputs_by_role(inputs: Inputs) -> InputsByRole:
-    """Return the keyword arguments of a call as inputs by role.
+    """Return the keyword arguments of a call, after a check that each one is a role of inputs.
 
-    A misspelt keyword, which would otherwise be ignored, is refused.
+    Without the check, a misspelt keyword would be ignored.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def inputs_by_role(inputs: Inputs) -> InputsByRole:
     roles = Inputs.__annotations__
     for role in inputs:
         if role not in roles:
-            raise TypeError(f"Inputs are {', '.join(roles)}, but {role!r} was given.")
+            raise TypeError(f"The inputs are {', '.join(roles)}, but {role!r} was given.")
     return cast("InputsByRole", inputs)
 
 
@@ -61,5 +61,5 @@ def _plain_value(value: npt.ArrayLike) -> PlainValue:
     array = np.asarray(value)
     if array.dtype.kind != "U":
         array = np.asarray(value, dtype=np.float64)
-    plain: PlainValue = array.item() if array.ndim == 0 else array.ravel().tolist()
-    return plain
+    plain_value: PlainValue = array.item() if array.ndim == 0 else array.ravel().tolist()
+    return plain_value

@@ -1,4 +1,4 @@
-"""FMUs that fly beside the wing: the damage that grows, and the gauges that read its strains."""
+"""FMUs that are coupled to a wing: damage that grows, and gauges that read strains."""
 
 COMPANION_NAMES = ("damage_growth", "strain_gauges")
 """The names of the companions; `fmu_asset.companions.build` packs them."""

@@ -40,7 +40,7 @@ class ScriptEntry(NamedTuple):
     first, last : float
         The times after the start between which its marks lie [s].
     gains : tuple of float
-        What each region loses at each of these marks.
+        The loss that each region gains at each of these marks.
     """
 
     first: float

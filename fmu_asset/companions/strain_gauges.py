@@ -86,7 +86,7 @@ class StrainGaugesBehaviour:
         return outputs
 
     def _outputs(self, time: float, strains: Sequence[float], reading_number: int) -> list[float]:
-        """Return the readings, then for each gauge 1 if it is received and 0 if it is lost."""
+        """Return the readings, followed by one number for each gauge: 1 if received, 0 if lost."""
         # systematic errors
         readings = []
         for gain, strain, offset in zip(self._gains, strains, self._offsets, strict=True):
@@ -94,22 +94,24 @@ class StrainGaugesBehaviour:
         for drift in self._drifts:
             readings[drift.gauge] += drift.rate * max(0.0, time - drift.start)
         # noise, and loss by chance
-        received = [1.0] * len(strains)
+        received_flags = [1.0] * len(strains)
         if self._noise or self._loss_probability:
             generator = random.Random(f"{self._seed}:{reading_number}")
             readings = [reading + self._noise * normal(generator) for reading in readings]
             if self._loss_probability:
-                received = [float(generator.random() >= self._loss_probability) for _ in strains]
+                received_flags = [
+                    float(generator.random() >= self._loss_probability) for _ in strains
+                ]
         # loss by the clock
         for window in self._loss_windows:
             if window.start < time <= window.end:
-                received[window.gauge] = 0.0
+                received_flags[window.gauge] = 0.0
         if self._blackout_start < time <= self._blackout_end:
-            received = [0.0] * len(strains)
-        for gauge, is_received in enumerate(received):
+            received_flags = [0.0] * len(strains)
+        for gauge, is_received in enumerate(received_flags):
             if not is_received:
                 readings[gauge] = 0.0
-        return readings + received
+        return readings + received_flags
 
     def state(self) -> list[float]:
         """Return the number of the last reading."""

@@ -169,9 +169,9 @@ def compiled_members(
     Parameters
     ----------
     model : ReducedArrays
-        The reduced structure.
+        The reduced model of the structure.
     declaration : Declaration
-        What the FMU declares for co-simulation.
+        The declarations of the FMU for co-simulation.
     roles : StructureRoles
         The role of each of its variables.
     fmi : {2, 3}

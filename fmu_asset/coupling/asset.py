@@ -140,7 +140,7 @@ class CoupledAsset(FmiAsset):
 
 
 def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) -> None:
-    """Refuse components in a circle whose state cannot be saved, which iterations need."""
+    """Refuse a circle of components that cannot save their state, as an iteration repeats steps."""
     for group in order.circles:
         for name in group:
             if assets[name].state_method != "serialised":

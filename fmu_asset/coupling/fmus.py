@@ -103,7 +103,7 @@ class CoupledFmus(InstanceHost):
     components : dict of str to SteppedComponent
         The components, by name.
     assets : dict of str to FmiAsset
-        Their FMUs, by name.
+        The FMUs of the components, by name.
     jacobi : bool
         Whether all components take the outputs at the beginning of the step.
     iterations : int
@@ -203,7 +203,7 @@ class CoupledFmus(InstanceHost):
     # instance
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
-        """Initialise the components in order; each takes the initial outputs of those before it.
+        """Initialise the components in order, each with the initial outputs of its predecessors.
 
         An input whose source comes later starts at the FMU's own start value.
 
@@ -269,9 +269,11 @@ class CoupledFmus(InstanceHost):
     def save(self) -> bytes:
         """Return the states of the components and the values that they had exchanged."""
         states = [asset.save_state() for asset in self.assets.values()]
-        held = {name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()}
+        held_inputs = {
+            name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()
+        }
         state = CoupledState(
-            held=held,
+            held=held_inputs,
             outputs=self._outputs.tolist(),
             before=self._outputs_before.tolist(),
             sizes=[len(state) for state in states],
@@ -281,15 +283,15 @@ class CoupledFmus(InstanceHost):
 
     def restore(self, content: bytes) -> None:
         """Bring the components to a state that `save` returned."""
-        saved = CoupledState.from_bytes(content)
-        component_states = saved.components
+        saved_state = CoupledState.from_bytes(content)
+        component_states = saved_state.components
         self._at_different_times = True
         for (name, asset), state in zip(self.assets.items(), component_states, strict=True):
             with errors_of_component(name):
                 asset.restore_state(state)
-        self._held_inputs = saved.held
-        self._outputs = np.array(saved.outputs)
-        self._outputs_before = np.array(saved.before)
+        self._held_inputs = saved_state.held
+        self._outputs = np.array(saved_state.outputs)
+        self._outputs_before = np.array(saved_state.before)
         self._at_different_times = False
 
     def take_log(self) -> list[tuple[int, str]]:
@@ -342,7 +344,7 @@ class CoupledFmus(InstanceHost):
         Parameters
         ----------
         component : SteppedComponent
-            The component.
+            The component of the coupled system.
         outputs, outputs_before : (O,) array
             All outputs, now and at the beginning of the step.
         """
@@ -360,7 +362,7 @@ class CoupledFmus(InstanceHost):
         Parameters
         ----------
         component : SteppedComponent
-            The component.
+            The component of the coupled system.
         fed_values : dict of str to float
             The ends of the lines by input; changed by this call.
         source_outputs : (O,) array
@@ -387,7 +389,7 @@ class CoupledFmus(InstanceHost):
         return begins
 
     def _iterate(self, group: Sequence[str]) -> None:
-        """Repeat the step of a circle of components until what they exchange has settled.
+        """Repeat the step of a circle of components until the exchanged values have converged.
 
         Raises
         ------

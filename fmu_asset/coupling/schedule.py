@@ -91,10 +91,10 @@ def schedule(
             name: [follower for follower in direct_followers[name] if follower in group]
             for name in group
         }
-        ordered: list[str] = []
+        ordered_names: list[str] = []
         for component_group in strong_components(direct_inside):
-            ordered += component_group
-        groups.append(tuple(ordered))
+            ordered_names += component_group
+        groups.append(tuple(ordered_names))
     circles = []
     for group in groups:
         first_name = group[0]
@@ -104,14 +104,14 @@ def schedule(
     for group in groups:
         for name in group:
             position[name] = len(position)
-    held = []
+    held_connections = []
     for connection in connections:
         if position[connection.source.component] >= position[connection.target.component]:
-            held.append(connection)
+            held_connections.append(connection)
     return Schedule(
         groups=tuple(groups),
         circles=frozenset(circles),
-        held=tuple(held),
+        held=tuple(held_connections),
         loops=algebraic_loops(connections, feedthrough),
     )
 
@@ -237,12 +237,12 @@ def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
     circles = []
     for loop in loops[:_SHOWN_LOOPS]:
         circles.append(" -> ".join(str(end) for end in loop))
-    shown = "; ".join(circles)
+    circle_list = "; ".join(circles)
     if len(loops) > _SHOWN_LOOPS:
-        shown += f" and {len(loops) - _SHOWN_LOOPS} more"
+        circle_list += f" and {len(loops) - _SHOWN_LOOPS} more"
     subject = "an algebraic loop" if len(loops) == 1 else f"{len(loops)} algebraic loops"
     return (
-        f"The connections close {subject} ({shown}): every value in it depends on itself at the "
-        "same moment; delay one of its connections, allow iterations, or take the algorithm "
+        f"The connections close {subject} ({circle_list}): every value in it depends on itself at "
+        "the same moment; delay one of its connections, allow iterations, or take the algorithm "
         "jacobi, which delays all of them."
     )

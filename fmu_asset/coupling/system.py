@@ -79,7 +79,7 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     sha256 : str
         A hash of everything that the meaning of a saved state depends on.
     """
@@ -156,7 +156,7 @@ def _component_variable(
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     end : Endpoint
         The component and its variable.
     info : VariableInfo
@@ -201,7 +201,7 @@ def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> st
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     binding : Binding
         A binding of it.
     *algorithm : str or float
@@ -262,12 +262,12 @@ class SteppedComponent:
 def stepped_components(
     wiring: Wiring, exchange: Exchange, *, linear: bool = False
 ) -> dict[str, SteppedComponent]:
-    """Return the components of a system as the system steps them, by name.
+    """Return the components of a system, ready to be stepped, by name.
 
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     exchange : Exchange
         A binding of its description.
     linear : bool
@@ -295,7 +295,7 @@ def stepped_components(
 def _stepped_component(
     wiring: Wiring, exchange: Exchange, component: Component, *, linear: bool
 ) -> SteppedComponent:
-    """Return one component as the system steps it; see `stepped_components`."""
+    """Return one component of a system, ready to be stepped; see `stepped_components`."""
     name = component.name
     infos = {info.name: info for info in wiring.declared[name].variables}
     fed = {}
@@ -380,7 +380,7 @@ def _ends_at(exchange: Exchange, component: str, variables: Iterable[str]) -> li
 
 
 def _read_outputs(wiring: Wiring, exchange: Exchange, component: str) -> tuple[Endpoint, ...]:
-    """Return the outputs of a component that others or the binding read, or else any one output.
+    """Return the outputs of a component that are read by others or by the binding; at least one.
 
     Raises
     ------

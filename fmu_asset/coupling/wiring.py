@@ -147,16 +147,16 @@ class Wiring:
         self.schedule: Schedule = schedule(names, immediate, self._used_feedthrough())
 
     def _used_feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the direct inputs of outputs, and of other variables that a connection reads."""
+        """Return the inputs that act at once on each output, and on other variables in use."""
         sources = {connection.source for connection in self.structure.connections}
-        used: dict[str, dict[str, frozenset[str]]] = {}
+        used_inputs: dict[str, dict[str, frozenset[str]]] = {}
         for component, description in self.declared.items():
-            used[component] = {}
+            used_inputs[component] = {}
             for variable, inputs in description.feedthrough.items():
                 end = Endpoint(component, variable)
                 if end in sources or self.variable(end).causality == "output":
-                    used[component][variable] = inputs
-        return used
+                    used_inputs[component][variable] = inputs
+        return used_inputs
 
     # ------------------------------------------------------------------ ends
 
@@ -243,11 +243,11 @@ class Wiring:
             self.units[connector] = unit
 
     def _source(self, connection: Connection) -> VariableInfo:
-        """Return the variable or connector at the source of a connection, if it can be one."""
+        """Return the variable or connector at the source of a connection; refuse any other end."""
         source = connection.source
         if source.component:
-            needed = "an output of a single number is needed"
-            return self._single(source, READABLE, "the source of a connection", needed)
+            requirement = "an output of a single number is needed"
+            return self._single(source, READABLE, "the source of a connection", requirement)
         connector = self._connector(source, ("input", "parameter"), "the source")
         if connection.delayed:
             raise CouplingError(f"The connection from the input {source} cannot be delayed.")
@@ -264,11 +264,11 @@ class Wiring:
         causalities: tuple[str, ...] = ("input",)
         if not connection.source.component and source_info.causality != "input":
             causalities = (source_info.causality, "input")
-        needed = f"a single number is needed as {' or '.join(causalities)}"
-        return self._single(target, causalities, "the target of this connection", needed)
+        requirement = f"a single number is needed as {' or '.join(causalities)}"
+        return self._single(target, causalities, "the target of this connection", requirement)
 
     def _single(
-        self, end: Endpoint, causalities: tuple[str, ...], role: str, needed: str
+        self, end: Endpoint, causalities: tuple[str, ...], role: str, requirement: str
     ) -> VariableInfo:
         """Return the variable at an end, which must be a single number of one of these causalities.
 
@@ -279,13 +279,13 @@ class Wiring:
         causalities : tuple of str
             The causalities that the variable may have.
         role, needed : str
-            The role of the end, and what is needed there, for the message.
+            The role of the end, and the requirement that it must meet, for the message.
         """
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:
             raise CouplingError(
                 f"{end} cannot be {role}: it is declared as {variable.causality} of the type "
-                f"{variable.kind}, and {needed}."
+                f"{variable.kind}, and {requirement}."
             )
         return variable
 
@@ -339,7 +339,7 @@ class Wiring:
         Parameters
         ----------
         component : Component
-            The component.
+            The component of the coupled system.
         leave_out_unknown : bool
             Whether those of unknown variables are added to `left_out` instead of refused.
         """
@@ -389,10 +389,10 @@ class Wiring:
         if isinstance(value, str) and value in variable.items:
             return float(variable.items[value])
         if isinstance(value, str | bytes):
-            accepted = comma_list(variable.items) if variable.items else "a number"
+            accepted_values = comma_list(variable.items) if variable.items else "a number"
             raise CouplingError(
                 f"{end} cannot be set to {value!r}: it is of the type {variable.kind}, and takes "
-                f"{accepted}."
+                f"{accepted_values}."
             )
         fmu_units = self.declared[end.component].units
         known_units = (*setting.units, *self.structure.units, *fmu_units)

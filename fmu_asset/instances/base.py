@@ -88,7 +88,7 @@ class FmuInstance(Instance):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
@@ -374,7 +374,7 @@ class FmuInstance(Instance):
         Parameters
         ----------
         verb : {"Set", "Get"}
-            Whether variables are set or read.
+            Whether the calls set or read the variables.
         groups : tuple of VariableGroup
             The groups, which follow one another in the block.
         doubles : C array of double
@@ -413,7 +413,7 @@ class FmuInstance(Instance):
         calls : list of FmiCall
             The calls.
         purpose : str
-            What the calls are for, for the message if the FMU refuses one.
+            The purpose of the calls, for the message if the FMU refuses one.
 
         Raises
         ------
@@ -461,18 +461,19 @@ class FmuInstance(Instance):
         return f"the step from t = {self._step_begin.value:g} s"
 
     def _call_error(self, function: str, status: int, purpose: str) -> FmuCallError:
-        """Return the error for a call that was not accepted; mark the instance as lost if it is.
+        """Return the error for a call that the FMU did not accept.
 
-        FMI allows some calls after an error. They are not used: the asset makes another instance.
+        Unless the FMU only discarded the call, the instance is marked as lost. FMI would allow some
+        further calls to a lost instance. None is made, and the asset replaces the instance.
 
         Parameters
         ----------
         function : str
-            The full name of the C function.
+            The full name of the C function that was called.
         status : int
-            The status that it returned.
+            The status that the function returned.
         purpose : str
-            What it was called for.
+            The purpose of the call, for the message: "initialisation".
         """
         self.lost = self.lost or status != DISCARD
         consequence = {

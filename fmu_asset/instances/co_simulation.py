@@ -53,7 +53,7 @@ class CoSimulation(FmuInstance):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
     """
 
     classes = {1: FMU1CoSimulation, 2: FMU2Slave, 3: FMU3Slave}  # noqa: RUF012

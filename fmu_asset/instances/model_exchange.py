@@ -27,7 +27,7 @@ _MOST_EVENT_ITERATIONS = 100
 _MOST_EVENTS_IN_A_STEP = 10_000
 _MOST_INTERNAL_STEPS = 100_000
 _ROUNDING = 1e-12
-"""Share of a step by which two times may differ and still be the same."""
+"""Fraction of a step below which two times count as the same."""
 
 for _name in ("SUNLinSolFree", "SUNMatDestroy", "SUNContext_Free"):
     getattr(sundials_core, _name).argtypes = [ctypes.c_void_p]

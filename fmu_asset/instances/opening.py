@@ -12,7 +12,7 @@ def open_instance(plan: Plan) -> FmuInstance:
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Raises
     ------

@@ -193,7 +193,7 @@ class GroupArguments(NamedTuple):
 
 
 def values_of(block: DoubleBlock) -> Float:
-    """Return a C array of doubles as an array that shares its memory."""
+    """Return an array that shares the memory of a C array of doubles."""
     return np.frombuffer(memoryview(block).cast("B"))
 
 
@@ -267,7 +267,7 @@ def prepare_call(function: CFunction, *arguments: object) -> Callable[[], int]:
 
 
 _ROUNDING = 1e-12
-"""Share of a step by which a time may miss its end."""
+"""Fraction of a step by which a time may miss the end of the step."""
 
 
 class LinearInputs:
@@ -282,7 +282,7 @@ class LinearInputs:
         The request block: time, step size, inputs at the end of the step, linear inputs at its
         begin.
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
@@ -337,7 +337,7 @@ class Instance(Protocol):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
@@ -412,22 +412,22 @@ class Instance(Protocol):
         step = self.step
         sum_of_squares = reply.dot
         now = time.monotonic
-        done = 0
+        steps_done = 0
         next_report = now() + REPORT_PERIOD
         try:
             for request_row, reply_row in zip(requests, replies, strict=True):
                 request[:] = request_row
                 step()
                 reply_row[:] = reply
-                done += 1
+                steps_done += 1
                 # a fast test first: the sum of squares can be infinite for large values, too
                 if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
                     return
                 if now() > next_report:
-                    report(done)
+                    report(steps_done)
                     next_report = now() + REPORT_PERIOD
         finally:
-            report(done)
+            report(steps_done)
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""

@@ -51,7 +51,7 @@ class FmuInfo:
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     guid : str
         The GUID, which follows from the content.
     design_hash : str
@@ -228,10 +228,10 @@ def package_members(package: str, folder: str) -> dict[str, bytes]:
     folder : str
         The folder of the archive for the package.
     """
-    packed = {}
+    content_of_member = {}
     for name, content in read_members(Path(str(files(package))), [".py"]).items():
-        packed[f"{folder}/{name}"] = content.replace(b"from fe.runtime", b"from ..fe")
-    return packed
+        content_of_member[f"{folder}/{name}"] = content.replace(b"from fe.runtime", b"from ..fe")
+    return content_of_member
 
 
 def _license(package: str) -> bytes:
@@ -296,7 +296,7 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Replace the placeholder in the files of an FMU by their hash, and pack them into an archive.
+    """Put the hash of an FMU's files in the place of the placeholder, and pack the files.
 
     The hash is taken over the names and contents of the files with the placeholder, so that equal
     files give equal bytes.
@@ -319,7 +319,7 @@ def sealed(
 
 
 def with_identity(
-    members: Mapping[str, bytes], old: ContentIdentity, new: ContentIdentity
+    members: Mapping[str, bytes], old_identity: ContentIdentity, new_identity: ContentIdentity
 ) -> dict[str, bytes]:
     """Return the files of an FMU with another tag and GUID, in their names and texts.
 
@@ -327,7 +327,7 @@ def with_identity(
     ----------
     members : mapping of str to bytes
         The files by name.
-    old, new : ContentIdentity
+    old_identity, new : ContentIdentity
         The tag and GUID in the files, and those to be written instead.
     """
     renamed_members = {}
@@ -336,10 +336,13 @@ def with_identity(
         if name.endswith(_TEXT_SUFFIXES):
             # The GUID is first: in a template it is the same placeholder as the tag.
             for pattern in _GUID_PATTERNS.get(name, ()):
-                old_guid, new_guid = pattern.format(old.guid), pattern.format(new.guid)
+                old_guid, new_guid = (
+                    pattern.format(old_identity.guid),
+                    pattern.format(new_identity.guid),
+                )
                 new_content = new_content.replace(old_guid.encode(), new_guid.encode())
-            new_content = new_content.replace(old.tag.encode(), new.tag.encode())
-        renamed_members[name.replace(old.tag, new.tag)] = new_content
+            new_content = new_content.replace(old_identity.tag.encode(), new_identity.tag.encode())
+        renamed_members[name.replace(old_identity.tag, new_identity.tag)] = new_content
     return renamed_members
 
 

@@ -130,7 +130,7 @@ def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: 
     Parameters
     ----------
     file : Path
-        The script.
+        The path of the script.
     model_class : type of Fmi2Slave
         The slave class that it defines.
     identifier : str
@@ -205,7 +205,7 @@ def _set_units_and_ranges(
     Parameters
     ----------
     file : Path
-        The script.
+        The path of the script.
     variables : Element
         The XML element of the model description with the variables; it is changed.
     table, units : mapping
@@ -232,5 +232,5 @@ def _set_units_and_ranges(
 
 
 def _attribute_text(value: str | float) -> str:
-    """Return a limit of a variable as an XML attribute; a float is written with all its digits."""
+    """Return a limit of a variable as an XML attribute, a float with all its digits."""
     return value if isinstance(value, str) else repr(float(value))

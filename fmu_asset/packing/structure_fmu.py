@@ -200,7 +200,7 @@ def _python_structure_members(
     Parameters
     ----------
     model : ReducedModel
-        The reduced structure.
+        The reduced model of the structure.
     declaration : Declaration
         The name, description and variables of the FMU.
     start : mapping of str to float
@@ -236,7 +236,7 @@ def _patched_members(
     Parameters
     ----------
     model : ReducedModel
-        The wing.
+        The reduced model of the wing.
     effects : sequence of dict
         The effects as `PatchFile.plain` has them.
     arrays : PatchArrays or None
@@ -258,8 +258,9 @@ def _patched_members(
         return members
     if arrays is None:
         raise PatchFileError(
-            "The patch changes structure or loads, for which the FMU needs the wing in the basis "
-            "for patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
+            "The patch changes structure or loads, for which the FMU needs the arrays of the "
+            "patched wing: give them as `arrays`, as `fe.reduction.model_cache.patch_arrays` "
+            "returns them."
         )
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(
@@ -283,7 +284,7 @@ def _patched_members(
 
 
 def stem_of(model: ReducedModel) -> str:
-    """Return the name of a structure as an identifier of C, with at most 40 characters of it."""
+    """Return an identifier of C made from the first 40 characters of a structure's name."""
     plain_name = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:_LONGEST_STEM]
     if plain_name[:1].isalpha():
         return plain_name
@@ -433,7 +434,7 @@ def needed_patch_arrays(
     Parameters
     ----------
     design : WingDesign
-        The wing.
+        The design of the wing.
     patch : PatchFile or None
         Missing effects that the FMU carries.
     progress : Progress, optional

@@ -179,9 +179,9 @@ class Slave:
         checked_rows : int
             The number of rows, from the first, whose values must lie in their ranges.
         action : str
-            What is done, for messages.
+            The action, for messages.
         consequence : str
-            What a refusal means, for messages.
+            The consequence of a refusal, for messages.
         """
         try:
             if not self._check_ranges(checked_rows, consequence):
@@ -213,7 +213,7 @@ class Slave:
         return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
-        """Return whether a step is possible now; if not, refuse it with a message."""
+        """Return whether a step is possible now; if it is not, log a message that says why."""
         if self._phase != READY:
             phase = _PHASE_NAMES[self._phase]
             return self._refuse(Status.BAD_CALL, f"a step was requested {phase}")
@@ -224,6 +224,7 @@ class Slave:
                 f"the step from t = {current_time!r} s over {step_size!r} s was refused: the "
                 "communication point must be finite, the step size finite and positive",
             )
+        # The master adds up its steps with rounding errors of its own.
         tolerance = 1e-6 * step_size + 1e-9 * abs(self._time)
         if abs(current_time - self._time) > tolerance:
             return self._refuse(
@@ -380,7 +381,7 @@ class Slave:
         first, end : int
             First row, and end of the rows.
         consequence : str
-            What a refusal means, for messages.
+            The consequence of a refusal, for messages.
         """
         values = self._values
         for index in range(first, end):

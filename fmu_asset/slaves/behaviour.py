@@ -48,9 +48,9 @@ class StructureBehaviour:
     Parameters
     ----------
     model : ReducedModel
-        The reduced structure.
+        The reduced model of the structure.
     table : sequence of FmuVariable
-        Its variables, the inputs first.
+        The variables of the FMU, the inputs first.
     roles : StructureRoles
         Roles of variables.
     effects : SwitchableEffects, optional
@@ -252,7 +252,7 @@ class StructureBehaviour:
     # ------------------------------------------------------------ steps
 
     def _take_parameters(self, parameters: Mapping[str, float]) -> None:
-        """Set the parameters, and what follows from them."""
+        """Set the parameters, among them the damping and whether the response is transient."""
         self._parameters = dict(parameters)
         self._damping = (parameters["damping.alpha"], parameters["damping.beta"])
         self._is_transient = int(parameters["response"]) == TRANSIENT
@@ -392,7 +392,7 @@ class StructureBehaviour:
     def _read_by_sensors(
         self, active: ActiveEffects, outputs: list[float], duration: float, end: float
     ) -> list[float]:
-        """Return the outputs as sensors with effects read them; keep their filters' memory.
+        """Return the outputs as read by sensors with effects, and keep the memory of their filters.
 
         Parameters
         ----------

@@ -89,7 +89,7 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
-    """Return the unit of a parameter of a primitive, in the spelling of FMI, such as "N.s".
+    """Return the unit of a primitive's parameter as FMI spells it, such as "N.s".
 
     A primitive is an elementary change of a model or of a sensor. The unit is "1" if the parameter
     has no unit.

@@ -28,12 +28,12 @@ def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[
         Roles of variables.
     """
     reference = {row.name: row.reference for row in table}
-    bound = reference["strain_error_bound"]
+    bound_row = reference["strain_error_bound"]
     point_or_bound = reference[roles.load_point or roles.displacement_bound or ""]
     first_mode = reference["frequency[1]"]
     mode_count = sum(name.startswith("frequency[") for name in reference)
     return (
-        slice(bound, bound + 1),
+        slice(bound_row, bound_row + 1),
         slice(point_or_bound, point_or_bound + 1),
         slice(first_mode, first_mode + 2 * mode_count),  # frequencies, then damping ratios
     )
@@ -54,11 +54,11 @@ def load_contents(resources: Path) -> SlaveContents:
         if not name.startswith("effect."):
             structure_start[name] = value
     table, roles = structure_table(model, structure_start)
-    later = later_outputs(table, roles)
+    pending_outputs = later_outputs(table, roles)
     make_behaviour = partial(StructureBehaviour, model, table, roles)
     effects_file = resources / "effects.json"
     if not effects_file.is_file():
-        return SlaveContents(table, make_behaviour, later)
+        return SlaveContents(table, make_behaviour, pending_outputs)
     # a structure without effects needs none of these modules
     from fe.runtime.patch_arrays import PatchArrays
 
@@ -72,5 +72,5 @@ def load_contents(resources: Path) -> SlaveContents:
     return SlaveContents(
         table + rows,
         lambda: make_behaviour(SwitchableEffects(effects, gauge_count, arrays)),
-        later,
+        pending_outputs,
     )

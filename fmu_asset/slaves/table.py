@@ -104,7 +104,7 @@ def structure_table(
     Parameters
     ----------
     model : ReducedModel
-        The reduced structure.
+        The reduced model of the structure.
     start : mapping of str to float
         Start values by variable name that replace the nominal ones.
 
@@ -202,7 +202,7 @@ class _ModelTable(VariableTable):
     Parameters
     ----------
     model : ReducedModel
-        The reduced structure.
+        The reduced model of the structure.
     start : mapping of str to float
         Start values by variable name that replace the nominal ones.
     texts : mapping of str to str
@@ -234,9 +234,9 @@ class _ModelTable(VariableTable):
         Parameters
         ----------
         group : _ValueGroup
-            Its group.
+            The group of the variable.
         name, variable : str
-            Its name in the model and in the FMU.
+            The name of the value in the model, and that of the variable in the FMU.
         """
         self.add(
             variable,

@@ -39,7 +39,7 @@ class EnumerationType:
     Attributes
     ----------
     name, description : str
-        Its name, and a line for people.
+        The name of the variable, and a line that describes it to people.
     items : tuple of (str, int, str)
         Name, value and description of each item.
     """

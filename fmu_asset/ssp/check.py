@@ -32,7 +32,7 @@ class SspCheck:
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     problems : tuple of str
         One sentence for each problem; empty if none was found.
     components : tuple of (str, str)
@@ -88,12 +88,12 @@ def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
 
 
 def _difference_from_fmu(wiring: Wiring, end: Endpoint, connector: Connector) -> str:
-    """Return how a component's connector differs from its FMU's variable; empty if it does not.
+    """Return how a component's connector differs from the FMU's variable; empty if they agree.
 
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     end : Endpoint
         The component and its variable.
     connector : Connector
@@ -119,7 +119,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     file : Path
         The SSP file that it comes from.
     """
@@ -138,7 +138,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
 
 
 def _settable_names(wiring: Wiring) -> list[str]:
-    """Return the names of all parameters and inputs, of the system and of its components."""
+    """Return the names of all parameters and inputs that the system and its components have."""
     names = [
         connector.name for connector in wiring.structure.connectors if connector.kind != "output"
     ]

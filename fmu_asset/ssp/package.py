@@ -68,12 +68,12 @@ class SspPackage:
     Parameters
     ----------
     path : path-like
-        The file.
+        The path of the file.
 
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     names : set of str
         The names of the files in the archive.
 
@@ -164,7 +164,7 @@ def parse_xml(content: bytes, label: str) -> XmlElement:
     Parameters
     ----------
     content : bytes
-        The text.
+        The text of the file.
     label : str
         The name of the text in messages.
 
@@ -189,7 +189,7 @@ def parse_xml(content: bytes, label: str) -> XmlElement:
 
 
 def _convert_to_ssp1(root: XmlElement, label: str) -> None:
-    """Change a document of SSP 2.0 into SSP 1.0, as far as it is read.
+    """Change those parts of an SSP 2.0 document that are read here into SSP 1.0.
 
     SSP 2.0 has the same namespaces and more words. The numbers of FMI 3 become the two that SSP 1.0
     knows; the FMU that they come from decides their size. Metadata and signatures are left out.

@@ -70,11 +70,11 @@ class ParameterReader:
 
     def transformation(self, element: XmlElement, label: str) -> Conversion:
         """Return the linear transformation of a connection or mapping entry."""
-        linear = element.find("ssc:LinearTransformation", NAMESPACES)
-        if linear is None:
+        transformation_element = element.find("ssc:LinearTransformation", NAMESPACES)
+        if transformation_element is None:
             return IDENTITY
-        factor = self._finite(linear.get("factor", "1"), f"the factor of {label}")
-        offset = self._finite(linear.get("offset", "0"), f"the offset of {label}")
+        factor = self._finite(transformation_element.get("factor", "1"), f"the factor of {label}")
+        offset = self._finite(transformation_element.get("offset", "0"), f"the offset of {label}")
         return Conversion(factor, offset)
 
     def _finite(self, text: str, label: str) -> float:

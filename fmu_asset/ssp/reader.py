@@ -42,7 +42,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
     Parameters
     ----------
     path : path-like
-        The file.
+        The path of the file.
     folder : path-like
         The folder for its FMUs; made if it is missing.
 
@@ -367,7 +367,7 @@ class _SystemReader:
         return chain
 
     def _set_from_chain(self, target: Endpoint, chain: list[Connection]) -> None:
-        """Give an end the value that is set at a connector on the way to it.
+        """Set the value at the end of a chain of connections that is set at a connector on its way.
 
         Of several such connectors the outermost one counts.
         """
@@ -375,21 +375,23 @@ class _SystemReader:
             connector = connection.source
             if connector.component in self.components or connector not in self.settings:
                 continue
-            for later in chain[index:]:
-                if later.scale != IDENTITY or not later.convert_units:
+            for later_connection in chain[index:]:
+                if later_connection.scale != IDENTITY or not later_connection.convert_units:
                     raise package_error(
                         self.package,
                         f"{str(connector)!r} is set and transformed on its way to {str(target)!r}; "
-                        "set that instead.",
+                        "set the latter instead.",
                     )
             self.settings[target] = self.settings[connector]
             return
 
     def _joined(self, chain: list[Connection]) -> Connection:
-        """Return one connection for those that follow one another through nested systems."""
+        """Return one connection in the place of a chain of connections through nested systems."""
         source, target = chain[0].source, chain[-1].target
         scale = reduce(Conversion.then, (connection.scale for connection in chain))
-        has_units_on_the_way = any(self.connectors[later.source].unit for later in chain[1:])
+        has_units_on_the_way = any(
+            self.connectors[later_connection.source].unit for later_connection in chain[1:]
+        )
         all_convert = all(connection.convert_units for connection in chain)
         some_convert = any(connection.convert_units for connection in chain)
         if all_convert != some_convert or (scale != IDENTITY and has_units_on_the_way):

@@ -42,7 +42,7 @@ def write_ssp(
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     path : path-like
         Where to write, with the suffix .ssp.
     parameter_names : mapping of Endpoint to str, optional
@@ -184,7 +184,7 @@ def _written_parameters(
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     names : mapping of Endpoint to str
         Names of parameters in the parameter set, where they are not `component.variable`.
     units : mapping of str
@@ -218,7 +218,7 @@ def _written_parameters(
 
 
 def _number_text(end: Endpoint, variable: VariableInfo, value: float) -> str:
-    """Return a number as a parameter set has it; of an enumeration, the name of the item."""
+    """Return the text of a number in a parameter set; for an enumeration, the name of its item."""
     if variable.base_type == "Real":
         return repr(value)
     if variable.base_type == "Boolean":

@@ -196,7 +196,7 @@ def filter_calls(*, tcp: bool, truncates: bool) -> None:
     checked(libc().prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, filter_program, 0, 0))
 
 
-def _program(calls: _ProcessorCalls, refused: tuple[int, ...], *, tcp: bool) -> bytes:
+def _program(calls: _ProcessorCalls, refused_calls: tuple[int, ...], *, tcp: bool) -> bytes:
     """Return the BPF program of the filter.
 
     The kernel runs the program from its first instruction at every system call, until an
@@ -206,7 +206,7 @@ def _program(calls: _ProcessorCalls, refused: tuple[int, ...], *, tcp: bool) -> 
     ----------
     calls : _ProcessorCalls
         The numbers of the calls on this processor.
-    refused : tuple of int
+    refused_calls : tuple of int
         The calls that are refused whatever their arguments are.
     tcp : bool
         Whether the process may open internet sockets.
@@ -234,7 +234,7 @@ def _program(calls: _ProcessorCalls, refused: tuple[int, ...], *, tcp: bool) -> 
     # architecture.
     program = _load(_ARCHITECTURE) + _unless_equal(calls.architecture, _DENY)
     program += _load(_CALL_NUMBER) + _if_at_least(_OTHER_ABI, _DENY)
-    for number in refused:
+    for number in refused_calls:
         program += _if_equal(number, _DENY)
     for number in calls.ignored:
         program += _if_equal(number, _DO_NOTHING)

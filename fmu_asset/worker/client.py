@@ -43,7 +43,7 @@ class _CallKind(NamedTuple):
     limit : str
         Attribute of `WorkerLimits` with its limit of time.
     action : str
-        Its name in a sentence.
+        The name of the action in a sentence.
     """
 
     limit: Literal["load_time", "step_time"]
@@ -80,8 +80,12 @@ class WorkerLimits(Section):
         Resident memory [MiB].
     sandbox : bool
         Whether the system keeps the FMU from the user's files, from programs and from the network.
-    read, write, ports, programs
-        Rights that the sandbox grants in spite of this; see `Grants`.
+    read, write : tuple of str
+        Files and folders that the FMU may read or write in the sandbox; see `Grants` for paths.
+    ports : tuple of int
+        TCP ports to which the FMU may connect from the sandbox, on any host.
+    programs : bool
+        Whether the FMU may start programs in the sandbox.
     """
 
     step_time: Positive = 60.0
@@ -114,7 +118,7 @@ class WorkerInstance(Instance):
     Parameters
     ----------
     plan : Plan
-        What is exchanged.
+        The variables that each call exchanges with the FMU.
     scratch : Path
         Folder of the worker alone; it is removed when the worker ends.
     limits : WorkerLimits
@@ -429,7 +433,7 @@ class WorkerInstance(Instance):
         Parameters
         ----------
         deadline : float
-            The time on the monotonic clock by which the answer must have come [s].
+            The latest time of the answer, on the monotonic clock [s].
 
         Raises
         ------
@@ -461,11 +465,11 @@ class WorkerInstance(Instance):
             If it does.
         """
         self._next_memory_check = time.monotonic() + 5.0 * _MEMORY_CHECK_PERIOD
-        used = self.memory
-        if used > self._limits.memory * _MEBIBYTE:
+        used_memory = self.memory
+        if used_memory > self._limits.memory * _MEBIBYTE:
             self._process.kill()
             raise FmuMemoryError(
-                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during "
+                f"The FMU took {used_memory / _MEBIBYTE:.0f} MiB of memory during "
                 f"{self._call_kind.action}, more than the limit of {self._limits.memory:g} MiB; "
                 "its worker was stopped. If it needs that much, give it more `memory` in the table "
                 "[limits] of its binding; otherwise it leaks."

@@ -66,13 +66,13 @@ class WorkerProcess:
         If the worker cannot be started.
     """
 
-    def __init__(self, folder: Path, shared: str, grants: Grants | None) -> None:
+    def __init__(self, folder: Path, fmu_folder: str, grants: Grants | None) -> None:
         self._folder = folder
         self._remark = ""
         if grants is not None and landlock_version():
             self._remark = _CONFINED
         # the process of the supervisor, which starts that of the worker
-        self._process = self._start(shared, grants)
+        self._process = self._start(fmu_folder, grants)
         pipes = (self._process.stdin, self._process.stdout)
         self._pipes = [pipe for pipe in pipes if pipe is not None]
         self.outgoing, self.incoming = (pipe.fileno() for pipe in self._pipes)
@@ -84,7 +84,7 @@ class WorkerProcess:
         (number,) = WORKER_NUMBER.unpack(first_message)
         self.number: int = number
 
-    def _start(self, shared: str, grants: Grants | None) -> "subprocess.Popen[bytes]":
+    def _start(self, fmu_folder: str, grants: Grants | None) -> "subprocess.Popen[bytes]":
         """Start the supervisor and return its process; arguments as for the class."""
         root = str(Path(__file__).parents[2])
         environment = {
@@ -98,7 +98,7 @@ class WorkerProcess:
         grants_text = "" if grants is None else json.dumps(asdict(grants))
         report = report_descriptor()
         report_text = "" if report is None else str(report)
-        arguments = [root, str(self._folder), shared, grants_text, report_text]
+        arguments = [root, str(self._folder), fmu_folder, grants_text, report_text]
         try:
             with (self._folder / "worker.log").open("wb") as log:
                 return subprocess.Popen(
@@ -155,7 +155,7 @@ class WorkerProcess:
         Parameters
         ----------
         action : str
-            What the worker was doing, such as "a step".
+            The action of the worker at that time, such as "a step".
         """
         is_alive = not self._wait_for_end(CLOSE_LIMIT)
         self.kill()

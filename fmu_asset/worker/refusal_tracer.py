@@ -1,4 +1,4 @@
-"""The tracer by which a supervisor counts what the sandbox refuses its worker (ptrace(2))."""
+"""The tracer with which a supervisor counts the calls that the sandbox refuses (ptrace(2))."""
 
 import ctypes
 import json
@@ -130,7 +130,7 @@ class RefusalTracer:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
     def _look_at_call(self, thread: int) -> None:
-        """Remember the system call that a thread enters; count it if it returns as refused.
+        """Remember the system call that a thread enters; at its return, count it if it was refused.
 
         Arguments are known only at the entry, and the result only at the exit.
         """
@@ -158,7 +158,7 @@ class RefusalTracer:
         call : SystemCall
             The call.
         arguments : list of int
-            Its arguments.
+            The arguments of the call.
         """
         count, first_description = self._refused.get(call.kind, (0, ""))
         description = first_description or self._description(thread, call, arguments)
@@ -236,7 +236,7 @@ class RefusalTracer:
 
 
 def _is_refusal(call: SystemCall, error: int) -> bool:
-    """Return whether the error of a failed call is one by which the sandbox refuses it."""
+    """Return whether a failed call has an error with which the sandbox refuses calls."""
     if error == EACCES:
         return True
     if error == EPERM:

@@ -54,9 +54,9 @@ class RefusalReport:
 
     @property
     def counts(self) -> dict[RefusalKind, tuple[int, str]]:
-        """Number of refused calls of each kind, and the first of each."""
-        refused: dict[RefusalKind, tuple[int, str]] = self._record.get("refused", {})
-        return refused
+        """How many calls of each kind were refused, and a description of the first one."""
+        refused_calls: dict[RefusalKind, tuple[int, str]] = self._record.get("refused", {})
+        return refused_calls
 
     def verdict(self) -> Literal["ok", "warning", "skipped"]:
         """Return "warning" if something was refused, "skipped" if that could not be counted."""

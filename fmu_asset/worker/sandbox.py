@@ -127,16 +127,16 @@ def landlock_version() -> int:
     return max(version, 0)
 
 
-def confine(grants: Grants, own: str, shared: str) -> bool:
+def confine(grants: Grants, scratch_folder: str, fmu_folder: str) -> bool:
     """Take from this process, irrevocably, all rights that an FMU does not need.
 
     Parameters
     ----------
     grants : Grants
         The rights that this FMU keeps in addition to those of every FMU.
-    own : str
+    scratch_folder : str
         The only folder in which the FMU may always write: the worker's scratch folder.
-    shared : str
+    fmu_folder : str
         The folder or file of the FMU, which it may read.
 
     Returns
@@ -161,7 +161,7 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
     # bits, so the mask of the known rights has as many ones as there are rights.
     all_rights = (1 << _RIGHT_COUNTS.get(version, _RIGHT_COUNT)) - 1
     rules = _ruleset(version, all_rights)
-    _grant_paths(rules, grants, own, shared, all_rights)
+    _grant_paths(rules, grants, scratch_folder, fmu_folder, all_rights)
     # Landlock controls TCP connections from its version 4, and truncate(2) from its version 3.
     if version > 3:
         for port in grants.ports:
@@ -193,7 +193,9 @@ def _ruleset(version: int, all_rights: int) -> int:
     return checked(libc().syscall(_CREATE_RULESET, attributes, len(attributes), 0))
 
 
-def _grant_paths(rules: int, grants: Grants, own: str, shared: str, all_rights: int) -> None:
+def _grant_paths(
+    rules: int, grants: Grants, scratch_folder: str, fmu_folder: str, all_rights: int
+) -> None:
     """Add rules that grant rights to files and folders.
 
     Parameters
@@ -208,8 +210,8 @@ def _grant_paths(rules: int, grants: Grants, own: str, shared: str, all_rights: 
     programs = _EXECUTE if grants.programs else 0
     read_rights = (_READ | programs) & all_rights
     write_rights = (all_rights & ~_EXECUTE | programs) & all_rights
-    readable = (*_SYSTEM, *_paths_of_python(), shared, *_located(grants.read, shared))
-    writable = (*_DEVICES, own, *_located(grants.write, shared))
+    readable = (*_SYSTEM, *_paths_of_python(), fmu_folder, *_located(grants.read, fmu_folder))
+    writable = (*_DEVICES, scratch_folder, *_located(grants.write, fmu_folder))
     _allow(rules, readable, read_rights)
     _allow(rules, writable, write_rights)
 
@@ -234,26 +236,26 @@ def _allow(rules: int, paths: Iterable[str], rights: int) -> None:
         os.close(descriptor)
 
 
-def missing_path(grants: Grants, shared: str) -> str:
+def missing_path(grants: Grants, fmu_folder: str) -> str:
     """Return the first granted path that does not exist, or an empty text if all exist.
 
     Parameters
     ----------
     grants : Grants
         The grants of the binding.
-    shared : str
+    fmu_folder : str
         The folder of the FMU, to which relative paths refer.
     """
-    for path in _located(grants.read + grants.write, shared):
+    for path in _located(grants.read + grants.write, fmu_folder):
         if not os.path.exists(path):  # noqa: PTH110
             return path
     return ""
 
 
-def _located(paths: tuple[str, ...], shared: str) -> list[str]:
+def _located(paths: tuple[str, ...], fmu_folder: str) -> list[str]:
     """Return granted paths with `~` expanded; relative paths are taken from the FMU's folder."""
     return [
-        os.path.join(shared, os.path.expanduser(path))  # noqa: PTH111, PTH118 - light
+        os.path.join(fmu_folder, os.path.expanduser(path))  # noqa: PTH111, PTH118 - light
         for path in paths
     ]
 

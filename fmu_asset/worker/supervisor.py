@@ -67,7 +67,7 @@ class _Worker(NamedTuple):
     process: int
 
 
-def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
+def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoReturn:
     """Start the worker, wait until it or the twin ends, clean up, and end as the worker did.
 
     At the start, the pipes to the twin are the standard input and output. They are moved to other
@@ -87,7 +87,7 @@ def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     _limit_this_process()
     # start the worker
     signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED_SIGNALS)
-    worker = _start_worker(twin, scratch, shared, grants, report)
+    worker = _start_worker(twin, scratch, fmu_folder, grants, report)
     tracer = _tracer_of(worker.number, report)
     statuses: dict[int, int] = {}
     was_asked_to_end = False
@@ -119,7 +119,7 @@ def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     # the pipes of a twin are closed a moment before it is dead
     if is_deserted and not was_asked_to_end and worker_status != 0 and has_ended(twin.process, 1.0):
         remove_folder(scratch)
-        remove_folder(shared)
+        remove_folder(fmu_folder)
     _end_as(worker_status)
 
 
@@ -145,7 +145,7 @@ def _limit_this_process() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
-def _start_worker(twin: _Twin, scratch: str, shared: str, grants: str, report: str) -> _Worker:
+def _start_worker(twin: _Twin, scratch: str, fmu_folder: str, grants: str, report: str) -> _Worker:
     """Fork the worker from this process and return it; arguments as for `supervise`."""
     supervisor = os.getpid()
     number = os.fork()
@@ -158,11 +158,11 @@ def _start_worker(twin: _Twin, scratch: str, shared: str, grants: str, report: s
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
         if os.getppid() != supervisor:
             os._exit(0)  # the supervisor has ended meanwhile
-        _work(twin, scratch, shared, grants)
+        _work(twin, scratch, fmu_folder, grants)
     return _Worker(number, os.pidfd_open(number))
 
 
-def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
+def _work(twin: _Twin, scratch: str, fmu_folder: str, grants: str) -> NoReturn:
     """As the worker, enter the sandbox and serve the twin; arguments as for `supervise`."""
     # Imports are here so that the supervisor has nothing of them, and before the sandbox, since
     # some libraries start programs.
@@ -174,7 +174,7 @@ def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
 
         is_confined = False
         if grants:
-            is_confined = confine(Grants(**json.loads(grants)), scratch, shared)
+            is_confined = confine(Grants(**json.loads(grants)), scratch, fmu_folder)
         serve(twin.incoming, twin.outgoing, confined=is_confined)
     except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
         import traceback
@@ -271,7 +271,7 @@ def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
 def _wait_for_end(
     worker: _Worker, twin: _Twin, tracer: "RefusalTracer | None", statuses: dict[int, int]
 ) -> bool:
-    """Wait for the end of the worker; return whether the twin had left it before.
+    """Wait for the end of the worker; return whether the twin had ended before the worker.
 
     The twin has left it if it has ended or closed its pipe. The worker is then killed unless it
     ends soon. A traced worker stops at each of its system calls until it is resumed here. The
@@ -282,7 +282,7 @@ def _wait_for_end(
     worker : _Worker
         The worker.
     twin : _Twin
-        The twin.
+        The process of the twin, which started this one.
     tracer : RefusalTracer or None
         Counts the refusals of the worker.
     statuses : dict of int to int

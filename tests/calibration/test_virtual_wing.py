@@ -107,7 +107,9 @@ def virtual_bench(wing):
 @pytest.fixture(scope="module")
 def recorded_trials(virtual_bench):
     """Fits of the ring-downs of the bench."""
-    return fit_trials(measure_ring_down(virtual_bench, 3, sampling_rate=250.0), free=True)
+    return fit_trials(
+        measure_ring_down(virtual_bench, 3, sampling_rate=250.0), frequencies_fitted=True
+    )
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ HASHED_COPIES = {
     "ssp": SSP_COPY,
     "strain_library": LIBRARY_COPY,
 }
-"""The copies of files in a run folder of which the run records the hash, by the hash's name."""
+"""The copies of files in a run folder whose hashes the run records, by the names of the hashes."""
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
 NO_ASSET = (
@@ -193,9 +193,9 @@ class FlownAndBelieved:
     Attributes
     ----------
     asset : str
-        What flies.
+        The asset that flies, in words.
     model : str
-        What predicts the observations of the twin.
+        The model that predicts the observations of the twin, in words.
     differ : bool
         Whether they are known to be different models.
     """
@@ -208,14 +208,14 @@ class FlownAndBelieved:
 def calibration_sentence(
     record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence on the model that was calibrated, and whether it is the believed one.
+    """Return a sentence that says which model was calibrated, and whether the twin believes it.
 
     Parameters
     ----------
     record : mapping
         The record of the calibration that a run folder contains.
     asset, believed : str
-        What flies and what the twin believes, in words.
+        The asset that flies and the model that the twin believes, in words.
     hashes : mapping of str to str
         The hashes of the files and designs of the run, by name.
 
@@ -247,7 +247,7 @@ class AssetSource:
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : FileSection, optional
         The table of the scenario that names the files.
     """
@@ -255,7 +255,7 @@ class AssetSource:
     label: ClassVar = "asset"
     """What flies or is believed, in words, if it is the same for all sources of the class."""
     differ: bool = False
-    """Whether the believed model is known to be another one than that which flies."""
+    """Whether the believed model is known to differ from the model that flies."""
     model: "ReducedModel | None" = None
     """The reduced model of what flies or is believed, once it is prepared, if there is one."""
 
@@ -316,7 +316,7 @@ class AssetSource:
         Parameters
         ----------
         folder : Path
-            The run folder.
+            The path of the run folder.
         progress : Progress
             Receives reports on the progress.
 
@@ -417,9 +417,9 @@ class AssetBelief(BeliefSection):
 
     kind: Literal["asset"] = "asset"
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> AssetSource:
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> AssetSource:
         """Return the source of what flies."""
-        return flown
+        return flown_source
 
 
 class PairedSource(AssetSource):

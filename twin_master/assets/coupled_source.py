@@ -168,7 +168,7 @@ class SeveralSource(FmuSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : SeveralSection
         The table `asset` of the scenario. A variable of the binding is a connector of the system,
         or an FMU's own variable, which is written `component.variable`.
@@ -354,7 +354,7 @@ class CoupledSource(SeveralSource):
 
 
 def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
-    """Return the connectors of the system itself, each once: first its outputs, then its inputs.
+    """Return each connector of the whole system once, first the outputs and then the inputs.
 
     A connection leads to an output of the system if its target names no component. It comes from
     an input of the system if its source names no component.

@@ -93,7 +93,7 @@ class DesignBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "DesignSource":
         """Return the source of the model."""
         return DesignSource(scenario, section=self)
 
@@ -277,7 +277,7 @@ class _SpanLocation(NamedTuple):
 
 
 def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation | None:
-    """Return the location of a change of the model along the span; None if it has none."""
+    """Return where along the span a change of the model acts; None if it acts at no one place."""
     span = wing.planform.semi_span
     # Masses and forces may lie beyond the tip, by the fraction OVERHANG of the span.
     farthest = (1.0 + OVERHANG) * span
@@ -360,7 +360,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
     def _pack(self, progress: Progress) -> None:
-        """Pack the wing as the FMU in the run folder, at its calibrated values if it has any."""
+        """Pack the wing, with its calibrated values if it has any, as the FMU in the run folder."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
         options: Tailoring = {}
@@ -479,9 +479,9 @@ def strain_predictor(
     Parameters
     ----------
     wing : ReducedModel
-        The wing.
+        The reduced model of the wing.
     patch : PatchFile
-        The effects.
+        The primitive changes by which the effects act on the model.
     patch_arrays : PatchArrays, optional
         The wing in the basis for patches; None if the effects do not need it.
     """
@@ -503,7 +503,7 @@ def strain_predictor(
         effect_values[variable.name] = float(variable.start or 0.0)
     behaviour.tune(effect_values, 0.0)
     # A value that a prediction does not set stays at its start value.
-    nominal = {variable.name: variable.start or 0.0 for variable in variables}
+    start_values = {variable.name: variable.start or 0.0 for variable in variables}
     input_names = [variable.name for variable in variables if variable.causality == "input"]
 
     def predict(
@@ -512,10 +512,10 @@ def strain_predictor(
         control: Mapping[str, float],
         health: Mapping[str, float],
     ) -> Float:
-        values = {**nominal, "tip_force": tip_force, **control}
+        values = {**start_values, "tip_force": tip_force, **control}
         values |= {f"health.{region}": loss for region, loss in health.items()}
         inputs = [values[name] for name in input_names]
-        parameters = {**nominal, "young_modulus_factor": young_modulus_factor}
+        parameters = {**start_values, "young_modulus_factor": young_modulus_factor}
         outputs = behaviour.start(parameters, 0.0, inputs)
         return np.array(outputs[:gauge_count])  # the strains are the first outputs
 

@@ -223,7 +223,7 @@ class FmuAsset(Asset):
 
 
 def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[str, str]:
-    """Return for each FMU variable a name under which the run's NetCDF file can store it.
+    """Return the name of each FMU variable in the run's NetCDF file, which allows fewer characters.
 
     `/` would make a group in that file; it and unprintable characters become `_`. A name that is
     reserved or used already gets `_` at its end until it is unique.
@@ -246,7 +246,7 @@ class FmuSource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : FmuSection
         The table `asset` of the scenario.
     """
@@ -336,8 +336,8 @@ class FmuSource(AssetSource):
             if not calibrated_values:
                 raise
             raise MissionInputError(
-                f"{error} The calibration has {', '.join(calibrated_values)}: give one of what is "
-                "flown, or name the parameter in `asset.parameters`."
+                f"{error} The calibration has {', '.join(calibrated_values)}: give a calibration "
+                "of the asset that flies, or name the parameter in `asset.parameters`."
             ) from error
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
@@ -428,14 +428,14 @@ class FmuSource(AssetSource):
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of a role; refuse another number of values than in the scenario."""
-        expected = self._scenario.observation.count
+        """Return the positions of the values of a role, if they are as many as in the scenario."""
+        expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
-        if count != expected:
+        if count != expected_count:
             raise MissionInputError(
                 f"the binding {binding.name} observes {count} values of `{role}`, and the scenario "
-                f"expects {expected}."
+                f"expects {expected_count}."
             )
         return positions
 
@@ -458,11 +458,11 @@ class FmuSource(AssetSource):
             )
         names_by_sort = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", names_by_sort)
-        received = None
+        received_positions = None
         if truth.received is not None:
-            received = self._slice_of_role(binding, truth.received)
+            received_positions = self._slice_of_role(binding, truth.received)
         observation = self._observation_slice(binding, truth.observation or "")
-        return TruthOutputs(truth.state, observation, received)
+        return TruthOutputs(truth.state, observation, received_positions)
 
     def parameters(self) -> dict[str, float]:
         """Return the parameters of the FMU.
@@ -569,7 +569,7 @@ class ScriptSource(FmuSource):
         return {**read_files(other_files), FMU_COPY: script_fmu(script).content}
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Pack the FMU in the scratch folder; return the binding with its lengths of arrays."""
+        """Pack the FMU in the scratch folder; return the binding with the lengths of its arrays."""
         packed_fmu = scratch / "asset.fmu"
         packed_fmu.write_bytes(self.files()[FMU_COPY])
         asset = FmiAsset(packed_fmu, binding, parameters=self.parameters())

@@ -205,7 +205,7 @@ class ObservationLibrary:
             raise self._other_parameter_error(name)
 
     def _other_parameter_error(self, name: str) -> MissionInputError:
-        """Return the error that the library has another parameter than the scenario."""
+        """Return the error for a library whose parameter is not that of the scenario."""
         return MissionInputError(
             f"the observation library was sampled over the parameter {self.parameter or 'none'}, "
             f"and the scenario calibrates {name}: {_ADVICE}"
@@ -276,7 +276,7 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     Parameters
     ----------
     path : Path
-        The NetCDF file.
+        The path of the NetCDF file.
     library : ObservationLibrary
         The library.
 
@@ -299,7 +299,7 @@ def load_observation_library(path: Path) -> ObservationLibrary:
     Parameters
     ----------
     path : Path
-        The NetCDF file.
+        The path of the NetCDF file.
 
     Raises
     ------
@@ -344,7 +344,7 @@ class LibraryBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> LibrarySource:
         """Return the source of the library.
 
         Raises
@@ -352,12 +352,12 @@ class LibraryBelief(BeliefSection):
         MissionInputError
             If what flies is not an FMU.
         """
-        if not isinstance(flown, FmuSource):
+        if not isinstance(flown_source, FmuSource):
             raise MissionInputError(
                 "an observation library was sampled from an FMU, and the kind of the asset is "
                 f"`{scenario.asset.kind}`: set `belief.kind` to `asset` or `design`."
             )
-        return LibrarySource(scenario, self, flown)
+        return LibrarySource(scenario, self, flown_source)
 
 
 class LibrarySource(AssetSource):
@@ -366,7 +366,7 @@ class LibrarySource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     section : LibraryBelief
         The table `belief` of the scenario.
     flown : FmuSource
@@ -374,9 +374,9 @@ class LibrarySource(AssetSource):
         the section names a design.
     """
 
-    def __init__(self, scenario: Scenario, section: LibraryBelief, flown: FmuSource) -> None:
+    def __init__(self, scenario: Scenario, section: LibraryBelief, flown_source: FmuSource) -> None:
         super().__init__(scenario, section)
-        self._flown = flown
+        self._flown = flown_source
         self._design_source: DesignSource | None = None
         if section.design is not None:
             belief = DesignBelief(design=section.design)
@@ -437,7 +437,7 @@ class LibrarySource(AssetSource):
         Parameters
         ----------
         verb : str
-            What is compared, for the message: "has the sensors".
+            The verb and the compared things, for the message: "has the sensors".
         of_library, of_scenario : sequence of str
             The labels of the library, and those that the scenario asks for.
         """

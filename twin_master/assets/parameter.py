@@ -230,7 +230,7 @@ def read_calibration(calibration: Calibration) -> "CalibrationRecord | None":
 
 def check_calibration(
     calibration: Calibration,
-    known: Collection[str],
+    known_names: Collection[str],
     where: str,
     *,
     ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
@@ -246,7 +246,7 @@ def check_calibration(
     ----------
     calibration : Calibration
         The table of the scenario.
-    known : collection of str
+    known_names : collection of str
         The parameters of the model, which must contain all parameters of the calibration.
     where : str
         The name of the model or binding with these parameters, for the message.
@@ -257,7 +257,7 @@ def check_calibration(
         The hash of the believed design; empty if it is not known, or if the twin does not believe
         the model.
     advice : str
-        What the user can do about an unknown parameter, for the message.
+        The advice to the user about an unknown parameter, for the message.
 
     Raises
     ------
@@ -271,14 +271,14 @@ def check_calibration(
     if record is None or record.design is not None:
         return
     names = {prior.name for prior in record.priors}
-    names_by_sort = [("parameter", names, known)]
+    names_by_sort = [("parameter", names, known_names)]
     check_names(f"the calibration of {record.asset} has the", where, names_by_sort, advice=advice)
     if design_hash and record.design_hash not in ("", design_hash):
         raise MissionInputError(
             f"the calibration of {record.asset} is of the model {record.model} with the design "
             f"{record.design_hash:.12}, and {where}, which the twin believes, has the design "
-            f"{design_hash[:12]}: calibrate what is believed, or let the twin believe what was "
-            "calibrated."
+            f"{design_hash[:12]}: calibrate the believed model, or let the twin believe the "
+            "calibrated one."
         )
     for name, (low, high) in ranges.items():
         if name in names and not low <= record.mean(name) <= high:

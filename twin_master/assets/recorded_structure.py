@@ -35,7 +35,7 @@ def modal_features(
     inputs : (V,) array
         The values of the model's inputs, in their order.
     section : ModesSection
-        Which of the modes are observed, and at which accelerometers.
+        The observed modes and their features, and the accelerometers.
     damping : (float, float), optional
         Rayleigh's alpha [1/s] and beta [s]; by default those of the model.
 

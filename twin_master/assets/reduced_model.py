@@ -64,7 +64,7 @@ class ChosenValue(NamedTuple):
     Attributes
     ----------
     description : str
-        Which value it is, in words.
+        The value in words.
     name : str
         The input.
     value : float
@@ -84,7 +84,7 @@ class NamedStructure(AssetSource):
         calibration=SAME_NAMES,
         parameter="give it in a table [[parameter]]",
         static_test=(
-            "the calibration source `static_test` is for wings: of a structure give `file`, or "
+            "the calibration source `static_test` is for wings: for a structure give `file`, or "
             "`normal` or `fixed` with `mean`."
         ),
     )
@@ -312,7 +312,7 @@ class ReducedModelSource(NamedStructure):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     model : ReducedModel, optional
         The reduced model of a wing, if it exists already.
     section : FileSection, optional

@@ -85,7 +85,7 @@ def as_overrides(overrides: Overrides | Mapping[str, Any] | None) -> Overrides:
 
 
 def resolve_scenario(
-    loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+    loaded_scenario: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario with the overrides and with absolute paths.
 
@@ -93,10 +93,10 @@ def resolve_scenario(
 
     Parameters
     ----------
-    loaded : LoadedScenario
+    loaded_scenario : LoadedScenario
         The scenario and its file.
     overrides : Overrides or mapping, optional
-        What differs from the scenario.
+        The values that replace those of the scenario.
 
     Raises
     ------
@@ -106,8 +106,8 @@ def resolve_scenario(
         If the scenario with the overrides has an unknown or missing key, or a wrong value.
     """
     overrides = as_overrides(overrides)
-    folder = loaded.path.resolve().parent
-    table = loaded.scenario.with_paths_from(folder).to_dict()
+    folder = loaded_scenario.path.resolve().parent
+    table = loaded_scenario.scenario.with_paths_from(folder).to_dict()
     _override_asset(table, overrides)
     if overrides.library:
         design = table["belief"].get("design")
@@ -129,7 +129,7 @@ def resolve_scenario(
             "give "
             '--calibration, or `source = "file"` in the table `calibration`.'
         )
-    source = str(loaded.path)
+    source = str(loaded_scenario.path)
     if overrides.learnt:
         apply_learnt(table, overrides.learnt, overrides.learnt_group)
         source += f" with {overrides.learnt}"
@@ -174,7 +174,7 @@ def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) 
     """
     if file_count > 1:
         raise MissionInputError(
-            "one asset flies: give one of an SSP file, --fmu and --strain-library."
+            "only one asset can fly: give only one of an SSP file, --fmu and --strain-library."
         )
     if overrides.strain_library and (overrides.binding or overrides.library):
         raise MissionInputError(
@@ -286,13 +286,13 @@ def asset_source(scenario: Scenario) -> AssetSource:
         If the twin of the scenario does not fit in memory.
     """
     check_scenario_fits(scenario)
-    flown: AssetSource = scenario.asset.source(scenario)
-    believed: AssetSource = scenario.belief.source(scenario, flown)
-    if believed is flown:  # `belief.kind` is `asset`
-        return flown
-    if isinstance(flown, WatchedSource):
+    flown_source: AssetSource = scenario.asset.source(scenario)
+    believed_source: AssetSource = scenario.belief.source(scenario, flown_source)
+    if believed_source is flown_source:  # `belief.kind` is `asset`
+        return flown_source
+    if isinstance(flown_source, WatchedSource):
         raise MissionInputError(NO_ASSET)
-    return PairedSource(flown, believed, differ=scenario.models_differ)
+    return PairedSource(flown_source, believed_source, differ=scenario.models_differ)
 
 
 def believed_source(scenario: Scenario) -> AssetSource:

@@ -230,7 +230,7 @@ class StrainLibraryBelief(BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "StrainLibrarySource":
         """Read the library and return its source.
 
         Raises
@@ -253,11 +253,11 @@ class StrainLibrarySource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     library : StrainLibrary
         The library.
     path : Path, optional
-        Its file, of which a run folder gets a copy.
+        The path of the library's file; a run folder gets a copy of it.
     """
 
     label = "strain library"
@@ -288,7 +288,7 @@ class StrainLibrarySource(AssetSource):
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return the library's own samples of its parameter."""
+        """Return the values of the parameter at which the library was sampled."""
         values = self._library.young_modulus_factor
         return ParameterDraws(
             name=self._scenario.calibration.parameter,

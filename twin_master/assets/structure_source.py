@@ -31,7 +31,7 @@ class StructureFiles(FileSection):
     """A table that names a structure file, which names a mesh or matrices beside it."""
 
     def all_files(self) -> dict[str, Path]:
-        """Return the structure file and the mesh or matrices that it names, by their copies' paths.
+        """Return the structure file and the mesh or matrices that it names, by paths of copies.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class StructureBelief(StructureFiles, BeliefSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "ReducedModelSource":
+    def source(self, scenario: Scenario, flown_source: AssetSource) -> "ReducedModelSource":
         """Return the source of the model."""
         return ReducedModelSource(scenario, section=self)
 

@@ -39,7 +39,7 @@ PackedKind = Literal["python", "compiled"]
 
 
 def export_scenario(
-    loaded: LoadedScenario,
+    loaded_scenario: LoadedScenario,
     out: Path,
     *,
     seed: int | None = None,
@@ -53,8 +53,8 @@ def export_scenario(
 
     Parameters
     ----------
-    loaded : LoadedScenario
-        The scenario.
+    loaded_scenario : LoadedScenario
+        The scenario, as read from its file.
     out : Path
         The file to write.
     seed : int, optional
@@ -77,7 +77,7 @@ def export_scenario(
     FmuError
         If the FMUs do not fit.
     """
-    scenario = resolve_scenario(loaded, {"seed": seed})
+    scenario = resolve_scenario(loaded_scenario, {"seed": seed})
     if kind is not None:
         scenario = _with_packed_kind(scenario, kind)
     source = scenario.asset.source(scenario)
@@ -226,7 +226,7 @@ def _with_values(
     Parameters
     ----------
     wiring : Wiring
-        The system.
+        The components of the system, and the connections between them.
     binding : Binding
         The binding of the system.
     parameters, load : mapping of str to float

@@ -1,1 +1,1 @@
-"""Many twins: ensembles of one scenario, fleets of assets, and what is learnt across them."""
+"""Many twins: ensembles of one scenario, fleets of assets, and learning across assets."""

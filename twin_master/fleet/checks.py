@@ -31,12 +31,12 @@ def flies_model(scenario: Scenario) -> bool:
 
 
 def source_of(scenario: Scenario, *, is_real: bool = False) -> AssetSource:
-    """Return the source of the assets of a fleet and of the model that its twins use.
+    """Return the source of a fleet's assets and of the model that the twins use.
 
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     is_real : bool
         Whether the assets are real, so that only the twins' model is needed.
     """

@@ -50,7 +50,7 @@ def locked_fleet_folder(
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     kind : str
         `KIND` or `WATCHED_KIND`.
     record : mapping
@@ -100,7 +100,7 @@ def fleet_config(folder: Path, *kinds: str) -> JsonObject:
     Parameters
     ----------
     folder : Path
-        The folder.
+        The path of the folder.
     *kinds : str
         The kinds of fleets that are accepted; by default one that is flown.
 

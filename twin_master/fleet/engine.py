@@ -127,8 +127,8 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         return futures
 
     cores = max(1, sum(client.nthreads().values()))
-    running = as_completed(submit(islice(pieces, cores * (1 + WAITING_PER_CORE))))
-    for future in running:
+    running_flights = as_completed(submit(islice(pieces, cores * (1 + WAITING_PER_CORE))))
+    for future in running_flights:
         piece = piece_of_key.pop(future.key)
         try:
             # The scheduler flies a piece again, on another worker, if its worker died.
@@ -136,7 +136,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         except KilledWorker:
             if len(piece.members) > 1:
                 single_twins = [piece._replace(members=(member,)) for member in piece.members]
-                running.update(submit(single_twins))
+                running_flights.update(submit(single_twins))
                 continue
             reason = "its flight ended the worker process: fly an FMU that crashes isolated."
             result = result_of_unflown(piece.members[0], reason)
@@ -147,12 +147,12 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
             ) from None
         yield FlownPiece(piece, result)
         del future  # lets the workers forget the result
-        running.update(submit(islice(pieces, 1)))
+        running_flights.update(submit(islice(pieces, 1)))
 
 
 @cache
 def program_version() -> str:
-    """Return a hash of this program, of Python and of the packages on which results depend."""
+    """Return a hash of this program, Python and all packages that can change results."""
     provenance = collect_provenance().as_dict()
     python = list(sys.version_info[:2])
     return hash_record([provenance["versions"], provenance["source_hashes"], python])
@@ -177,7 +177,7 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
 
 @contextmanager
 def _connected_client(engine: Engine) -> "Iterator[Client]":
-    """Return a context with a client of the cluster, or of local workers that end with it."""
+    """Return a context with a client of the cluster, or of local workers that the context ends."""
     import dask
 
     # Importing `distributed` adds its defaults to the configuration. That must happen before the

@@ -86,7 +86,7 @@ def _evidence_at_points(
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
-    """Return the reason why transitions of a scenario cannot be learnt; empty if they can."""
+    """Return why the transitions of a scenario cannot be learnt; an empty text if they can."""
     if scenario.transition.kind != _LEARNABLE_KIND:
         return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
     count = len(_assumed_probabilities(scenario))
@@ -112,7 +112,7 @@ class _Cause(NamedTuple):
 
 
 def _assumed_probabilities(scenario: Scenario) -> dict[_Cause, float]:
-    """Return the probabilities to worsen of a scenario, in the order of its controls."""
+    """Return the probability of worsening that a scenario assumes for each of its controls."""
     probabilities = {}
     for control in scenario.control_names:
         entry = scenario.transition.probability[control]
@@ -188,18 +188,19 @@ class TransitionFamily:
     def learnable(cls, scenario: Scenario) -> "TransitionFamily":
         """Return the transitions of a scenario of the kind `independent_worsening`."""
         probabilities = _assumed_probabilities(scenario)
-        # Each entry is linear in its probability p, so that its values at p = 1/4 and 3/4 determine
-        # it: slope = difference / (1/2). At p = 0 or 1 zero entries would be left out of the lists.
-        lists = _predecessors_at(scenario, 0.25)
+        # Each entry is a linear function of its probability p. Its values at p = 1/4 and 3/4
+        # determine slope and ends. At p = 0 or 1 the lists would lack the entries that are zero.
+        low, high = 0.25, 0.75
+        lists = _predecessors_at(scenario, low)
         entries = lists.probability
-        slope = 2.0 * (_predecessors_at(scenario, 0.75).probability - entries)
+        slope = 2.0 * (_predecessors_at(scenario, high).probability - entries)
         return cls(
             names=tuple(cause.name for cause in probabilities),
             assumed=np.array(list(probabilities.values())),
             lists=lists,
             parameter_index=_parameter_index(scenario, list(probabilities), lists),
-            entries_at_zero=entries + slope * -0.25,
-            entries_at_one=entries + slope * 0.75,
+            entries_at_zero=entries - slope * low,
+            entries_at_one=entries + slope * (1.0 - low),
             prior=build_graphical_model(scenario).prior,
         )
 
@@ -214,14 +215,14 @@ class TransitionFamily:
 
 
 def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists:
-    """Return the predecessor lists of a scenario with this value of all probabilities to worsen."""
-    equal = {"probability": dict.fromkeys(scenario.control_names, probability)}
-    transition = scenario.transition.model_copy(update=equal)
+    """Return the predecessor lists of a scenario whose probabilities of worsening are all equal."""
+    equal_probabilities = {"probability": dict.fromkeys(scenario.control_names, probability)}
+    transition = scenario.transition.model_copy(update=equal_probabilities)
     return _predecessors(scenario.model_copy(update={"transition": transition}))
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return for each entry of the lists the index of its probability to worsen, (non-zeros,).
+    """Return for each entry of the lists, (non-zeros,), the index of its probability of worsening.
 
     Rows of the lists are ordered by factor, then by control, then by level.
     """
@@ -253,7 +254,7 @@ class ScaledLikelihood(NamedTuple):
 
 
 def scaled_likelihood(
-    model: GaussianSensorModel, observed: Float, control: Index
+    model: GaussianSensorModel, observations: Float, control: Index
 ) -> ScaledLikelihood:
     """Return the likelihood of each state in each step, given the observations of B twins.
 
@@ -261,19 +262,19 @@ def scaled_likelihood(
     ----------
     model : GaussianSensorModel
         The model of the G sensors.
-    observed : (B, T, G) array
+    observations : (B, T, G) array
         The observations in SI units; NaN where one was lost.
     control : (B, T) array
         The control in force in each step.
     """
     twin_count, step_count = control.shape
-    all_steps = observed.reshape(-1, observed.shape[-1])
+    all_steps = observations.reshape(-1, observations.shape[-1])
     log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
     return _scaled(log_likelihood.reshape(twin_count, step_count, -1))
 
 
 def _scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return the likelihood divided by its largest value in each step, from its log (B, T, S)."""
+    """Return likelihoods divided by the largest of each step, from their logarithms (B, T, S)."""
     largest = log_likelihood.max(axis=2, keepdims=True)
     return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
 
@@ -311,7 +312,7 @@ def parameter_evidence(
     family: TransitionFamily,
     probability: Float,
     model: GaussianSensorModel,
-    observed: Float,
+    observations: Float,
     control: Index,
 ) -> Float:
     """Return the log evidence of B twins for E values of a parameter that is constant in time.
@@ -326,7 +327,7 @@ def parameter_evidence(
         The probabilities to worsen.
     model : GaussianSensorModel
         The model of the G sensors; its E draws are the values of the parameter.
-    observed : (B, T, G) array
+    observations : (B, T, G) array
         The observations in SI units; NaN where one was lost.
     control : (B, T) array
         The control in force in each step.
@@ -338,7 +339,7 @@ def parameter_evidence(
     """
     result = np.empty((len(control), model.draw_count))
     for twin in range(len(control)):
-        log_density = model.log_density_of_draws(observed[twin], control[twin])  # (T, S, E)
+        log_density = model.log_density_of_draws(observations[twin], control[twin])  # (T, S, E)
         log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
         # The E values take the place of twins: all have the same controls.
         likelihood = _scaled(log_density_by_draw)

@@ -180,15 +180,15 @@ def fly_fleet(
         _note_slow_flights(fleet, progress)
         with JournalFile(folder, hash_record(config)) as journal:
             counts = _FleetFlight(fleet, folder, journal).fly(engine, progress)
-        failures, ended = endings_of(folder)
+        failures, early_ends = endings_of(folder)
         result = fleet.head.model_dump(exclude={"shard"})
-        result |= {"twins": fleet.size, "failures": failures, "ended": ended}
+        result |= {"twins": fleet.size, "failures": failures, "ended": early_ends}
         atomic_write_text(folder / RESULT_NAME, run_folder.to_json(result))
     return FleetOutcome(
         folder=folder,
         twins=fleet.size,
         failures=failures,
-        ended=ended,
+        ended=early_ends,
         seconds=time.perf_counter() - start,
         shards_flown=counts.flown,
         shards_kept=counts.kept,
@@ -252,11 +252,11 @@ def endings_of(folder: Path) -> Endings:
     else:
         content = [record for record, *_ in records(journal)]
     failures: dict[str, str] = {}
-    ended: dict[str, str] = {}
+    early_ends: dict[str, str] = {}
     for record in content:
         failures |= record["failures"]
-        ended |= record["ended"]
-    return Endings(dict(sorted(failures.items())), dict(sorted(ended.items())))
+        early_ends |= record["ended"]
+    return Endings(dict(sorted(failures.items())), dict(sorted(early_ends.items())))
 
 
 def prepare_kit(
@@ -269,7 +269,7 @@ def prepare_kit(
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     folder : Path
         The folder of the prepared knowledge; files are written to it.
     is_real : bool
@@ -330,7 +330,7 @@ class Shard(NamedTuple):
 
 
 def _shards(fleet: Fleet) -> Iterator[Shard]:
-    """Yield the shards of a fleet in the order of its groups and of their members.
+    """Yield the shards of a fleet, group by group, each with its members in order.
 
     If the members have different scenarios, each is a shard of its own.
     """
@@ -353,7 +353,7 @@ class _FleetFlight:
     Parameters
     ----------
     fleet : Fleet
-        The fleet.
+        The plan of the fleet.
     folder : Path
         The folder of the fleet.
     journal : JournalFile
@@ -381,24 +381,24 @@ class _FleetFlight:
         return _ShardCounts(flown=len(remaining), kept=len(shards) - len(remaining))
 
     def _remaining(self, shards: Sequence[Shard]) -> list[Shard]:
-        """Return the shards of which not all twins are in the store.
+        """Return the shards with twins that are missing in the store.
 
         The rows of single twins are compared, because the twins of a shard are stored one by one if
         workers died over it.
         """
-        stored = set()
+        stored_rows = set()
         for record, *_ in records(self._journal.path):
             first, end = record["rows"]
-            stored |= {(record["group"], row) for row in range(first, end)}
+            stored_rows |= {(record["group"], row) for row in range(first, end)}
         remaining = []
         for shard in shards:
             rows = {(shard.group_number, member.row) for member in shard.members}
-            if not rows <= stored:
+            if not rows <= stored_rows:
                 remaining.append(shard)
         return remaining
 
     def _pieces(self, shards: Sequence[Shard]) -> Iterator[Piece]:
-        """Yield the shards with all that workers need to fly them.
+        """Yield the shards, each with the knowledge and the recordings that a worker needs.
 
         If the scenario of a single asset, with its own FMU or calibration, cannot be prepared, the
         asset is stored as failed and the other shards are flown.
@@ -407,13 +407,15 @@ class _FleetFlight:
             group = self._fleet.groups[number]
             try:
                 kit = self._packed_kit(number, members[0].scenario_number)
-                recorded = tuple(_with_recording(group, member) for member in members)
+                members_with_recordings = tuple(
+                    _with_recording(group, member) for member in members
+                )
             except FLIGHT_ERRORS as error:
                 if len(group.scenarios) == 1:
                     raise
                 self._store(number, members, result_of_unflown(members[0], str(error)))
             else:
-                yield Piece(number, kit, recorded)
+                yield Piece(number, kit, members_with_recordings)
 
     def _pack_kit(self, group_number: int, scenario_number: int) -> bytes:
         """Prepare a scenario of a group and return its packed kit."""
@@ -454,12 +456,12 @@ class _FleetFlight:
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:
-    """Return sentences by GROUP/NAME of the twin, given sentences by its name alone."""
+    """Return sentences by GROUP/NAME of a twin, given sentences by the name of the twin alone."""
     return {f"{group.name}/{name}": sentence for name, sentence in sentences.items()}
 
 
 def _with_recording(group: Group, member: Member) -> Member:
-    """Return a member with the messages of its real asset, so that workers read no files."""
+    """Return a member with the recorded messages of its asset, so that workers read no files."""
     if not group.observations or member.file is None:
         return member
     messages = file_feed(member.file, group.scenarios[0]).messages(None)

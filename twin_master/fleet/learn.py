@@ -63,6 +63,9 @@ NODE_DEVIATIONS = 6.0
 
 The unit is the standard deviation of the calibration.
 """
+_LEAST_PROBABILITY = 1e-3
+_LARGEST_PROBABILITY = 0.9
+"""Probabilities of worsening under which damage may grow or stay in any step."""
 _MOST_SHARED = 2
 """Largest number of probabilities to worsen for which groups share a distribution."""
 
@@ -205,15 +208,15 @@ def _lessons_of_groups(
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
             group = open_group(folder, record["name"])
-            flown = list(flown_twins(folder, record, group))
-            if flown:
-                lessons[record["name"]] = _learn_group(record, group, flown)
+            twins_by_scenario = list(flown_twins(folder, record, group))
+            if twins_by_scenario:
+                lessons[record["name"]] = _learn_group(record, group, twins_by_scenario)
             stage.advance()
     return lessons
 
 
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
-    """Return the records of all groups, and of the distribution of probabilities that they share.
+    """Return the records of all groups, and of the distribution of probabilities common to them.
 
     They share one if several groups have learnt the same one or two probabilities to worsen.
     """
@@ -243,8 +246,8 @@ def _records_with_shared_distribution(
     records = {}
     for (name, lesson), probabilities in zip(lessons.items(), posterior.groups, strict=True):
         records[name] = lesson.with_probabilities(probabilities, flown_controls)
-    shared = dict(zip(names, posterior.hyperparameters, strict=True))
-    return {"groups": records, "shared": shared}
+    shared_distribution = dict(zip(names, posterior.hyperparameters, strict=True))
+    return {"groups": records, "shared": shared_distribution}
 
 
 class _Observations(NamedTuple):
@@ -277,7 +280,7 @@ class _WeighedSteps(NamedTuple):
 
 
 def _learn_group(
-    record: JsonObject, group: "xr.DataTree", flown: Sequence[TwinsOfScenario]
+    record: JsonObject, group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
@@ -290,17 +293,17 @@ def _learn_group(
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group.
-    flown : sequence of TwinsOfScenario
+    twins_by_scenario : sequence of TwinsOfScenario
         The twins that have flown, by scenario.
     """
-    scenario = flown[0].knowledge.scenario
+    scenario = twins_by_scenario[0].knowledge.scenario
     family = _transition_family(scenario)
-    observations = _observations(group, flown)
+    observations = _observations(group, twins_by_scenario)
     # With several scenarios each twin has its own calibration, and no common distribution of the
     # parameter is learnt.
     nodes = None
-    if len(flown) == 1:
-        nodes = _parameter_nodes(flown[0], is_real="recordings" in record)
+    if len(twins_by_scenario) == 1:
+        nodes = _parameter_nodes(twins_by_scenario[0], is_real="recordings" in record)
     noise = _noise_factor(observations, family, nodes)
     steps = _explained_steps(observations, family, noise.mean)
     twin_count = sum(len(part.control) for part in steps)
@@ -310,7 +313,7 @@ def _learn_group(
             "can be learnt from it; check its model and its noise."
         )
     grid = _probability_grid(family, steps) if family.names else None
-    rows = np.concatenate([twins.rows for twins in flown])
+    rows = np.concatenate([twins.rows for twins in twins_by_scenario])
     lessons: JsonObject = {
         "twins": twin_count,
         "left_out": len(rows) - twin_count,
@@ -333,20 +336,23 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     return TransitionFamily.learnable(scenario)
 
 
-def _observations(group: "xr.DataTree", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
+def _observations(
+    group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
+) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
-    observed = observation_rows(group, flown[0].knowledge.scenario)
+    observed_rows = observation_rows(group, twins_by_scenario[0].knowledge.scenario)
     control = stored_values(group, "observed/control_index").astype(np.int64)
     # Steps that were not flown have the control -1. They have no observations, so that the
     # evidence does not depend on their control: the first control takes its place.
     control = np.maximum(control, 0)
     return [
-        _Observations(twins.knowledge, observed[twins.rows], control[twins.rows]) for twins in flown
+        _Observations(twins.knowledge, observed_rows[twins.rows], control[twins.rows])
+        for twins in twins_by_scenario
     ]
 
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
-    """Return the controls under which a twin in the rows has flown a step that is not its last."""
+    """Return the controls under which a twin in the rows has flown a step before its last one."""
     control = stored_values(group, "observed/control_index").astype(np.int64)[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
@@ -355,15 +361,15 @@ def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequenc
 def _explained_steps(
     observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
 ) -> list[_WeighedSteps]:
-    """Return the likelihoods of the twins whose observations have a probability above 0.
+    """Return the likelihoods of the twins whose observations are possible under the model.
 
     The likelihoods are computed with a factor on the assumed noise.
     """
     point = _with_all_transitions_possible(family.assumed)[None]
     parts = []
-    for knowledge, observed, control in observations:
+    for knowledge, observed_rows, control in observations:
         sensor_model = with_noise_factor(knowledge.sensor_model, noise_factor)
-        likelihood = scaled_likelihood(sensor_model, observed, control).values
+        likelihood = scaled_likelihood(sensor_model, observed_rows, control).values
         evidence = transition_evidence(family, point, likelihood, control)
         is_explained = np.isfinite(evidence[:, 0])
         parts.append(_WeighedSteps(likelihood[is_explained], control[is_explained]))
@@ -371,8 +377,12 @@ def _explained_steps(
 
 
 def _with_all_transitions_possible(probability: Float) -> Float:
-    """Return probabilities clipped to 0.001 to 0.9, so that damage may grow or stay in any step."""
-    return probability.clip(1e-3, 0.9)
+    """Return probabilities of worsening that are neither near 0 nor near 1.
+
+    So any course of the damage is possible, and observations that are impossible with these
+    probabilities contradict the sensor model.
+    """
+    return probability.clip(_LEAST_PROBABILITY, _LARGEST_PROBABILITY)
 
 
 def _probability_grid(family: TransitionFamily, steps: Sequence[_WeighedSteps]) -> LikelihoodGrid:
@@ -423,14 +433,14 @@ def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNode
     source = source_of(knowledge.scenario, is_real=is_real)
     source.prepare(twins.folder, SilentProgress())
     nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
-    predicted = source.observation_table(nodes, knowledge.model)
-    if len(predicted) != NODES:  # a stored library of observations has fixed draws
+    predicted_readings = source.observation_table(nodes, knowledge.model)
+    if len(predicted_readings) != NODES:  # a stored library of observations has fixed draws
         return None
-    return _ParameterNodes(values, prior / prior.sum(), predicted)
+    return _ParameterNodes(values, prior / prior.sum(), predicted_readings)
 
 
 def with_noise_factor(
-    model: GaussianSensorModel, factor: float, predicted: Float | None = None
+    model: GaussianSensorModel, factor: float, value_per_draw: Float | None = None
 ) -> GaussianSensorModel:
     """Return a copy of a sensor model with its noise multiplied by a factor.
 
@@ -440,11 +450,11 @@ def with_noise_factor(
         The model.
     factor : float
         The factor on the standard deviation of the noise.
-    predicted : (E, S, U, G) array, optional
+    value_per_draw : (E, S, U, G) array, optional
         The noise-free readings at other values of the parameter; by default those of the model.
     """
     return type(model)(
-        model.value_per_draw if predicted is None else predicted,
+        model.value_per_draw if value_per_draw is None else value_per_draw,
         model.standard_deviation * factor,
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
@@ -456,7 +466,7 @@ def with_noise_factor(
 def _noise_factor(
     observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
 ) -> Distribution:
-    """Return the posterior of the factor on the assumed noise; its logarithm has a uniform prior.
+    """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
 
     The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
     it in each step separately would attribute a part of the noise to the parameter. With nodes, the
@@ -475,8 +485,8 @@ def _noise_factor(
             ]
         )
 
-    bound = np.log(LARGEST_NOISE)
-    widest_axis = np.linspace(-bound, bound, NOISE_POINTS)
+    largest_log_factor = np.log(LARGEST_NOISE)
+    widest_axis = np.linspace(-largest_log_factor, largest_log_factor, NOISE_POINTS)
     (axis,), values = resolve_density(log_likelihood, (widest_axis,))
     return Distribution(axis, cell_probabilities(values), np.exp)
 
@@ -493,15 +503,15 @@ def _evidence_of_noise(
     """
     probability = _with_all_transitions_possible(family.assumed)
     total = 0.0
-    for knowledge, observed, control in observations:
+    for knowledge, observed_rows, control in observations:
         if nodes is None:
             model = with_noise_factor(knowledge.sensor_model, factor)
-            likelihood = scaled_likelihood(model, observed, control)
+            likelihood = scaled_likelihood(model, observed_rows, control)
             evidence = transition_evidence(family, probability[None], likelihood.values, control)
             log_evidence = evidence[:, 0] + likelihood.log_scale
         else:
             model = with_noise_factor(knowledge.sensor_model, factor, nodes.predicted)
-            at_nodes = parameter_evidence(family, probability, model, observed, control)
+            at_nodes = parameter_evidence(family, probability, model, observed_rows, control)
             log_evidence = _average_over_nodes(at_nodes, nodes.prior)
         total += float(log_evidence[np.isfinite(log_evidence)].sum())
     return total
@@ -539,9 +549,9 @@ def _population(
     probability = family.assumed
     if grid is not None:
         probability = np.array([marginal.mean for marginal in grid.marginals])
-    knowledge, observed, control = observations
+    knowledge, observed_rows, control = observations
     model = with_noise_factor(knowledge.sensor_model, noise_factor, nodes.predicted)
-    log_evidence = parameter_evidence(family, probability, model, observed, control)
+    log_evidence = parameter_evidence(family, probability, model, observed_rows, control)
     draws = knowledge.draws
     population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
     return {

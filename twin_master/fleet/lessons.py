@@ -64,7 +64,7 @@ def write_learnt(path: Path, folder: Path, record: Record) -> Path:
 
 
 def _scenario_tables(group: Record, means: Record, scenario: Record) -> JsonObject:
-    """Return the tables that replace those of a scenario, from what was learnt of a group.
+    """Return the tables with which the lessons of a group replace assumptions of a scenario.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def _group_rows(group: Record) -> Iterator[LessonRow]:
 
 
 def _probability_row(control: str, probability: Record) -> LessonRow:
-    """Return the row of a probability to worsen, of a control and perhaps of a factor."""
+    """Return the table row for the probability of worsening under a control."""
     title = f"probability to worsen, {control}"
     assumed = probability["assumed"]
     if not probability["flown"]:
@@ -202,6 +202,6 @@ def _probability_row(control: str, probability: Record) -> LessonRow:
 
 
 def _value_row(title: str, assumed: str, learnt: Record) -> LessonRow:
-    """Return the row of a quantity with its mean and interval."""
+    """Return the table row for a quantity: its mean and its interval."""
     interval = f"{learnt['lower_95']:.4g} to {learnt['upper_95']:.4g}"
     return LessonRow("", title, assumed, f"{learnt['mean']:.4g}", interval)

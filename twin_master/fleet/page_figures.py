@@ -14,7 +14,7 @@ _LETTERS = "abcdefgh"
 
 @style.publication_style()
 def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
-    """Draw the map of the assets of a group: a panel for each factor of the state.
+    """Draw a group's assets as a map, with a panel for each factor of the state.
 
     In each panel one cell for each asset has the colour of the factor's value. The cells are in
     descending order of severity of damage, row by row; assets that failed in flight, and assets
@@ -87,10 +87,10 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
         estimates = factor.scale * mean[:, steps, number]
         truths = factor.scale * state[:, steps, number]
         quantiles = np.nanquantile(estimates, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
-        low, lower_quartile, median, upper_quartile, high = quantiles
+        low, lower_quartile, medians, upper_quartile, high = quantiles
         style.band(axes, steps, low, high, style.PRESENT)
         style.band(axes, steps, lower_quartile, upper_quartile, style.PRESENT)
-        axes.plot(steps, median, color=style.PRESENT, label="median of the filtered means")
+        axes.plot(steps, medians, color=style.PRESENT, label="median of the filtered means")
         is_truth_known = ~np.isnan(truths).all(axis=0)  # false after the end of all flights
         true_median = np.nanmedian(truths[:, is_truth_known], axis=0)
         axes.plot(

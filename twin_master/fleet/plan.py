@@ -279,7 +279,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
     Parameters
     ----------
     path : Path or str
-        The TOML file.
+        The path of the TOML file.
     seed : int, optional
         A seed that replaces the one of the file.
 
@@ -353,10 +353,10 @@ def ensemble(
     shard : int
         The number of twins that are flown in one piece.
     """
-    resolved = resolve_scenario(load_scenario(scenario), overrides)
-    mission = resolved.mission
+    resolved_scenario = resolve_scenario(load_scenario(scenario), overrides)
+    mission = resolved_scenario.mission
     members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
-    group = Group(mission.name, (resolved,), {}, members)
+    group = Group(mission.name, (resolved_scenario,), {}, members)
     head = FleetSection(name=mission.name, title=mission.title, seed=mission.seed, shard=shard)
     return Fleet(head, (group,))
 
@@ -401,18 +401,18 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     """
     # The scenario is a file beside the fleet file, or the name of a shipped scenario.
     local_file = folder / section.scenario
-    loaded = load_scenario(local_file if local_file.is_file() else section.scenario)
+    loaded_scenario = load_scenario(local_file if local_file.is_file() else section.scenario)
     observations = section.observations or ""
     if observations and not is_broker(observations):
         observations = str(folder / observations)
     files = _files_of_assets(section, folder)
     return Group(
         name=section.name,
-        scenarios=_scenarios(section, folder, seed, loaded, files),
+        scenarios=_scenarios(section, folder, seed, loaded_scenario, files),
         parameter_spreads={} if observations else section.parameters,
         members=_members(section, seed, observations, files),
         observations=observations,
-        scenario_file=loaded.file,
+        scenario_file=loaded_scenario.file,
     )
 
 
@@ -434,7 +434,11 @@ def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
 
 
 def _scenarios(
-    section: GroupSection, folder: Path, seed: int, loaded: LoadedScenario, files: list[Path]
+    section: GroupSection,
+    folder: Path,
+    seed: int,
+    loaded_scenario: LoadedScenario,
+    files: list[Path],
 ) -> tuple[Scenario, ...]:
     """Return the one scenario of a group, or a scenario for each FMU or calibration of its assets.
 
@@ -443,19 +447,23 @@ def _scenarios(
     TwinMasterError
         If a scenario cannot be resolved; the message lists all files for which this is so.
     """
-    common = _common_overrides(section, folder, seed)
+    common_overrides = _common_overrides(section, folder, seed)
     if not files:
-        return (_with_values_of_group(section, resolve_scenario(loaded, common)),)
+        return (
+            _with_values_of_group(section, resolve_scenario(loaded_scenario, common_overrides)),
+        )
     scenarios = []
     objections = []
     for file in files:
         file_override: dict[str, Any] = {section.pattern_key: file}
         try:
-            resolved = resolve_scenario(loaded, replace(common, **file_override))
+            resolved_scenario = resolve_scenario(
+                loaded_scenario, replace(common_overrides, **file_override)
+            )
         except TwinMasterError as error:
             objections.append(f"{file.name}: {error}")
         else:
-            scenarios.append(_with_values_of_group(section, resolved))
+            scenarios.append(_with_values_of_group(section, resolved_scenario))
     if objections:
         raise FleetError("\n".join(["assets that cannot fly:", *objections]))
     return tuple(scenarios)
@@ -496,13 +504,14 @@ def _members(
     seed : int
         The seed of the fleet.
     observations : str
-        The pattern of the recordings of real assets, or an address; empty if assets are flown.
+        The pattern of the recordings of real assets, or the address of the broker that sends their
+        messages; empty if the assets are simulated.
     files : list of Path
         The FMU or calibration of each asset; empty if the section gives the number of assets.
     """
     if observations:
         if is_broker(observations):
-            return ()
+            return ()  # an asset of a broker joins the group with its first message
         return tuple(
             Member(row, asset_name(path), seed, {}, file=path)
             for row, path in enumerate(recording_files(observations))

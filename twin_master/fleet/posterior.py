@@ -200,7 +200,7 @@ def _relevant_range(
 
 
 def _is_fine(axis: Float, marginal: Float) -> bool:
-    """Return whether the spacing of an axis suits the deviation of its marginal, an (N,) array."""
+    """Return whether the points of an axis lie close enough for its marginal distribution (N,)."""
     step = axis[1] - axis[0]
     mean = marginal @ axis
     deviation = np.sqrt(marginal @ (axis - mean) ** 2)
@@ -275,7 +275,9 @@ def marginal_distributions(
     """
     marginals = []
     for number, (axis, transform) in enumerate(zip(axes, transforms, strict=True)):
-        other_axes = tuple(other for other in range(weight.ndim) if other != number)
+        other_axes = tuple(
+            other_number for other_number in range(weight.ndim) if other_number != number
+        )
         marginals.append(Distribution(axis, weight.sum(axis=other_axes), transform))
     return tuple(marginals)
 
@@ -486,17 +488,18 @@ class PopulationPosterior:
 
 
 def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> PopulationPosterior:
-    """Infer mean and standard deviation of a normal population of which B members were observed.
+    """Infer mean and standard deviation of a normal population from B observed members.
 
-    The prior of the mean is uniform over the range of the nodes. The prior of the standard
-    deviation is a half-t distribution with `PRIOR_FREEDOM` degrees of freedom (Gelman 2006).
+    A parameter of the members is distributed normally in the population. The prior of the mean is
+    uniform over the range of the nodes. The prior of the standard deviation is a half-t
+    distribution with `PRIOR_FREEDOM` degrees of freedom (Gelman 2006).
 
     Parameters
     ----------
     nodes : (E,) array
         Equally spaced values of the parameter.
     log_evidence : (B, E) array
-        The log evidence of each member's observations if its parameter has the value of a node.
+        The log evidence of each member's observations at each of these values.
     scale : float
         The scale of the prior of the standard deviation.
     """
@@ -510,6 +513,7 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
     edges = np.append(values, values[-1] + step) - 0.5 * step
 
     def log_density(axes: Axes) -> Float:
+        """Return the log posterior (means, deviations) of the population, up to a constant."""
         means, deviations = axes
         log_evidence_of_all = np.empty((POPULATION_POINTS, POPULATION_POINTS))
         for column, deviation in enumerate(deviations):
@@ -525,8 +529,10 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
 
     mean_axis = np.linspace(nodes[0], nodes[-1], POPULATION_POINTS)
     deviation_axis = np.linspace(0.25 * step, 0.5 * (nodes[-1] - nodes[0]), POPULATION_POINTS)
+    # Grid on which the posterior is well resolved, with the probability of each of its points
     axes, log_values = resolve_density(log_density, (mean_axis, deviation_axis))
     weight = cell_probabilities(log_values)
+    # Both axes are the quantities themselves, so that no transformation is needed.
     mean, deviation = marginal_distributions(weight, axes, (np.asarray, np.asarray))
     return PopulationPosterior(mean, deviation)
 
@@ -553,9 +559,9 @@ def _member_likelihood(nodes: Float, log_evidence: Float, values: Float) -> Floa
     """
     from scipy.interpolate import CubicSpline
 
-    possible = log_evidence[np.isfinite(log_evidence).all(axis=1)]
-    relative = possible - possible.max(axis=1, keepdims=True)
-    relative = np.maximum(relative, LEAST_LOG_EVIDENCE)
-    likelihood = np.exp(CubicSpline(nodes, relative, axis=1)(values))
+    finite_log_evidence = log_evidence[np.isfinite(log_evidence).all(axis=1)]
+    relative_log_evidence = finite_log_evidence - finite_log_evidence.max(axis=1, keepdims=True)
+    relative_log_evidence = np.maximum(relative_log_evidence, LEAST_LOG_EVIDENCE)
+    likelihood = np.exp(CubicSpline(nodes, relative_log_evidence, axis=1)(values))
     likelihood /= likelihood.sum(axis=1, keepdims=True)
     return np.asarray(likelihood)

@@ -73,20 +73,20 @@ class Outcomes:
     credible_coverage: Estimated
 
     @classmethod
-    def from_store(cls, stored: Mapping[Any, Any]) -> "Outcomes":
+    def from_store(cls, stored_arrays: Mapping[Any, Any]) -> "Outcomes":
         """Return the outcomes of all twins in a group of the store that have flown.
 
         Of a twin whose asset ended its simulation early, the flown steps are counted.
 
         Parameters
         ----------
-        stored : mapping of str to array
+        stored_arrays : mapping of str to array
             The variables of the group by name, with a row for each twin.
         """
-        flown = flown_rows(np.asarray(stored["status"]))
+        rows_flown = flown_rows(np.asarray(stored_arrays["status"]))
 
         def values(name: str) -> Float:
-            return np.asarray(stored[name])[flown].astype(np.float64)
+            return np.asarray(stored_arrays[name])[rows_flown].astype(np.float64)
 
         delay = values("delay")
         delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
@@ -129,7 +129,7 @@ def _mean(values: Float) -> Estimated:
 
 
 def _root(mean_square: Estimated) -> Estimated:
-    """Return the root r of a mean square, with its first-order error: d(r^2) / (2 r)."""
+    """Return the root r of a mean square, with the first-order standard error d(r^2) / (2 r)."""
     root = float(np.sqrt(mean_square.value))
     return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
@@ -163,7 +163,7 @@ def open_fleet(folder: Path | str) -> "xr.DataTree":
 
 
 def notice_counts(group: "xr.DataTree", kind: str) -> Index:
-    """Return the number of notices of a kind that each twin of a group gave, a (B,) array."""
+    """Return how many notices of a kind each of the B twins in a group gave: (B,)."""
     return np.asarray(
         stored_values(group, "notice/count")[:, NOTICE_KINDS.index(kind)], dtype=np.int64
     )
@@ -294,14 +294,14 @@ def flown_twins(
     RunFolderError
         If a file of the twins' prepared knowledge is missing or damaged.
     """
-    flown = flown_rows(stored_values(group, "status"))
-    scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[flown]
+    rows_flown = flown_rows(stored_values(group, "status"))
+    scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[rows_flown]
     for number in np.unique(scenario_numbers).tolist():
         knowledge_folder = folder / GROUPS / record["name"] / str(number)
         scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(
             knowledge_folder
         )
-        rows = flown[scenario_numbers == number]
+        rows = rows_flown[scenario_numbers == number]
         yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
 
 
@@ -345,7 +345,7 @@ def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree"
 
 
 def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
-    """Return counts of the twins of a group, and figures of their outcomes, by title.
+    """Return counts of a group's twins, and the figures of their outcomes, by title.
 
     The figures are means over the twins with their standard errors; a group without a flown twin
     has counts alone. Figures that need the true state are left out for real assets.
@@ -412,7 +412,7 @@ class _PrintedFigure(NamedTuple):
     unit: str = ""
 
 
-_PRINTED_FIGURES = {
+PRINTED_FIGURES_OF_FLEETS = {
     f"fallback within {WITHIN} ": _PrintedFigure(
         f"assets whose control changed within {WITHIN} steps of the damage that called for it",
         100.0,
@@ -429,6 +429,15 @@ _PRINTED_FIGURES = {
     ),
 }
 """How figures are printed, by the beginning of their keys; others are counts of assets."""
+COUNTS_OF_FLEETS = (
+    "twins",
+    "flown",
+    "failed in flight",
+    "ended early",
+    "raised an alarm",
+    "left a gauge out",
+)
+"""Titles of the counts of assets, which are their keys."""
 
 
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
@@ -438,25 +447,25 @@ def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[lis
         keys |= dict.fromkeys(figures)
     rows = []
     for key in keys:
-        printed = _PrintedFigure(key)
-        for beginning, description in _PRINTED_FIGURES.items():
+        printed_figure = _PrintedFigure(key)
+        for beginning, description in PRINTED_FIGURES_OF_FLEETS.items():
             if key.startswith(beginning):
-                printed = description._replace(
+                printed_figure = description._replace(
                     title=description.title.format(of=key.removeprefix(beginning))
                 )
-        cells = [_figure_text(figures.get(key), printed) for figures in groups.values()]
-        rows.append([printed.title, *cells])
+        cells = [_figure_text(figures.get(key), printed_figure) for figures in groups.values()]
+        rows.append([printed_figure.title, *cells])
     return rows
 
 
-def _figure_text(figure: Estimated | int | None, printed: _PrintedFigure) -> str:
+def _figure_text(figure: Estimated | int | None, printed_figure: _PrintedFigure) -> str:
     """Return a figure with its standard error and unit as text; empty if there is none."""
     if figure is None:
         return ""
     if isinstance(figure, int):
         return str(figure)
-    value = printed.scale * figure.value
-    error = printed.scale * figure.error
+    value = printed_figure.scale * figure.value
+    error = printed_figure.scale * figure.error
     # One twin has no standard error.
     text = plus_minus(value, error) if np.isfinite(error) else significant(value)
-    return f"{text} {printed.unit}".rstrip()
+    return f"{text} {printed_figure.unit}".rstrip()

@@ -155,7 +155,7 @@ def _add_flown_fleet(
 def _leaving_or_explanation(
     page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
 ) -> Float | None:
-    """Return the probability that each flown twin of a group changes its control.
+    """Return for each flown twin of a group the probability that its control changes soon.
 
     The probabilities are those of `leaving_probabilities`. If they cannot be computed, add a
     paragraph with the reason to the page, and return None.
@@ -209,7 +209,7 @@ def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
 
 
 def _damage_sentence(standings: Sequence[Standing]) -> str:
-    """Return the most severely damaged asset and its state; empty if no state is estimated."""
+    """Return a sentence on the most severely damaged asset; empty if no state is estimated."""
     standings_with_state = [standing for standing in standings if standing.most_damaged is not None]
     if not standings_with_state:
         return ""
@@ -258,7 +258,7 @@ def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None
     Parameters
     ----------
     page : Page
-        The page.
+        The page to which content is added.
     failures : mapping of str to str
         The error of each asset, by GROUP/NAME.
     caption : str
@@ -294,10 +294,12 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
     """Add the figure of the assets' states over time, if any step has an estimated state."""
-    flown = flown_rows(stored_values(group, "status"))
-    mean = believed_means(group)[flown]
+    rows_flown = flown_rows(stored_values(group, "status"))
+    mean = believed_means(group)[rows_flown]
     if standing.names and not np.isnan(mean).all():
-        figure = course_figure(standing.scenario, mean, stored_values(group, "truth/state")[flown])
+        figure = course_figure(
+            standing.scenario, mean, stored_values(group, "truth/state")[rows_flown]
+        )
         page.add_report_figure(WORDS.figure("course", figure))
 
 

@@ -81,7 +81,7 @@ def flights_of_recordings(
 
 
 def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
-    """Return the history of beliefs and controls of a twin given the messages of one real asset.
+    """Return a twin's history of beliefs and controls, given the messages of one real asset.
 
     If a message comes late and changes the observation of a former step, all steps are filtered
     again with the final observations.
@@ -140,8 +140,8 @@ class Kit:
         model and estimator that a user has given.
     """
 
-    def __init__(self, packed: bytes) -> None:
-        scenario, files, self.wing, parts = pickle.loads(packed)
+    def __init__(self, packed_kit: bytes) -> None:
+        scenario, files, self.wing, parts = pickle.loads(packed_kit)
         folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)
@@ -150,7 +150,7 @@ class Kit:
         self.knowledge: Knowledge = load_knowledge(folder, self.scenario, parts=parts)
 
     def without_folder(self, sentence: str) -> str:
-        """Return a sentence in which paths do not begin with the temporary folder of the kit."""
+        """Return a sentence with the temporary folder of the kit cut off from all paths."""
         return sentence.replace(f"{self._folder}/", "")
 
     def open_asset(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:

@@ -83,21 +83,21 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
     """
     # All scenarios of a group come from one scenario file, with equal states and controls.
     scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = flown_rows(stored_values(group, "status"))
-    last_step = last_steps(group)[flown]
-    at_last_step = (flown, last_step)
+    rows_flown = flown_rows(stored_values(group, "status"))
+    last_step = last_steps(group)[rows_flown]
+    at_last_step = (rows_flown, last_step)
     last_control = stored_values(group, "observed/control_index")[at_last_step]
     names = [name for name, _seed, _scenario_number in record["members"]]
     return Standing(
         group=record["name"],
         scenario=scenario,
-        names=[names[row] for row in flown],
+        names=[names[row] for row in rows_flown],
         step=last_step,
         mean=believed_means(group)[at_last_step],
         deviation=stored_values(group, "filtered/standard_deviation")[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
-        alarms=notice_counts(group, "alarm")[flown],
-        leaving=np.full(len(flown), np.nan),
+        alarms=notice_counts(group, "alarm")[rows_flown],
+        leaving=np.full(len(rows_flown), np.nan),
     )
 
 
@@ -132,7 +132,7 @@ def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
 
 
 def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
-    """Return a moment of each of F factors of the state of B assets, a (B, F) array.
+    """Return a moment of each state factor of each asset, a (B, F) array.
 
     It is NaN where the record has None.
 

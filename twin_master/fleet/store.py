@@ -59,7 +59,7 @@ _NOT_DEFINED = -1
 
 
 def flown_rows(status: NDArray[Any]) -> Index:
-    """Return the rows of the twins that flew to the end of the mission or of their assets."""
+    """Return the rows of the twins that have flown to the end of the mission or of the asset."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 
@@ -284,16 +284,19 @@ def check_installed(*packages: str) -> None:
     FleetError
         If one of the packages is not installed.
     """
-    missing = [name for name in packages if util.find_spec(name) is None]
-    if missing:
-        raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
+    missing_packages = [name for name in packages if util.find_spec(name) is None]
+    if missing_packages:
+        raise FleetError(
+            f"a fleet needs {' and '.join(missing_packages)}: pip install 'uav-twin[fleet]'."
+        )
 
 
 def open_group(folder: Path, group: str) -> "xr.DataTree":
-    """Open a group of assets in the store of a fleet; each array is read when it is first used.
+    """Open a group of assets in the store of a fleet.
 
-    If an earlier version of the program wrote the store, the group is converted to the present
-    names and shapes of its arrays.
+    The arrays of the group are read from the disk when they are first used. If an earlier version
+    of the program wrote the store, the names and shapes of the arrays are converted to the present
+    ones.
 
     Parameters
     ----------
@@ -326,11 +329,11 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
         tree = in_present_layout(stored_group, scenario, names)
     # A path with braces is a template, such as "{input}", whose arrays differ between groups.
     required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
-    missing = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
-    if missing:
+    missing_paths = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
+    if missing_paths:
         raise FleetError(
             f"{folder} was flown by another version of this program and lacks "
-            f"{', '.join(missing)}: fly the fleet again with --replace, "
+            f"{', '.join(missing_paths)}: fly the fleet again with --replace, "
             "or read it with that version."
         )
     return tree
@@ -363,7 +366,10 @@ def create_store(folder: Path, fleet: Fleet) -> None:
 
 
 def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
-    """Create the arrays of a group, in chunks of one shard."""
+    """Create the empty arrays and the coordinates of a group of assets in the store of a fleet.
+
+    The assets of one shard are one chunk of each array, so that a shard writes whole chunks.
+    """
     scenario = group.scenarios[0]
     twin_count = len(group.members)
     sizes = dimension_sizes(scenario)
@@ -380,9 +386,9 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
             attributes=variable.attributes,
             overwrite=True,
         )
-    coordinates = store_coordinates(scenario, [member.name for member in group.members])
-    for group_path, coordinates_of_group in coordinates_of_groups(layout, coordinates).items():
-        _create_coordinates(zarr_group, group_path, coordinates_of_group)
+    all_coordinates = store_coordinates(scenario, [member.name for member in group.members])
+    for inner_group, coordinates in coordinates_of_groups(layout, all_coordinates).items():
+        _create_coordinates(zarr_group, inner_group, coordinates)
     zarr_group.attrs.update(
         {
             "scenario": scenario.mission.name,

@@ -117,7 +117,11 @@ def dimension_sizes(scenario: Scenario) -> dict[str, int]:
 
 
 def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[str, StoredVariable]:
-    """Return the variables of the store of a group, by their paths.
+    """Return the variables that the store of a fleet has for a group of assets.
+
+    They are listed in the schema, a table that has a row with axes, unit, title and type for each
+    variable. Path and row are templates: a field in braces is filled in for the scenario, and a
+    path with the field of a reading or a parameter stands for a variable of each of them.
 
     Parameters
     ----------
@@ -125,20 +129,25 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
         The scenario of the group.
     parameters : sequence of str
         The names of the true parameters that differ from twin to twin.
+
+    Returns
+    -------
+    dict of str to StoredVariable
+        The variables by their paths in the group.
     """
     observation = scenario.observation
-    different_units = dict.fromkeys(observation.sensor_units)
+    distinct_units = set(observation.sensor_units)
     common_fields = {
         "role": observation.role,
-        "sensor_unit": SEVERAL_UNITS if len(different_units) > 1 else observation.sensor_units[0],
+        "sensor_unit": SEVERAL_UNITS if len(distinct_units) > 1 else observation.sensor_units[0],
         "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
     }
     layout = {}
-    for template, row in SCHEMA["fleet"].items():
-        for own_fields in _fields_of_entries(template, scenario, parameters):
+    for path_template, row_templates in SCHEMA["fleet"].items():
+        for own_fields in _fields_of_entries(path_template, scenario, parameters):
             fields = common_fields | own_fields
-            path = template.format(**fields)
-            axes, unit, title, dtype = (text.format(**fields) for text in row)
+            path = path_template.format(**fields)
+            axes, unit, title, dtype = (template.format(**fields) for template in row_templates)
             usual_fill_value = np.nan if dtype[0] == "f" else 0
             fill_value = _FILL_VALUES.get(path, usual_fill_value)
             layout[path] = StoredVariable(tuple(axes.split()), unit, title, dtype, fill_value)
@@ -148,7 +157,7 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
 def _fields_of_entries(
     template: str, scenario: Scenario, parameters: Sequence[str]
 ) -> Iterator[dict[str, str]]:
-    """Yield the values of the own fields of each variable that a row of the schema describes."""
+    """Yield for each variable that one row of the schema describes the values of its fields."""
     if "{reading}" in template:
         for reading in scenario.readings:
             yield {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
@@ -197,7 +206,7 @@ def store_coordinates(scenario: Scenario, twins: Sequence[str]) -> dict[str, Coo
 def coordinates_of_groups(
     layout: Mapping[str, StoredVariable], coordinates: Mapping[str, Coordinate]
 ) -> dict[str, dict[str, Coordinate]]:
-    """Return the coordinates of each group of a store: those whose axes its variables have.
+    """Return for each group of a store the coordinates of all axes that its variables have.
 
     Parameters
     ----------
@@ -280,12 +289,18 @@ def in_present_layout(
     import xarray as xr
 
     dimensions = {
-        former: present for former, present in FORMER_DIMENSIONS.items() if former in dataset.dims
+        former_name: present_name
+        for former_name, present_name in FORMER_DIMENSIONS.items()
+        if former_name in dataset.dims
     }
     variables = {}
-    for name, stored in dataset.data_vars.items():
-        variable = stored.rename(
-            {former: present for former, present in dimensions.items() if former in stored.dims}
+    for name, stored_variable in dataset.data_vars.items():
+        variable = stored_variable.rename(
+            {
+                former_name: present_name
+                for former_name, present_name in dimensions.items()
+                if former_name in stored_variable.dims
+            }
         )
         if name == _FORMER_OBSERVED:
             for path, columns in observed_columns(scenario).items():
@@ -321,7 +336,9 @@ def former_names_used(dataset: "xr.Dataset") -> Mapping[str, str]:
     Names of dimensions come first, then those of variables, which become paths.
     """
     dimensions = {
-        name: present for name, present in FORMER_DIMENSIONS.items() if name in dataset.dims
+        name: present_name
+        for name, present_name in FORMER_DIMENSIONS.items()
+        if name in dataset.dims
     }
     paths = {name: path for name, path in FORMER_PATHS.items() if name in dataset.data_vars}
     return dimensions | paths

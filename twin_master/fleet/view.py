@@ -32,7 +32,7 @@ def serve_fleet(
     folder: Path,
     port: int,
     ready: Callable[[str], None],
-    wanted: Callable[[], bool] = _always,
+    is_wanted: Callable[[], bool] = _always,
 ) -> None:
     """Serve the report of a fleet to browsers on this machine, and renew it when files change.
 
@@ -44,7 +44,7 @@ def serve_fleet(
         The port of the server; 0 takes a free one.
     ready : callable
         Called with the address once the server answers.
-    wanted : callable
+    is_wanted : callable
         Returns whether to go on serving; by default for ever.
     """
     page = _CurrentPage(folder)
@@ -53,7 +53,7 @@ def serve_fleet(
         "/version": ServedText(page.version, "text/plain"),
         "/view.js": package_text("twin_master.fleet", "view.js", "text/javascript"),
     }
-    serve_texts(texts, port, ready, wanted)
+    serve_texts(texts, port, ready, is_wanted)
 
 
 class _CurrentPage:

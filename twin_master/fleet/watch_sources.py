@@ -86,7 +86,7 @@ class Source(Protocol):
         """Whether all observations are read and no more can come."""
 
     def look(self, *, for_new_assets: bool) -> int:
-        """Process the new observations of all assets of the group; return the number of steps."""
+        """Process the new observations of all assets, and return the number of new steps."""
 
 
 class FileSource:
@@ -134,7 +134,7 @@ class FileSource:
         return asset.watch.intake.has_ended or self._watcher.has_all_steps(asset)
 
     def look(self, *, for_new_assets: bool) -> int:
-        """Process the new lines of all files, each with its asset; return the number of steps.
+        """Process the new lines of all assets' files, and return the number of new steps.
 
         Parameters
         ----------
@@ -232,7 +232,7 @@ class TopicSource:
             self._find_topic(path.parent.name)
 
     def _take_in(self, message: BrokerMessage) -> int:
-        """Queue a message at its topic and process the topic; return the number of steps.
+        """Queue a message at its topic and process the topic; return the number of new steps.
 
         It is ignored if its asset has all steps asked for, or if there are too many assets.
         """

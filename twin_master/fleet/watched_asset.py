@@ -55,7 +55,7 @@ def counts_of(standing: JsonRecord) -> dict[str, int]:
     Parameters
     ----------
     standing : mapping
-        What `read_standing` returns.
+        The record of the asset, from `read_standing`.
     """
     assets = standing["assets"].values()
     decisions = [asset["last"] for asset in assets if asset["last"] is not None]

@@ -38,9 +38,9 @@ It doubles each time the same error comes again.
 LONGEST_AGAIN = 3600.0
 """Largest time until the watch of an asset is resumed after an error [s]."""
 IDLE_SECONDS = 0.05
-"""Shortest pause if nothing came [s]."""
+"""Shortest pause if no message has come [s]."""
 LONGEST_IDLE = 1.0
-"""Longest pause if nothing came [s]."""
+"""Longest pause if no message has come [s]."""
 BUSY_SHARE = 0.2
 """Fraction of a processor's time that polling sources without new messages may take."""
 _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")

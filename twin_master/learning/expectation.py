@@ -98,7 +98,7 @@ class LearntExpectation:
     rewards : RewardModel
         The rewards of the asset.
     policy : (S, U) array
-        p(U | D), by which controls are predicted.
+        The policy p(U | D) that predicts the controls.
     """
 
     learning: LearningFilter
@@ -234,7 +234,7 @@ class LearntExpectation:
     ) -> tuple[Float, Float]:
         """Return mean and standard deviation (G,) of a quantity that each gauge may have learnt.
 
-        A gauge that did not learn it has the default value for certain.
+        If a gauge has not learnt the quantity, its value is the default, with deviation zero.
         """
         certain = Learnt(default, 0.0, default, default)
         numbers = range(1, self.learning.sensor_model.sensor_count + 1)
@@ -289,14 +289,14 @@ class LearntExpectation:
         """
         hypotheses = self.learning.hypotheses(step)
         joint = _joint_with_marginal(hypotheses.weight, belief)
-        predicted = np.empty((horizon, *hypotheses.weight.shape))  # (H, K, S)
+        predicted_joint = np.empty((horizon, *hypotheses.weight.shape))  # (H, K, S)
         # The first transition is under the control in force, later ones are under the policy.
         transition = self.learning.model.transition.matrix[step.control_index]
         for h in range(horizon):
             joint = joint @ transition
-            predicted[h] = joint
+            predicted_joint[h] = joint
             transition = self._closed_loop
-        return self._expect(hypotheses, predicted[..., None] * policy, slice(None), None)
+        return self._expect(hypotheses, predicted_joint[..., None] * policy, slice(None), None)
 
     def _expect(
         self,
@@ -355,14 +355,16 @@ class LearntExpectation:
     def _sensor_moments(self, hypotheses: StaticHypotheses, controls: slice) -> tuple[Float, Float]:
         """Return mean and variance of each sensor's value without noise: (K, S, U', G), SI."""
         sensor_model = self.learning.sensor_model
-        predicted = sensor_model.value_per_draw[:, :, controls][hypotheses.draw]
+        predicted_values = sensor_model.value_per_draw[:, :, controls][hypotheses.draw]
         gain = _insert_state_and_control(hypotheses.gain)
         offset = _insert_state_and_control(hypotheses.offset)
         offset_variance = _insert_state_and_control(hypotheses.offset_variance)
         covariance = _insert_state_and_control(hypotheses.covariance)
         gain_variance = _insert_state_and_control(hypotheses.gain_variance)
-        value = predicted * (1.0 + gain) + offset
-        variance = offset_variance + predicted * (2.0 * covariance + predicted * gain_variance)
+        value = predicted_values * (1.0 + gain) + offset
+        variance = offset_variance + predicted_values * (
+            2.0 * covariance + predicted_values * gain_variance
+        )
         return value, variance
 
     def _expected_noise(

@@ -68,22 +68,22 @@ class FaultFilter:
         self._model = model
         self._sensor_model = sensor_model
         self._settings = settings
-        chosen, self._draw_weight = _choose_even_draws(
+        chosen_draws, self._draw_weight = _choose_even_draws(
             np.asarray(draws, np.float64), sensor_model.draw_weight
         )
         sensors = sensor_model.sensor_count
         states = model.states.size
-        self._gauge_belief_shape = (sensors, len(_GAINS), len(chosen), states)
+        self._gauge_belief_shape = (sensors, len(_GAINS), len(chosen_draws), states)
         if np.prod(self._gauge_belief_shape, dtype=float) > _MOST_BELIEF_NUMBERS:
             raise InvalidModelError(
-                f"noticing keeps a belief over {states} states and {len(chosen)} draws for each of "
-                f"{sensors * len(_GAINS)} faults of gauges, which are more than "
+                f"notices need a belief over {states} states and {len(chosen_draws)} draws for "
+                f"each of {sensors * len(_GAINS)} faults of gauges, which are more than "
                 f"{_MOST_BELIEF_NUMBERS} numbers: take fewer levels or state factors, or leave out "
                 "`notice`"
             )
 
         # Predictions of the chosen draws (E', S, G) and inverse noise (S, G) for each control.
-        values = sensor_model.value_per_draw[chosen]
+        values = sensor_model.value_per_draw[chosen_draws]
         noise = sensor_model.independent_standard_deviation
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(values[:, :, u]) for u in controls]
@@ -183,7 +183,7 @@ class FaultFilter:
         rows[is_nonzero] = self._model.transition.forward(control_index, rows[is_nonzero])
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: float) -> None:
-        """Let faults of single gauges begin in this step, and fade what is learnt of their gains.
+        """Let faults of single gauges begin in this step, and let the sums about their gains fade.
 
         A fault that begins now has the belief and the sums of squares of the model so far.
 
@@ -213,7 +213,7 @@ class FaultFilter:
         )
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: float) -> None:
-        """Let free gains begin in this step, and fade what is learnt of them.
+        """Let the fault of free gains begin in this step, and let its sums about the gains fade.
 
         Free gains are the fault that several gauges have unknown gains.
 
@@ -246,7 +246,7 @@ class FaultFilter:
         statistics.sum_cx *= fading * earlier_weight
 
     def _fading_per_step(self) -> float:
-        """Return the factor of exponential forgetting of the sums of gains, as gains may change."""
+        """Return the factor by which the sums about gains fade in a step, as gains may change."""
         return float(np.exp(-1.0 / self._settings.memory_steps))
 
     def probability_to_begin_after(self, step: float) -> float:
@@ -284,7 +284,7 @@ class FaultFilter:
             self._move_to_recovered(state, ended_or_hidden)
 
     def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix beliefs and sums of squares of ended and hidden faults into those of "recovered".
+        """Mix the beliefs and sums of ended and hidden faults into the hypothesis "recovered".
 
         "Recovered" is the hypothesis that the gauges are right again after a fault.
 
@@ -422,11 +422,11 @@ class FaultFilter:
     def _standardize(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
     ) -> tuple[StandardizedObservation, Float]:
-        """Return an observation in units of noise, and its log density without the residuals.
+        """Return an observation in units of the noise, and the first part of its log density.
 
-        The log density (N,), for each pair of a draw and a state, lacks the densities of the
-        standardised residuals, which depend on the hypothesis. The parameters are those of
-        `assimilate`.
+        This part (N,), for each pair of a draw and a state, is the same under all hypotheses. It
+        lacks the densities of the standardised residuals, which depend on the hypothesis. The
+        parameters are those of `assimilate`.
         """
         degrees = self._settings.noise_degrees
         count = state.observation_count
@@ -436,24 +436,24 @@ class FaultFilter:
         best_fit = self._sensor_model.fit_within_interval(
             readings, control_index, self._value[control_index], precision
         )
-        present = ~np.isnan(readings)
-        inverse_deviation = np.where(present, self._inverse_deviation[control_index], 0.0)
+        is_present = ~np.isnan(readings)
+        inverse_deviation = np.where(is_present, self._inverse_deviation[control_index], 0.0)
         prediction = (best_fit.value * inverse_deviation).reshape(-1, len(readings))
-        difference = np.where(present, readings - best_fit.value, 0.0)
+        difference = np.where(is_present, readings - best_fit.value, 0.0)
         observation = StandardizedObservation(
-            present=present,
+            present=is_present,
             residual=(difference * inverse_deviation).reshape(prediction.shape),
             prediction=prediction,
             power=0.5 * (degrees + count + 1.0),
             degrees=degrees,
         )
-        log_scale = np.log(inverse_deviation[:, present]).sum(axis=1)
+        log_scale = np.log(inverse_deviation[:, is_present]).sum(axis=1)
         log_prior_density = best_fit.log_density + log_density_beside + log_scale
         return observation, log_prior_density.ravel()
 
 
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
-    """Choose draws evenly over the range of all, and give each the probability of its neighbours.
+    """Choose draws evenly over the whole range, each with the probability of the draws around it.
 
     The chosen draws are evenly spaced: a true value in a wide gap between two of them would look
     like a fault.
@@ -465,7 +465,7 @@ def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], 
 
     Returns
     -------
-    chosen : (E',) array
+    chosen_draws : (E',) array
         The indices of the chosen draws.
     chosen_weight : (E',) array
         For each chosen draw, the total probability of the draws that are nearest to it.
@@ -473,7 +473,7 @@ def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], 
     order = np.argsort(draws, kind="stable")
     grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)
     nearest_to_grid = [order[np.argmin(np.abs(draws[order] - value))] for value in grid]
-    chosen = np.unique(nearest_to_grid)
-    nearest_chosen = np.argmin(np.abs(draws[:, None] - draws[chosen]), axis=1)
-    chosen_weight = np.bincount(nearest_chosen, weight, minlength=len(chosen))
-    return chosen, np.asarray(chosen_weight / chosen_weight.sum(), dtype=np.float64)
+    chosen_draws = np.unique(nearest_to_grid)
+    nearest_chosen = np.argmin(np.abs(draws[:, None] - draws[chosen_draws]), axis=1)
+    chosen_weight = np.bincount(nearest_chosen, weight, minlength=len(chosen_draws))
+    return chosen_draws, np.asarray(chosen_weight / chosen_weight.sum(), dtype=np.float64)

@@ -157,7 +157,7 @@ def mix_in_beginning_faults(
 def update_model(
     observation: StandardizedObservation, squares: Float, belief: Float, log_likelihood: Float
 ) -> tuple[float, Float]:
-    """Correct the belief of the model, or of another hypothesis of sound gauges.
+    """Correct the belief of the model, or of another hypothesis under which all gauges are sound.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def update_gauge_faults(
         The log evidence of each fault, up to the same constant as that of the model.
     """
     model_squares, kernel, log_likelihood = model
-    present, residual, prediction, power, degrees = observation
+    is_present, residual, prediction, power, degrees = observation
     log_evidence = np.empty_like(squares)
     weight = np.empty(len(log_likelihood))
     for fault in range(len(belief)):
@@ -247,7 +247,7 @@ def update_gauge_faults(
             weight[n] = log_likelihood[n]
             # Replace the kernel of gauge g by that of the fault. The factor 1 / sqrt(variance) of
             # its density follows below.
-            if present[g]:
+            if is_present[g]:
                 c = gain_deviations[k] * prediction[n, g]
                 x = residual[n, g] - gains[k] * prediction[n, g] - c * fitted_gain
                 variance = 1.0 + c * c * gain_variance
@@ -265,7 +265,7 @@ def update_gauge_faults(
                 c = gain_deviations[k] * prediction[n, g]
                 x = residual[n, g] - gains[k] * prediction[n, g]
                 variance = 1.0 + c * c * gain_variance
-                deviation = np.sqrt(variance) if present[g] else 1.0
+                deviation = np.sqrt(variance) if is_present[g] else 1.0
                 weight[n] = fault_belief[n] * np.exp(weight[n] - largest) / deviation
                 total += weight[n]
                 added_cc += weight[n] * c * c

@@ -182,13 +182,13 @@ class HypothesisWeights:
 
     @property
     def free_gains_probability(self) -> float:
-        """Probability that some gauges have unknown gains, whether it shows or not."""
+        """Probability that several gauges have unknown gains, whether this shows or not."""
         log_hidden = self.hidden[FREE_GAINS_OF_FAULTS]
         return float(np.exp(np.logaddexp(self.current[FREE_GAINS], log_hidden)))
 
     @property
     def gauge_fault_probability(self) -> Float:
-        """Probability of each single gauge and gain error (G K,), whether it shows or not."""
+        """Probability of each gain error of each gauge (G K,), whether this shows or not."""
         log_hidden = self.hidden[GAUGES_OF_FAULTS]
         return np.asarray(np.exp(np.logaddexp(self.current[GAUGE_FAULTS], log_hidden)))
 
@@ -259,7 +259,7 @@ def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> Mixed
 def list_hypotheses(
     weights: HypothesisWeights, beliefs: HypothesisBeliefs, gauge_names: tuple[str, ...]
 ) -> tuple[Hypothesis, ...]:
-    """Return the hypotheses with probability and belief, as they are shown to users.
+    """Return the competing hypotheses, each with its probability and its belief about the state.
 
     These are the model, each gauge whose fault has a probability of at least 1 %, and "none of
     these" (free gains).

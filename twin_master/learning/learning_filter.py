@@ -176,9 +176,9 @@ class LearningFilter:
         if largest == -np.inf:
             worst_residuals = self.sensor_model.worst_residuals(sensor_values, control_index)
             raise ImpossibleObservation(self._name, step, worst_residuals)
-        filtered = np.exp(log_belief - largest)
-        log_evidence = largest + float(np.log(filtered.sum()))
-        filtered /= filtered.sum()
+        joint_belief = np.exp(log_belief - largest)
+        log_evidence = largest + float(np.log(joint_belief.sum()))
+        joint_belief /= joint_belief.sum()
         log_belief -= log_evidence
 
         # Update the regressions. Each gauge is compared with the fit by all other gauges: a fit
@@ -193,10 +193,10 @@ class LearningFilter:
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
-            filtered=filtered.sum(axis=0),
+            filtered=joint_belief.sum(axis=0),
             log_evidence=log_evidence,
             carried=Carried(control_index, arrays),
-            learnt=self._learnt_quantities(filtered.sum(axis=1), statistics, count),
+            learnt=self._learnt_quantities(joint_belief.sum(axis=1), statistics, count),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -284,10 +284,12 @@ class LearningFilter:
         step_controls = np.array([step.control_index for step in carried])
         control = self._first_control[possible_hypotheses, None] + step_controls
         log_given_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
-        smoothed = smooth_many(
+        smoothed_beliefs = smooth_many(
             self._transition, control, np.exp(log_given_hypothesis), log_given_hypothesis
         )
-        result[:, possible_hypotheses] = weight[possible_hypotheses, None] * smoothed.swapaxes(0, 1)
+        result[:, possible_hypotheses] = weight[
+            possible_hypotheses, None
+        ] * smoothed_beliefs.swapaxes(0, 1)
         return result
 
     def _restore_draw_weights(self, log_belief: Float) -> Float:
@@ -336,25 +338,40 @@ class LearningFilter:
         return result
 
     def _learnt_noise_scales(self, weight: Float, fit: GaugeFit, count: Float) -> dict[str, Learnt]:
-        """Return the posterior of each noise scale, given the weights (K,) of the hypotheses.
+        """Return the posterior of each gauge's noise scale, the true over the assumed noise.
 
-        Given a hypothesis, the square of a scale has an inverse gamma distribution with a shape and
-        a rate. Mean and variance are averaged over the hypotheses. The quantiles are approximate:
-        those of the inverse gamma distribution with the mean rate.
+        Under a hypothesis, the square of a noise scale has an inverse gamma distribution. Mean and
+        variance are averaged over the hypotheses. The quantiles are approximate: those of the
+        inverse gamma distribution whose rate is the mean over the hypotheses.
+
+        Parameters
+        ----------
+        weight : (K,) array
+            The probability of each hypothesis.
+        fit : GaugeFit
+            The fit of the G gauges under each hypothesis.
+        count : (G,) array
+            The number of observations of each gauge.
+
+        Returns
+        -------
+        dict of str to Learnt
+            The posteriors by `noise_scale[g]`, with the gauges g counted from 1.
         """
         degrees = self._gauges.degrees
-        shape = 0.5 * (degrees + count)
-        rate = 0.5 * (degrees + fit.residual_squares)
+        shape = 0.5 * (degrees + count)  # (G,)
+        rate = 0.5 * (degrees + fit.residual_squares)  # (K, G)
+        mean_rate = weight @ rate
         low_level, high_level = INTERVAL
-        # The squared scale is the rate over a gamma variate, so that the lower quantile of the
-        # scale belongs to the upper one of the variate.
-        lower = np.sqrt(weight @ rate / gammaincinv(shape, high_level))
-        upper = np.sqrt(weight @ rate / gammaincinv(shape, low_level))
+        # The squared scale is the rate over a gamma variate. So the lower bound of the scale
+        # belongs to the upper quantile of the variate.
+        lower = np.sqrt(mean_rate / gammaincinv(shape, high_level))
+        upper = np.sqrt(mean_rate / gammaincinv(shape, low_level))
         # For a gamma variate x: E(1 / sqrt(x)) = Gamma(shape - 1/2) / Gamma(shape), and
         # E(1 / x) = 1 / (shape - 1).
         mean = weight @ np.sqrt(rate) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
-        variance = np.maximum(weight @ rate / (shape - 1.0) - mean**2, 0.0)
-        deviation = np.sqrt(variance)
+        mean_square = mean_rate / (shape - 1.0)
+        deviation = np.sqrt(np.maximum(mean_square - mean**2, 0.0))
         return {
             f"noise_scale[{g + 1}]": Learnt(
                 float(mean[g]), float(deviation[g]), float(lower[g]), float(upper[g])
@@ -397,7 +414,7 @@ class LearningFilter:
 def _learnt_coefficients(
     name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
 ) -> dict[str, Learnt]:
-    """Return the posterior of one coefficient of each gauge that learns it, as `name[g]` from 1.
+    """Return the posterior of a coefficient by name and number of the gauge: `name[g]`, g from 1.
 
     Parameters
     ----------

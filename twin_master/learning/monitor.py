@@ -72,7 +72,7 @@ class WatchfulEstimator:
 
     def __init__(
         self,
-        inner: Estimator,
+        inner_estimator: Estimator,
         sensor_model: GaussianSensorModel,
         draws: Float,
         settings: Noticing | None = None,
@@ -80,14 +80,14 @@ class WatchfulEstimator:
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(
-                "noticing needs the average over the draws outside the product over the sensors: "
+                "notices need the average over the draws outside the product over the sensors: "
                 "inside, each sensor has a parameter of its own"
             )
-        self._inner = inner
+        self._inner = inner_estimator
         self._sensor_model = sensor_model
-        self.model = inner.model
+        self.model = inner_estimator.model
         settings = settings or Noticing()
-        self._faults = FaultFilter(inner.model, sensor_model, draws, settings)
+        self._faults = FaultFilter(inner_estimator.model, sensor_model, draws, settings)
         self._notices = self._notice_writer(words or NoticeWording(), settings)
 
     def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
@@ -122,7 +122,7 @@ class WatchfulEstimator:
         stored_beliefs = [StoredBelief.from_arrays(step.arrays) for step in carried]
         last_step = stored_beliefs[-1]
         with np.errstate(divide="ignore"):
-            log_beliefs = np.log([stored.belief for stored in stored_beliefs])
+            log_beliefs = np.log([stored_belief.belief for stored_belief in stored_beliefs])
             log_beliefs[-1] = np.log(last_step.competing_belief)
         controls = [step.control_index for step in carried]
         competing = smooth(self.model, controls, log_beliefs)
@@ -182,7 +182,7 @@ class WatchfulEstimator:
         )
 
     def _continues(self, before: Carried) -> bool:
-        """Return whether the state of the previous step belongs to the same predictions."""
+        """Return whether the state of the previous step holds for the predictions of this model."""
         return bool(before.arrays.get(MODEL_KEY) == self._faults.model_key)
 
     def _suspicion(self, state: WatchState) -> Suspicion:

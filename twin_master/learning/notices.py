@@ -12,7 +12,7 @@ from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Sus
 from twin_master.network.sensor_model import GaussianSensorModel
 
 CLEARLY_BETTER = float(np.log(10.0))
-"""Log evidence by which free gains must exceed a single gauge, the simpler explanation."""
+"""Smallest log evidence of free gains over a single gauge, which is the simpler explanation."""
 _OR_THE_ASSET = "or the asset near it differs from the model, for example because it has softened"
 """Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
 _LEAST_NAMED_PROBABILITY = 0.1
@@ -132,20 +132,20 @@ class NoticeWriter:
         """
         best = max(hypotheses, key=lambda hypothesis: hypothesis.probability)
         if best is hypotheses[0]:
-            followed = 0
+            followed_hypothesis = 0
         elif best.belief is None:
-            followed = -1
+            followed_hypothesis = -1
         else:
-            followed = self.hypothesis_names.index(best.name) + 1
-        if best.probability <= 0.5 or followed == state.followed_hypothesis:
+            followed_hypothesis = self.hypothesis_names.index(best.name) + 1
+        if best.probability <= 0.5 or followed_hypothesis == state.followed_hypothesis:
             return []
-        state.followed_hypothesis = followed
+        state.followed_hypothesis = followed_hypothesis
 
         sensors = f"{self.wording.sensor}s"
         probability = f"(probability {best.probability:.3g})"
-        if followed == 0:
+        if followed_hypothesis == 0:
             sentence = f"the model explains the {sensors} again {probability}."
-        elif followed < 0:
+        elif followed_hypothesis < 0:
             sentence = (
                 f"no state explains the {sensors}: no state is believed, and the twin proposes the "
                 f"safest control {probability}."
@@ -156,7 +156,7 @@ class NoticeWriter:
                 f"{best.name}: belief and decision follow the other {sensors} {probability}. "
                 f"{or_the_asset}: these data cannot tell."
             )
-        numbers = (followed,) if followed > 0 else ()
+        numbers = (followed_hypothesis,) if followed_hypothesis > 0 else ()
         sentence = f"{self._step_text(step)}: {sentence}"
         return [Notice("hypothesis", sentence, numbers, best.probability)]
 
@@ -187,29 +187,29 @@ class NoticeWriter:
         log_weight = state.log_gauge_evidence + self.log_gauge_prior[:, None]
         weight = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))  # (G, K)
         probability = weight.sum(axis=1)
-        named = _largest(probability, _LEAST_NAMED_PROBABILITY)
+        named_gauges = _largest(probability, _LEAST_NAMED_PROBABILITY)
         onset = float(np.sum(weight * state.gauge_onset))
-        if len(named) > 1:
-            sensors = self.wording.name_sensors(named)
+        if len(named_gauges) > 1:
+            sensors = self.wording.name_sensors(named_gauges)
             finding = f"one of {sensors} does not show what the model predicts"
         else:
             expected_sign = weight @ np.sign(self.gains)
-            amount = "much" if expected_sign[named[0]] > 0.0 else "little"
-            finding = f"{self.wording.name_sensors(named)} shows too {amount}"
+            amount = "much" if expected_sign[named_gauges[0]] > 0.0 else "little"
+            finding = f"{self.wording.name_sensors(named_gauges)} shows too {amount}"
         finding = f"{finding}, {_OR_THE_ASSET}"
-        return self._alarm(state, step, finding, named, log_evidence, onset)
+        return self._alarm(state, step, finding, named_gauges, log_evidence, onset)
 
     def _free_gains_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
         """Return the alarm that no state explains all gauges, with the gauges of largest gain."""
         statistics = state.free_gain_statistics
         gain_deviations = np.abs(statistics.sum_cx) / np.sqrt(1.0 + statistics.sum_cc)
-        named = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
+        named_gauges = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
         finding = (
             "no state of the model explains all gauges together, least "
-            f"{self.wording.name_sensors(named)}"
+            f"{self.wording.name_sensors(named_gauges)}"
         )
         onset = float(state.free_gains_onset[0])
-        return self._alarm(state, step, finding, named, log_evidence, onset)
+        return self._alarm(state, step, finding, named_gauges, log_evidence, onset)
 
     def _alarm(
         self,

@@ -180,11 +180,11 @@ class GaugeRegression:
         count : (G,) array
             The number of earlier observations of each gauge.
         """
-        present = ~np.isnan(readings.observation)
+        is_present = ~np.isnan(readings.observation)
         fit = self.fit(statistics)
         # The factors of the density that do not depend on the state. The density is Student's, or
         # normal if the noise scale is not learnt.
-        log_constant: Float = np.full(len(present), -0.5 * np.log(2.0 * np.pi))
+        log_constant: Float = np.full(len(is_present), -0.5 * np.log(2.0 * np.pi))
         if self.degrees > 0.0:
             power = 0.5 * (self.degrees + count + 1.0)
             log_constant = gammaln(power) - gammaln(power - 0.5)
@@ -192,8 +192,8 @@ class GaugeRegression:
                 np.pi * (self.degrees + fit.residual_squares)
             )
         result = np.empty((len(readings.draw), readings.prediction.shape[1]))
-        result[:] = np.sum(log_constant, axis=-1, where=present)[..., None]
-        result += np.log(readings.inverse_deviation[:, present]).sum(axis=1)
+        result[:] = np.sum(log_constant, axis=-1, where=is_present)[..., None]
+        result += np.log(readings.inverse_deviation[:, is_present]).sum(axis=1)
         # The factors that do. The loop is faster on contiguous arrays.
         contiguous_fit = GaugeFit._make(map(np.ascontiguousarray, fit))
         _add_log_densities(
@@ -274,10 +274,14 @@ def _add_log_densities(
                 if np.isnan(observation[g]):
                     continue
                 scale = inverse_deviation[s, g]
-                predicted = prediction[draw[k], s, g]
+                predicted_value = prediction[draw[k], s, g]
                 a = offset_deviation[g] * scale
-                c = gain_deviation[g] * predicted * scale
-                x = (observation[g] - predicted) * scale - a * fit.offset[k, g] - c * fit.gain[k, g]
+                c = gain_deviation[g] * predicted_value * scale
+                x = (
+                    (observation[g] - predicted_value) * scale
+                    - a * fit.offset[k, g]
+                    - c * fit.gain[k, g]
+                )
                 variance = (
                     1.0
                     + a * (a * fit.offset_variance[k, g] + 2.0 * c * fit.covariance[k, g])
@@ -331,11 +335,11 @@ def _add_expected_products(
             for g in range(len(observation)):
                 if np.isnan(observation[g]):
                     continue
-                predicted = prediction[draw[k], s, g]
+                predicted_value = prediction[draw[k], s, g]
                 scale = inverse_deviation[s, g]
                 a = offset_deviation[g] * scale
-                c = gain_deviation[g] * predicted * scale
-                x = (observation[g] - predicted) * scale
+                c = gain_deviation[g] * predicted_value * scale
+                x = (observation[g] - predicted_value) * scale
                 sums.aa[k, g] += weight[s] * a * a
                 sums.ac[k, g] += weight[s] * a * c
                 sums.cc[k, g] += weight[s] * c * c

@@ -193,39 +193,41 @@ class WatchState:
         gauge_shape : tuple of int
             The shape (G, K, E, S) of `gauge_belief`.
         """
-        stored = {
+        stored_arrays = {
             name.removeprefix(PREFIX): array.copy()
             for name, array in arrays.items()
             if name.startswith(PREFIX)
         }
         gauge_belief = np.zeros(gauge_shape, dtype=np.float32)
-        gauge_belief.ravel()[stored["gauge_place"]] = stored["gauge"]
-        gauge_alarm_raised, free_gains_alarm_raised = stored["alarmed"].tolist()
+        gauge_belief.ravel()[stored_arrays["gauge_place"]] = stored_arrays["gauge"]
+        gauge_alarm_raised, free_gains_alarm_raised = stored_arrays["alarmed"].tolist()
         return cls(
-            model_belief=stored["model"],
-            recovered_belief=stored["mended"],
+            model_belief=stored_arrays["model"],
+            recovered_belief=stored_arrays["mended"],
             gauge_belief=gauge_belief,
-            free_gains_belief=stored["none"],
-            weights=HypothesisWeights(stored["share"], stored["hidden"], stored["shows"]),
-            log_gauge_evidence=stored["log_gauge"],
-            gauge_onset=stored["gauge_onset"],
-            log_free_gains_evidence=stored["log_none"],
-            free_gains_onset=stored["none_onset"],
-            model_squares=stored["model_squares"],
-            recovered_squares=stored["mended_squares"],
-            gauge_squares=stored["gauge_squares"],
-            gauge_sum_cc=np.ascontiguousarray(stored["gauge_sums"][..., 0]),
-            gauge_sum_cx=np.ascontiguousarray(stored["gauge_sums"][..., 1]),
-            free_gain_statistics=FreeGainStatistics.from_array(stored["none_statistics"]),
-            observation_count=stored["count"],
-            step_count=float(stored["steps"][0]),
+            free_gains_belief=stored_arrays["none"],
+            weights=HypothesisWeights(
+                stored_arrays["share"], stored_arrays["hidden"], stored_arrays["shows"]
+            ),
+            log_gauge_evidence=stored_arrays["log_gauge"],
+            gauge_onset=stored_arrays["gauge_onset"],
+            log_free_gains_evidence=stored_arrays["log_none"],
+            free_gains_onset=stored_arrays["none_onset"],
+            model_squares=stored_arrays["model_squares"],
+            recovered_squares=stored_arrays["mended_squares"],
+            gauge_squares=stored_arrays["gauge_squares"],
+            gauge_sum_cc=np.ascontiguousarray(stored_arrays["gauge_sums"][..., 0]),
+            gauge_sum_cx=np.ascontiguousarray(stored_arrays["gauge_sums"][..., 1]),
+            free_gain_statistics=FreeGainStatistics.from_array(stored_arrays["none_statistics"]),
+            observation_count=stored_arrays["count"],
+            step_count=float(stored_arrays["steps"][0]),
             gauge_alarm_raised=bool(gauge_alarm_raised),
             free_gains_alarm_raised=bool(free_gains_alarm_raised),
-            left_out=stored["left_out"] > 0.0,
-            followed_hypothesis=int(stored["leading"][0]),
-            belief=stored["belief"],
-            competing_belief=stored["rivals"],
-            model_weight=float(stored["right"][0]),
+            left_out=stored_arrays["left_out"] > 0.0,
+            followed_hypothesis=int(stored_arrays["leading"][0]),
+            belief=stored_arrays["belief"],
+            competing_belief=stored_arrays["rivals"],
+            model_weight=float(stored_arrays["right"][0]),
         )
 
 

@@ -97,7 +97,7 @@ class SamplingGrid:
         return tuple((first, min(first + length, self.size)) for first in firsts)
 
     def point(self, index: int) -> tuple[int, dict[str, float], str]:
-        """Return the index of the draw, the state, and the name of the control of a point."""
+        """Return the index of the draw, the state and the name of the control of a grid point."""
         draw, *levels, control = np.unravel_index(index, self.shape)
         state = {}
         for (name, values), level in zip(self.states.items(), levels, strict=True):
@@ -119,7 +119,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
     Parameters
     ----------
     texts : sequence of str
-        The texts.
+        The texts that the user gave, one for each axis.
     binding : Binding
         The binding of the FMU.
 
@@ -160,7 +160,7 @@ def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
 
 
 def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
-    """Return the numbers of VALUES in `NAME=VALUES`; `text` is all of it, for the message."""
+    """Return the numbers of VALUES in the text `NAME=VALUES` that a user gave."""
     try:
         if ":" in values_text:
             first, last, count = values_text.split(":")
@@ -272,7 +272,7 @@ def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
 
 
 def grid_of_scenario(
-    loaded: LoadedScenario,
+    loaded_scenario: LoadedScenario,
     folder: Path,
     texts: Sequence[str] = (),
     *,
@@ -286,8 +286,8 @@ def grid_of_scenario(
 
     Parameters
     ----------
-    loaded : LoadedScenario
-        The scenario.
+    loaded_scenario : LoadedScenario
+        The scenario, as read from its file.
     folder : Path
         The folder into which the FMU and its binding are copied.
     texts : sequence of str
@@ -307,15 +307,19 @@ def grid_of_scenario(
         If the asset of the scenario cannot be prepared.
     """
     # the FMU that flies
-    scenario = resolve_scenario(_without_library(loaded), overrides)
-    flown = scenario.asset.source(scenario)
-    if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
+    scenario = resolve_scenario(_without_library(loaded_scenario), overrides)
+    flown_source = scenario.asset.source(scenario)
+    if not isinstance(flown_source, FmuSource) or isinstance(flown_source, SeveralSource):
         raise MissionInputError(
             f"the scenario {scenario.mission.name} flies an asset of the kind "
             f"`{scenario.asset.kind}`, and one FMU can be sampled."
         )
-    believed = scenario.belief.source(scenario, flown)
-    source = flown if believed is flown else PairedSource(flown, believed)
+    believed_source = scenario.belief.source(scenario, flown_source)
+    source = (
+        flown_source
+        if believed_source is flown_source
+        else PairedSource(flown_source, believed_source)
+    )
     source.check()
     source.prepare(folder, reporter())
 
@@ -328,7 +332,7 @@ def grid_of_scenario(
     if gives_other_parameter or values_by_role["control"] or values_by_role["load"]:
         raise MissionInputError(
             f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the "
-            "rest is said by the scenario."
+            "scenario gives the rest."
         )
     levels = {factor.name: factor.levels for factor in scenario.state}
     values = parameters.get(draws.name, tuple(draws.values.tolist()))
@@ -343,7 +347,7 @@ def grid_of_scenario(
             for name in expectations
             if name in binding.parameter
         }
-    fixed_parameters = flown.parameters()
+    fixed_parameters = flown_source.parameters()
     fixed_parameters.pop(draws.name, None)
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),
@@ -357,22 +361,22 @@ def grid_of_scenario(
         parameters=fixed_parameters,
         others=dependent_parameters,
         settling_steps=settling_steps,
-        step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
+        step_timeout=flown_source.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
-def _without_library(loaded: LoadedScenario) -> LoadedScenario:
-    """Return the scenario without the observation library that its twin believes.
+def _without_library(loaded_scenario: LoadedScenario) -> LoadedScenario:
+    """Return the scenario with the FMU as belief, if its twin believes an observation library.
 
     The library is yet to be sampled. In its place the twin believes the wing design that the table
     `belief` names, or else the asset itself.
     """
-    belief = loaded.scenario.belief
+    belief = loaded_scenario.scenario.belief
     if not isinstance(belief, LibraryBelief):
-        return loaded
+        return loaded_scenario
     if belief.design is None:
         model: AssetBelief | DesignBelief = AssetBelief()
     else:
         model = DesignBelief(design=belief.design)
-    scenario = loaded.scenario.model_copy(update={"belief": model})
-    return replace(loaded, scenario=scenario)
+    scenario = loaded_scenario.scenario.model_copy(update={"belief": model})
+    return replace(loaded_scenario, scenario=scenario)

@@ -25,7 +25,7 @@ class GridSampler:
     Parameters
     ----------
     grid : SamplingGrid
-        The grid.
+        The points at which the FMU is sampled.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class GridSampler:
         return history.values[steps_per_point - 1 :: steps_per_point, self._observation_slice]
 
     def _error_at(self, error: FmuError, point: int) -> FmuError:
-        """Return an error whose message begins with the point at which it happened."""
+        """Return an error with the point at which it happened at the beginning of its message."""
         # A worker that ends abruptly has reported its progress some steps earlier.
         is_located = isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
         where = "at" if is_located else "at or soon after"
@@ -151,7 +151,7 @@ class GridSampler:
             settings.append(f"{grid.parameter} = {grid.draws[draw]:g}")
         return ", ".join(settings)
 
-    def _check_repeated_point(self, point: int, former: Float) -> None:
+    def _check_repeated_point(self, point: int, first_observation: Float) -> None:
         """Observe a point again, and refuse the FMU if its observation changes too much.
 
         An FMU without memory returns the same values, and an FMU that has settled nearly the same.
@@ -160,21 +160,23 @@ class GridSampler:
         ----------
         point : int
             The point.
-        former : (G,) array
+        first_observation : (G,) array
             The first observation at the point.
         """
         settling_steps = self._grid.settling_steps
-        latter = self._observe(point, point + 1)[0]
-        change = np.abs(latter - former)
+        repeated_observation = self._observe(point, point + 1)[0]
+        change = np.abs(repeated_observation - first_observation)
         tolerance = SETTLED_TOLERANCE if settling_steps else MEMORY_TOLERANCE
-        if not np.any(change > tolerance * np.maximum(np.abs(former), np.abs(latter))):
+        if not np.any(
+            change > tolerance * np.maximum(np.abs(first_observation), np.abs(repeated_observation))
+        ):
             return
         worst_sensor = int(np.argmax(change))
         variable = self._asset.binding.observation[self._grid.role].variables[worst_sensor]
         fmu = self._grid.fmu
         point_name = self._point_name(point)
-        former_value = f"{variable} = {former[worst_sensor]:.9g}"
-        latter_value = f"{latter[worst_sensor]:.9g}"
+        former_value = f"{variable} = {first_observation[worst_sensor]:.9g}"
+        latter_value = f"{repeated_observation[worst_sensor]:.9g}"
         if settling_steps:
             raise MissionInputError(
                 f"the FMU {fmu} has not settled after {settling_steps} steps: at {point_name} it "

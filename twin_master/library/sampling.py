@@ -54,9 +54,9 @@ class SamplingOutcome:
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     library : ObservationLibrary
-        Its content.
+        The content of the library.
     kept_blocks, block_count : int
         The number of blocks that an interrupted sampling had finished, and of all blocks.
     workers : int
@@ -93,7 +93,7 @@ def sample_library(
     Parameters
     ----------
     grid : SamplingGrid
-        The grid.
+        The points at which the FMU is sampled.
     out : Path
         The NetCDF file. Until it is written, finished blocks are in the folder
         `blocks_folder(out)`.
@@ -246,7 +246,7 @@ def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
 
 
 def _library_record(grid: SamplingGrid) -> dict[str, Any]:
-    """Return everything that determines a library: the grid, hashes of its files, the version.
+    """Return all that determines a library: the grid, the hashes of the files, and the version.
 
     The time limit of a step has no influence, and is left out.
     """
@@ -296,7 +296,7 @@ def _prepare_folder(
 
 
 def _differing_keys(former_plan: bytes, record: dict[str, Any]) -> str:
-    """Return the keys in which a former plan differs from a record, for the message."""
+    """Return the keys in which the plan of an earlier sampling differs from the present one."""
     try:
         former_record = parse_json(former_plan, PLAN_NAME, MissionInputError)
         keys = [key for key in record if former_record.get(key) != record[key]]
@@ -335,7 +335,7 @@ def sampled_dataset(
     Parameters
     ----------
     grid : SamplingGrid
-        The grid.
+        The points at which the FMU is sampled.
     binding : Binding
         The binding of the FMU.
     record : mapping

@@ -62,10 +62,10 @@ def decision_from_line(
 def _health_record(
     line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel, *, is_believed: bool
 ) -> JsonObject:
-    """Return mean, standard deviation and unit of each state factor, by its name."""
-    filtered = array_from_json(line["filtered"])
-    mean = model.states.mean(filtered)
-    deviation = model.states.standard_deviation(filtered)
+    """Return believed mean, standard deviation and unit of each state factor, by its name."""
+    filtered_belief = array_from_json(line["filtered"])
+    mean = model.states.mean(filtered_belief)
+    deviation = model.states.standard_deviation(filtered_belief)
     health: JsonObject = {}
     for index, factor in enumerate(scenario.state):
         health[factor.name] = {

@@ -137,8 +137,8 @@ def reading_from_line(record: JsonObject) -> Reading:
             observation=array_from_json(record["observation"]),
             monitors=dict(zip(record["monitors"], values, strict=True)),
         )
-    observed = array_from_json(record["observed"])
-    return Reading(observed, int(record["control_index"]), ground_truth=ground_truth)
+    observed_values = array_from_json(record["observed"])
+    return Reading(observed_values, int(record["control_index"]), ground_truth=ground_truth)
 
 
 class JournalFile:
@@ -158,7 +158,7 @@ class JournalFile:
     Attributes
     ----------
     path : Path
-        The file.
+        The path of the file.
     size : int
         The size of all complete lines, in bytes.
 
@@ -264,7 +264,7 @@ def records(path: Path, begin: int = 0) -> Iterator[JournalLine]:
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     begin : int
         The position of the first line to read, in bytes.
 
@@ -320,7 +320,7 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLin
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     end : int, optional
         The end of the last line to read, in bytes; the end of the file if left out.
 
@@ -368,7 +368,7 @@ def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     limit : float
         The largest step that counts.
 
@@ -397,11 +397,11 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     begin : int
         The position of the first byte of the damaged line in the file.
     reason : str
-        What is wrong with the line, as a clause that the error message quotes.
+        The fault of the line, as a clause that the error message quotes.
     """
     line_number = 1
     undamaged_lines_before = 0

@@ -51,7 +51,7 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
     Parameters
     ----------
     twin : Twin
-        The twin.
+        The twin that assimilates and decides.
     source : Source
         The source. It is asked for an observation after the previous step was stored.
     *sinks : callable
@@ -62,18 +62,25 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
         reading = source.read(twin)
         if reading is None:
             return
-        received = time.perf_counter()
+        time_received = time.perf_counter()
         try:
             twin_step = _assimilate(twin, reading)
         except (ImpossibleObservation, InvalidObservationError) as error:
             reading = source.replace_impossible(reading, error)
             twin_step = _assimilate(twin, reading)
-        decided = time.perf_counter()
+        time_decided = time.perf_counter()
         step = MissionStep(reading, twin_step)
         for sink in sinks:
             sink(step)
-        stored = time.perf_counter()
-        yield replace(step, seconds=(received - begin, decided - received, stored - decided))
+        time_stored = time.perf_counter()
+        yield replace(
+            step,
+            seconds=(
+                time_received - begin,
+                time_decided - time_received,
+                time_stored - time_decided,
+            ),
+        )
 
 
 def _assimilate(twin: Twin, reading: Reading) -> TwinStep:
@@ -98,17 +105,17 @@ def fly(
     Parameters
     ----------
     scenario : Scenario
-        The mission.
+        The scenario of the mission.
     twin : Twin
-        The twin.
+        The twin that assimilates and decides.
     plant : Plant
         The asset and its truth, at the same step as the twin.
     *sinks : callable
-        What stores each step, see `operate`.
+        The functions that store each step, see `operate`.
     history : History, optional
         The steps flown so far; the new ones are added to it, also if an error ends the flight.
     progress : Progress, optional
-        Shows the steps.
+        The display of the progress in steps.
 
     Returns
     -------

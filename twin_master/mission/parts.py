@@ -93,8 +93,8 @@ class TwinParts:
 
     def record(self) -> dict[str, str]:
         """Return how sensor model and estimator are called, for ``config.json``."""
-        given = {"sensor_model": self.sensor_model, "estimator": self.estimator}
-        return {role: description(part) for role, part in given.items() if part is not None}
+        given_parts = {"sensor_model": self.sensor_model, "estimator": self.estimator}
+        return {role: description(part) for role, part in given_parts.items() if part is not None}
 
     def with_objects(self) -> "TwinParts":
         """Return the parts with objects in the place of names.
@@ -141,7 +141,7 @@ class TwinParts:
         Parameters
         ----------
         twin : TwinBeforeFlight
-            What the twin knows; its sensor model is that of the scenario.
+            The knowledge of the twin; its sensor model is that of the scenario.
 
         Raises
         ------
@@ -164,11 +164,11 @@ class TwinParts:
                 f"from it, because planner and report use its predictions, but {description(part)} "
                 "was given: derive the class, or step a `uav_twin.Twin` with it."
             )
-        needed = twin.sensor_model.mean.shape
-        if part.mean.shape != needed:
+        expected_shape = twin.sensor_model.mean.shape
+        if part.mean.shape != expected_shape:
             raise MissionInputError(
                 f"the sensor model {description(part)} is for (states, controls, sensors) = "
-                f"{part.mean.shape}, and the scenario has {needed}: make it of "
+                f"{part.mean.shape}, and the scenario has {expected_shape}: make it of "
                 "`sensor_model.value_per_draw` of `uav_twin.prepare_twin`."
             )
         return part
@@ -179,7 +179,7 @@ class TwinParts:
         Parameters
         ----------
         twin : TwinBeforeFlight
-            What the twin knows; its estimator is that of the scenario.
+            The knowledge of the twin; its estimator is that of the scenario.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class TwinParts:
             )
         return part  # type: ignore[return-value]
 
-    def check_same(self, recorded: Mapping[str, str], folder: Path) -> None:
+    def check_same(self, recorded_parts: Mapping[str, str], folder: Path) -> None:
         """Refuse to resume a run with other parts than it was begun with.
 
         Raises
@@ -216,13 +216,13 @@ class TwinParts:
         NotResumableError
             If the parts are not those of the record.
         """
-        given = self.record()
+        given_parts = self.record()
         for role in ("sensor_model", "estimator"):
-            if recorded.get(role) != given.get(role):
-                begun_with = recorded.get(role, "that of the scenario")
-                now = given.get(role, "that of the scenario")
+            if recorded_parts.get(role) != given_parts.get(role):
+                begun_with = recorded_parts.get(role, "that of the scenario")
+                now = given_parts.get(role, "that of the scenario")
                 words = role.replace("_", " ")
-                advice = f"give `{role}` again" if role in recorded else f"leave `{role}` out"
+                advice = f"give `{role}` again" if role in recorded_parts else f"leave `{role}` out"
                 raise NotResumableError(
                     f"the run in {folder} was begun with another {words} ({begun_with}) than it "
                     f"would be continued with ({now}): {advice}, or fly it again with --replace."
@@ -248,9 +248,9 @@ def description(part: object) -> str:
     """Return how a part is called in records and sentences."""
     if isinstance(part, str):
         return part
-    named = part if hasattr(part, "__qualname__") else type(part)
-    article = "" if named is part else "object of "
-    return f"{article}{named.__module__}.{named.__qualname__}"
+    named_object = part if hasattr(part, "__qualname__") else type(part)
+    article = "" if named_object is part else "object of "
+    return f"{article}{named_object.__module__}.{named_object.__qualname__}"
 
 
 def object_by_name(role: str, name: str) -> object:

@@ -69,9 +69,9 @@ def plan_within_limit(
     Parameters
     ----------
     scenario : Scenario
-        The mission.
+        The scenario of the mission.
     problem : DecisionProblem
-        Its decision problem, without a price.
+        The decision problem of the mission, without a price.
     rewards : RewardModel
         The rewards, which contain the health limit.
 
@@ -81,19 +81,19 @@ def plan_within_limit(
         If the bound does not hold even for the largest price.
     """
     first_control = scenario.control_names.index(scenario.mission.first_control)
-    allowed = scenario.planner.limit_probability
+    allowed_probability = scenario.planner.limit_probability
     probability_beyond = _probability_beyond_limit(rewards)
 
     def plan_with_price(price: float) -> PricedPlan:
         priced_problem = replace(problem, reward=problem.reward - price * probability_beyond)
-        gap = _GAP if allowed is None else _GAP_OF_PRICED_PLANS
+        gap = _GAP if allowed_probability is None else _GAP_OF_PRICED_PLANS
         return PricedPlan(plan_on_belief(priced_problem, first=first_control, gap=gap), price)
 
     def keeps_limit(candidate: PricedPlan) -> bool:
-        if allowed is None:
+        if allowed_probability is None:
             return True
         fraction = share_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
-        return fraction <= allowed
+        return fraction <= allowed_probability
 
     without_price = plan_with_price(0.0)
     if keeps_limit(without_price):
@@ -107,8 +107,8 @@ def plan_within_limit(
         price = 4.0 * best.price
         if price > _LARGEST_PRICE:
             raise PlanningError(
-                f"no plan keeps the probability beyond a health limit at {allowed:g}: allow more, "
-                "or give the scenario a gentler control or a repair"
+                f"no plan keeps the probability beyond a health limit at {allowed_probability:g}: "
+                "allow more, or give the scenario a gentler control or a repair"
             )
         best = plan_with_price(price)
 
@@ -196,7 +196,7 @@ class ComparedPolicy:
     Attributes
     ----------
     name : str
-        What the rule is called.
+        The name of the rule.
     returns : (B,) array
         The return of each mission. Missions of the same number meet the same random numbers under
         all rules.
@@ -215,9 +215,11 @@ class ComparedPolicy:
         """The half width of the 95 % interval of the mean."""
         return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
 
-    def beyond(self, other: "ComparedPolicy") -> "ComparedPolicy":
-        """Return the difference of the returns to those of another rule, mission by mission."""
-        return ComparedPolicy(f"{self.name} beyond {other.name}", self.returns - other.returns)
+    def beyond(self, other_policy: "ComparedPolicy") -> "ComparedPolicy":
+        """Return by how much the returns exceed those of another rule, mission by mission."""
+        return ComparedPolicy(
+            f"{self.name} beyond {other_policy.name}", self.returns - other_policy.returns
+        )
 
 
 def simulate_policy(
@@ -239,8 +241,8 @@ def compare_simple_rules(
     plan = value_iteration(problem.transition, problem.reward, problem.discount)
     decides_on_predicted = scenario.planner.decide_on == "predicted"
 
-    def mode_of_policy(belief: Float, filtered: Float, _step: int) -> Index:
-        decided_on = belief if decides_on_predicted else filtered
+    def mode_of_policy(belief: Float, filtered_belief: Float, _step: int) -> Index:
+        decided_on = belief if decides_on_predicted else filtered_belief
         return np.asarray(np.argmax(decided_on @ plan.policy, axis=1))
 
     def qmdp(belief: Float, _filtered: Float, _step: int) -> Index:
@@ -249,10 +251,10 @@ def compare_simple_rules(
     def inspect_every(period: int) -> Decide:
         inspecting_control = scenario.readings[0][0]
 
-        def rule(belief: Float, filtered: Float, step: int) -> Index:
+        def rule(belief: Float, filtered_belief: Float, step: int) -> Index:
             if step % period == 0:
                 return np.full(len(belief), inspecting_control)
-            return qmdp(belief, filtered, step)
+            return qmdp(belief, filtered_belief, step)
 
         return rule
 
@@ -274,10 +276,10 @@ def _simulate(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Flo
     """
     first_control = scenario.control_names.index(scenario.mission.first_control)
 
-    def decide(belief: Float, filtered: Float, step: int) -> Index:
+    def decide(belief: Float, filtered_belief: Float, step: int) -> Index:
         if step == 0:
             return np.full(len(belief), first_control)
-        return rule(belief, filtered, step)
+        return rule(belief, filtered_belief, step)
 
     return simulated_returns(
         problem,

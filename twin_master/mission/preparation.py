@@ -57,7 +57,7 @@ class Knowledge:
     Attributes
     ----------
     scenario : Scenario
-        What is to be flown.
+        The scenario to fly.
     model : GraphicalModel
         The states, controls and transitions.
     draws : ParameterDraws
@@ -339,7 +339,7 @@ class Knowledge:
 
     @cached_property
     def true_model(self) -> GraphicalModel:
-        """The model by which true damage grows: that of the twin, or with other probabilities."""
+        """The model of true damage growth: that of the twin, or one with other probabilities."""
         probability = self.scenario.truth.probability
         if not probability:
             return self.model
@@ -359,7 +359,7 @@ class Knowledge:
 def _inspected_sensor_model(
     scenario: Scenario, model: GraphicalModel
 ) -> "partial[InspectedSensorModel]":
-    """Return the constructor of the sensor model, with its arguments of inspections filled in.
+    """Return the constructor of the sensor model, with the noise of the scenario's inspections.
 
     An inspection reads one factor of the state, with noise of a stated standard deviation.
     """
@@ -395,7 +395,7 @@ def prepare_knowledge(
     Parameters
     ----------
     scenario : Scenario
-        What is to be flown.
+        The scenario to fly.
     source : AssetSource
         The source of the asset, already prepared.
     seed : int
@@ -414,15 +414,15 @@ def prepare_knowledge(
     """
     model = build_graphical_model(scenario)
     draws = source.draws(seed)
-    predicted = source.observation_table(draws, model)
+    predicted_readings = source.observation_table(draws, model)
     true_values = source.structural_table(draws, model)
     noise_settings = {
         "observation.standard_deviation": scenario.observation.standard_deviation,
         "truth.noise.standard_deviation": scenario.truth.noise.standard_deviation,
     }
     for key, deviation in noise_settings.items():
-        check_noise(key, deviation, predicted, scenario.observation.sensor_units)
-    knowledge = Knowledge(scenario, model, draws, predicted, policy, true_values, parts)
+        check_noise(key, deviation, predicted_readings, scenario.observation.sensor_units)
+    knowledge = Knowledge(scenario, model, draws, predicted_readings, policy, true_values, parts)
     if parts.replace_filter:
         _ = knowledge.estimator  # made now, so that a part that does not fit is refused here
     return knowledge
@@ -441,7 +441,7 @@ def prepare_twin(
     scenario : LoadedScenario, str or Path
         The scenario, its shipped name, or its file.
     overrides : Overrides or mapping, optional
-        What differs from the file, as for `fly`.
+        The values that replace those of the file, as for `fly`.
     progress : Progress, optional
         Shows the stages of the modelling.
 
@@ -456,8 +456,8 @@ def prepare_twin(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
         If the scenario cannot be modelled; the error is one clear sentence.
     """
-    resolved = resolve_scenario(load_scenario(scenario), overrides)
-    return prepare_without_folder(resolved, asset_source(resolved), progress)
+    resolved_scenario = resolve_scenario(load_scenario(scenario), overrides)
+    return prepare_without_folder(resolved_scenario, asset_source(resolved_scenario), progress)
 
 
 def prepare_without_folder(
@@ -490,9 +490,9 @@ def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     knowledge : Knowledge
-        What to write.
+        The knowledge to write.
     number : int, optional
         The number of an earlier model of a watch, from 0; left out for the last or only one.
 
@@ -542,7 +542,7 @@ def load_knowledge(
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     scenario : Scenario
         The scenario in its `config.json`.
     number : int, optional
@@ -559,15 +559,15 @@ def load_knowledge(
     if not path.is_file():
         path = folder / KNOWLEDGE_NAME
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            predicted = np.asarray(stored["predicted"], dtype=np.float64)
-            draws = np.asarray(stored["draws"], dtype=np.float64)
-            policy: Float | BeliefPolicy = np.asarray(stored["policy"], dtype=np.float64)
+        with np.load(path, allow_pickle=False) as stored_arrays:
+            predicted_readings = np.asarray(stored_arrays["predicted"], dtype=np.float64)
+            draws = np.asarray(stored_arrays["draws"], dtype=np.float64)
+            policy: Float | BeliefPolicy = np.asarray(stored_arrays["policy"], dtype=np.float64)
             true_values = None
-            if "true" in stored:
-                true_values = np.asarray(stored["true"], dtype=np.float64)
-            if "belief_control" in stored:
-                policy = BeliefPolicy.from_arrays(stored, "belief_")
+            if "true" in stored_arrays:
+                true_values = np.asarray(stored_arrays["true"], dtype=np.float64)
+            if "belief_control" in stored_arrays:
+                policy = BeliefPolicy.from_arrays(stored_arrays, "belief_")
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter,
@@ -577,7 +577,9 @@ def load_knowledge(
             calibration.source,
         )
         model = build_graphical_model(scenario)
-        knowledge = Knowledge(scenario, model, parameter, predicted, policy, true_values, parts)
+        knowledge = Knowledge(
+            scenario, model, parameter, predicted_readings, policy, true_values, parts
+        )
         _ = knowledge.plan  # planned now, so that arrays of another shape are refused here
         return knowledge
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:

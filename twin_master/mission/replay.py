@@ -71,7 +71,7 @@ def replay(
     Parameters
     ----------
     path : Path
-        The journal.
+        The path of the journal.
     models : sequence of BelievedModel
         The model at the beginning, and those that were adopted later.
     lag : int or None
@@ -163,7 +163,7 @@ class _BackwardScan:
         return True
 
     def _check_order(self, line: JournalLine, step: int) -> None:
-        """Refuse a line whose step is neither that of the following line nor one less."""
+        """Refuse a journal line whose step is neither that of the next line nor the one before."""
         later_step = self._later_step
         if later_step is None or later_step - step in (0, 1):
             return
@@ -176,8 +176,7 @@ class _BackwardScan:
             return
         step = int(record["settled"]["step"])
         state = record["settled"]["state"]
-        # It must lie before each required step, and before the first step of each model that was
-        # adopted later.
+        # The required steps include the first step of each model that was adopted later.
         if all(step < required_step for required_step in self._required_steps):
             self.settled = SettledState(step, decode_state(state))
 
@@ -222,7 +221,7 @@ def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
     in_force = []
     for index, model in enumerate(models):
         later_models = models[index + 1 :]
-        if all(later.from_step > model.from_step for later in later_models):
+        if all(later_model.from_step > model.from_step for later_model in later_models):
             in_force.append(model)
     return in_force
 
@@ -244,7 +243,7 @@ def refilter(
     lag : int or None
         The lag of the twin, in steps.
     settled : SettledState, optional
-        Where to begin; before the first step if left out.
+        The state to begin with; the one before the first step if left out.
     """
     models = models_in_force(models)
     first_step = 0 if settled is None else max(settled.step, 0)
@@ -276,7 +275,7 @@ def spans_of_models(
     Parameters
     ----------
     history : History
-        The steps.
+        The steps of the flight so far.
     models : sequence of BelievedModel
         The models in the order of their adoption.
     """

@@ -18,19 +18,19 @@ from twin_master.network.inference import known_control
 
 
 def expected_in_steps(
-    history: History, knowledge: Knowledge, belief: Float, *, smoothed: bool
+    history: History, knowledge: Knowledge, belief: Float, *, is_smoothed: bool
 ) -> Expectation:
     """Return the expected observations and rewards in the steps of a history.
 
     Parameters
     ----------
     history : History
-        The T steps.
+        The T steps of the flight so far.
     knowledge : Knowledge
         The knowledge of the twin in these steps.
     belief : (T, S) array
         The filtered or smoothed belief in each step.
-    smoothed : bool
+    is_smoothed : bool
         Whether the belief is the smoothed one.
     """
     learnt_expectation = knowledge.expectation
@@ -40,23 +40,23 @@ def expected_in_steps(
             knowledge.sensor_model, knowledge.rewards, joint, history.observation_rows
         )
     carried = [step.twin_step.carried for step in history.steps]
-    if smoothed:
+    if is_smoothed:
         return learnt_expectation.smoothed(carried, belief, history.observed)
     return learnt_expectation.filtered(carried, belief, history.observed)
 
 
 def expected_ahead(
-    history: History, knowledge: Knowledge, predicted: Float
+    history: History, knowledge: Knowledge, predicted_beliefs: Float
 ) -> tuple[Expectation, Float]:
     """Return the predicted observations and rewards in the H steps after each step of a history.
 
     Parameters
     ----------
     history : History
-        The T steps.
+        The T steps of the flight so far.
     knowledge : Knowledge
         The knowledge of the twin in these steps.
-    predicted : (T, H, S) array
+    predicted_beliefs : (T, H, S) array
         The belief about the state in each of the H steps after each step.
 
     Returns
@@ -67,16 +67,16 @@ def expected_ahead(
         The probability of each control.
     """
     policy = knowledge.policy_with_doubt(history.unexplained)
-    joint = predicted[..., None] * policy[:, None]  # (T, H, S, U), eqs. (37)-(39)
+    joint = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U), eqs. (37)-(39)
     control_probability = joint.sum(axis=-2)
     learnt_expectation = knowledge.expectation
     if learnt_expectation is None:
-        expected = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, None)
-        return expected, control_probability
+        expectation = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, None)
+        return expectation, control_probability
     carried = [step.twin_step.carried for step in history.steps]
-    horizon = predicted.shape[1]
-    expected = learnt_expectation.predicted(carried, history.filtered, policy, horizon)
-    return expected, control_probability
+    horizon = predicted_beliefs.shape[1]
+    expectation = learnt_expectation.predicted(carried, history.filtered, policy, horizon)
+    return expectation, control_probability
 
 
 def residual_summary(
@@ -90,11 +90,11 @@ def residual_summary(
     Parameters
     ----------
     history : History
-        The steps.
+        The steps of the flight so far.
     from_step : int
         The number of the first step that is evaluated.
     models : sequence of BelievedModel
-        What the twin believed in the steps, in the order of adoption.
+        The models that the twin believed in the steps, in the order of adoption.
     """
     history = history.without_first(from_step - history.first_step)
     if not history.steps or np.isnan(history.observed).all():
@@ -104,7 +104,7 @@ def residual_summary(
         span_history = replace(history, steps=history.steps[span])
         if span_history.steps:
             expectations.append(
-                expected_in_steps(span_history, knowledge, span_history.filtered, smoothed=False)
+                expected_in_steps(span_history, knowledge, span_history.filtered, is_smoothed=False)
             )
     expectation = concatenate_expectations(expectations)
     residual = (history.observed - expectation.mean) / expectation.noise

@@ -3,8 +3,8 @@
 The information of a set of sensors is the expected logarithm of the posterior probability of the
 true state over its prior probability. The expectation is over simulated readings, with all states
 equally probable. Effects that move all sensors together (a damage between two levels, the
-calibrated parameter) count as such, not as independent noise. A structure may have candidates
-beside the gauges of its file.
+calibrated parameter) count as common, not as independent noise. A structure may have candidates
+in addition to the gauges of its file.
 """
 
 import itertools
@@ -86,7 +86,7 @@ class DrawnReadings:
 
     @cached_property
     def _terms(self) -> _LikelihoodTerms:
-        """The terms of the likelihood of each sensor, which add up over a set of sensors."""
+        """The terms of each sensor's likelihood; the terms of a set of sensors are their sum."""
         residual = self.residual.transpose(2, 0, 1)  # (G, N, S)
         loadings = self.loadings.transpose(1, 0, 2)  # (G, S, F)
         return _LikelihoodTerms(
@@ -220,14 +220,14 @@ def choose_sensors(
         raise MissionInputError(
             f"--sensors is from 1 to {len(candidates)}, the candidates, but {count} was given."
         )
-    chosen = _add_greedily(readings, candidates, count)
-    chosen = _exchange(readings, candidates, chosen)
-    ordered = _add_greedily(readings, chosen, count)
+    chosen_sensors = _add_greedily(readings, candidates, count)
+    chosen_sensors = _exchange(readings, candidates, chosen_sensors)
+    ordered_sensors = _add_greedily(readings, chosen_sensors, count)
     information = []
     for number in range(1, count + 1):
-        information.append(_mean_information(readings, ordered[:number]))
+        information.append(_mean_information(readings, ordered_sensors[:number]))
     return SensorDesign(
-        tuple(ordered), tuple(information), _mean_information(readings, list(candidates))
+        tuple(ordered_sensors), tuple(information), _mean_information(readings, list(candidates))
     )
 
 
@@ -254,34 +254,38 @@ def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> _
 def _add_greedily(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], count: int
 ) -> list[int]:
-    """Return `count` sensors, each of which adds the most information to those before it."""
-    chosen: list[int] = []
-    while len(chosen) < count:
-        extended = [[*chosen, sensor] for sensor in candidates if sensor not in chosen]
-        chosen = _best_set(readings, extended).sensors
-    return chosen
+    """Return `count` sensors; each adds the most information to the sensors chosen before it."""
+    chosen_sensors: list[int] = []
+    while len(chosen_sensors) < count:
+        extended_sets = [
+            [*chosen_sensors, sensor] for sensor in candidates if sensor not in chosen_sensors
+        ]
+        chosen_sensors = _best_set(readings, extended_sets).sensors
+    return chosen_sensors
 
 
 def _exchange(
-    readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen: list[int]
+    readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen_sensors: list[int]
 ) -> list[int]:
     """Return the chosen sensors, improved by exchanging one at a time for another candidate.
 
     It ends if no exchange gains information.
     """
-    information = _mean_information(readings, chosen)
-    while len(candidates) > len(chosen):
-        other_sensors = [sensor for sensor in candidates if sensor not in chosen]
+    information = _mean_information(readings, chosen_sensors)
+    while len(candidates) > len(chosen_sensors):
+        other_sensors = [sensor for sensor in candidates if sensor not in chosen_sensors]
         exchanged_sets = []
-        for position in range(len(chosen)):
+        for position in range(len(chosen_sensors)):
             for sensor in other_sensors:
-                exchanged_sets.append([*chosen[:position], sensor, *chosen[position + 1 :]])
+                exchanged_sets.append(
+                    [*chosen_sensors[:position], sensor, *chosen_sensors[position + 1 :]]
+                )
         best_set = _best_set(readings, exchanged_sets)
         if best_set.information <= information + _LEAST_GAIN:
             break
         information = best_set.information
-        chosen = best_set.sensors
-    return chosen
+        chosen_sensors = best_set.sensors
+    return chosen_sensors
 
 
 def level_separations(
@@ -295,7 +299,7 @@ def level_separations(
     Parameters
     ----------
     knowledge : Knowledge
-        What the twin knows.
+        The knowledge of the twin.
     readings : sequence of DrawnReadings
         The readings under each control.
     sensors : sequence of int
@@ -338,27 +342,27 @@ def _squared_distance(
 
 
 def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
-    """Return the scenario with more gauges on its structure, which are sensors.
+    """Return the scenario with further gauges on its structure, all of which are sensors.
 
     The new gauges stand after the gauges of the structure file and before those of its rosettes.
 
     Parameters
     ----------
     scenario : Scenario
-        The scenario; its paths are absolute.
+        The scenario, with absolute paths.
     candidates : str
         The largest number of rosettes to place evenly on the surface, or a TOML file with tables
         `gauge` and `rosette`, as in a structure file.
     folder : Path
-        Where the structure file with the new gauges is written.
+        The folder into which the structure file with the new gauges is written.
 
     Raises
     ------
     MissionInputError
-        If the belief is not a structure from a mesh, the sensors are not strain gauges that are all
-        alike, no rosette is asked for, or the structure file has its gauges in a list.
+        If the twin does not believe a structure with a mesh, if the sensors are not strain gauges
+        of one kind, if no rosette is asked for, or if the structure file has its gauges in a list.
     InvalidDesignError
-        If a candidate is wrong; the sentence names it.
+        If a new gauge does not lie on the structure; the message names the gauge.
     """
     belief, design = _extensible_structure(scenario)
     if candidates.isdecimal() and int(candidates) == 0:
@@ -416,15 +420,24 @@ def _append_gauges(structure_file: Path, gauges: Sequence[Gauge]) -> None:
 def _with_sensors(
     scenario: Scenario, declared_gauges: Sequence[str], all_gauges: Sequence[str]
 ) -> Scenario:
-    """Return the scenario with all gauges as sensors; the health reward counts the same as before.
+    """Return the scenario with all gauges as sensors; its reward for health keeps its weight.
 
-    Learning and notices are left out, because they are set for the declared gauges.
+    The reward for health still depends on the gauges that it depended on. The tables of learning
+    and of notices are removed, because their settings hold for the declared gauges alone.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario, with the declared gauges as sensors.
+    declared_gauges, all_gauges : sequence of str
+        The names of the gauges before and after the candidates were added.
     """
     observation = scenario.observation
     titles = dict(zip(declared_gauges, observation.titles or declared_gauges, strict=True))
     health_sensors = scenario.rewards.health_sensors
     if health_sensors == "all":
         health_sensors = tuple(range(1, len(declared_gauges) + 1))
+    # Sensors are named by their numbers from 1, which the new gauges shift.
     new_health_sensors = []
     for number in health_sensors:
         gauge = declared_gauges[number - 1]

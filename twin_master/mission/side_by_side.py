@@ -105,7 +105,7 @@ class _TrueStates(NamedTuple):
     Attributes
     ----------
     state_index : (B,) array
-        Their indices; zeros if they are scripted.
+        The indices of the states; zeros if the states are scripted.
     state : (B, F) array
         The value of each state factor, SI.
     """
@@ -176,7 +176,7 @@ class _StatelessAssets:
         return np.hstack((sensed, inspected)), true_states.state
 
     def _advance(self, step: int, control: Index) -> _TrueStates:
-        """Return the true states of a step: scripted, or drawn given those of the step before."""
+        """Return the true states in a step: scripted, or drawn given the previous states."""
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
             return _TrueStates(
@@ -214,7 +214,7 @@ def fly_side_by_side(
     Parameters
     ----------
     knowledge : Knowledge
-        What all twins know; the scenario neither learns nor gives notices.
+        The knowledge of all twins; the scenario neither learns nor gives notices.
     truths : sequence of Truth
         The truth of each twin.
     assets : sequence of Asset
@@ -263,16 +263,16 @@ class _Formation:
         """
         if step > 0:
             self._end_missions(step)
-        observed, state = self._assets.fly_step(
+        observed_rows, state = self._assets.fly_step(
             step, self._control, self._is_flying, self.flights.failure
         )
         self._is_flying &= np.array(self.flights.failure) == ""
-        observed[~self._is_flying] = np.nan
-        filtered = self._filter(step, observed)
-        self._store(step, observed, state, filtered)
-        self._log_belief = filtered.log_filtered
+        observed_rows[~self._is_flying] = np.nan
+        filtered_beliefs = self._filter(step, observed_rows)
+        self._store(step, observed_rows, state, filtered_beliefs)
+        self._log_belief = filtered_beliefs.log_filtered
         self._previous_control = self._control
-        self._control = self._decide(filtered.filtered)
+        self._control = self._decide(filtered_beliefs.filtered)
 
     def _end_missions(self, step: int) -> None:
         """End the missions whose last control was an action that ends them."""
@@ -283,25 +283,27 @@ class _Formation:
             self.flights.ended[twin] = early_end_sentence(scenario, step, reason)
             self._is_flying[twin] = False
 
-    def _filter(self, step: int, observed: Float) -> Filtered:
+    def _filter(self, step: int, observed_rows: Float) -> Filtered:
         """Return the filtered beliefs of a step, and mark twins with an impossible observation.
 
         Such a twin stops flying, and its error is stored in `flights.failure`.
         """
         knowledge = self._knowledge
-        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, self._control)
+        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed_rows, self._control)
         # The filter takes sequences of steps; each twin has a sequence of one.
-        filtered, failed_row = filter_many(
+        filtered_beliefs, failed_row = filter_many(
             knowledge.model.transition,
             self._control[:, None],
             likelihood[:, None],
             self._log_belief,
             self._previous_control,
         )
-        only_step = filtered[:, 0]
+        only_step = filtered_beliefs[:, 0]
         is_impossible = failed_row >= 0
         for twin in np.flatnonzero(is_impossible & self._is_flying).tolist():
-            worst = knowledge.sensor_model.worst_residuals(observed[twin], int(self._control[twin]))
+            worst = knowledge.sensor_model.worst_residuals(
+                observed_rows[twin], int(self._control[twin])
+            )
             name = knowledge.scenario.mission.name
             self.flights.failure[twin] = str(ImpossibleObservation(name, step, worst))
         self._is_flying &= ~is_impossible
@@ -310,25 +312,27 @@ class _Formation:
         only_step.log_filtered[is_impossible] = knowledge.model.log_prior
         return only_step
 
-    def _store(self, step: int, observed: Float, state: Float, filtered: Filtered) -> None:
+    def _store(
+        self, step: int, observed_rows: Float, state: Float, filtered_beliefs: Filtered
+    ) -> None:
         """Store a step of the twins that are still flying."""
         is_flying = self._is_flying
         flights = self.flights
-        flights.observation_rows[is_flying, step] = observed[is_flying]
+        flights.observation_rows[is_flying, step] = observed_rows[is_flying]
         flights.control_index[is_flying, step] = self._control[is_flying]
         flights.state[is_flying, step] = state[is_flying]
-        flights.filtered[is_flying, step] = filtered.filtered[is_flying]
-        flights.log_evidence[is_flying, step] = filtered.log_evidence[is_flying]
+        flights.filtered[is_flying, step] = filtered_beliefs.filtered[is_flying]
+        flights.log_evidence[is_flying, step] = filtered_beliefs.log_evidence[is_flying]
         flights.unexplained[is_flying, step] = 0.0  # none of these twins gives notices
 
-    def _decide(self, filtered: Float) -> Index:
+    def _decide(self, filtered_belief: Float) -> Index:
         """Return the next control of each twin (B,), within the budget of inspections."""
         knowledge = self._knowledge
         planner = knowledge.scenario.planner
         policy_on_belief = knowledge.plan.on_belief
         probability = decision_probability(
             knowledge.model.transition,
-            filtered,
+            filtered_belief,
             self._previous_control,
             knowledge.plan.policy,
             policy_on_belief,
@@ -339,7 +343,7 @@ class _Formation:
             flying = np.flatnonzero(self._is_flying)
             control[flying] = ration_controls(
                 knowledge.model.transition,
-                filtered[flying],
+                filtered_belief[flying],
                 self._previous_control[flying],
                 control[flying],
                 policy_on_belief,
@@ -359,7 +363,7 @@ def fly_one_by_one(
     Parameters
     ----------
     knowledge : Knowledge
-        What all twins know.
+        The knowledge of all twins.
     truths : sequence of Truth
         The truth of each twin.
     asset_of : callable

@@ -53,9 +53,9 @@ class Reading:
     revises : int or None
         The earlier step that the observation belongs to; None is the next step.
     unreadable : dict of int to str
-        What a sensor sent if it was not a number, by the index of the sensor.
+        The content that a sensor sent in the place of a number, by the index of the sensor.
     ground_truth : GroundTruth or None
-        What really happened in the step; None for a real asset.
+        The true state and values in the step; None for a real asset.
     """
 
     observed: Float
@@ -233,7 +233,7 @@ class Truth:
     Parameters
     ----------
     scenario : Scenario
-        What happens.
+        The scenario of the mission.
     model : GraphicalModel
         The states, and the transitions that random growth of damage follows.
     seed : int
@@ -418,8 +418,8 @@ class DamageGrowth:
 
 def _possible_states(probability: Float) -> _NextStates:
     """Return the states of positive probability (S,) with their cumulative probability."""
-    possible = np.flatnonzero(probability > 0.0)
-    return _NextStates(np.cumsum(probability[possible]), possible)
+    possible_states = np.flatnonzero(probability > 0.0)
+    return _NextStates(np.cumsum(probability[possible_states]), possible_states)
 
 
 def _draw(states: _NextStates, uniform: Float) -> Index:
@@ -441,16 +441,16 @@ def checked_observation(
         If the number of values is wrong, or a value is not finite.
     """
     values = np.asarray(reading.values, dtype=np.float64)
-    expected = scenario.observation
-    if values.shape != (expected.count,):
+    section = scenario.observation
+    if values.shape != (section.count,):
         raise MissionInputError(
-            f"step {step}: the scenario expects {expected.count} values of `{expected.role}` and "
+            f"step {step}: the scenario expects {section.count} values of `{section.role}` and "
             f"the asset returned {values.shape}"
         )
     if not np.all(np.isfinite(values)):
         numbers = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
         raise MissionInputError(
-            f"step {step}: the asset returned NaN or an infinity for `{expected.role}` {numbers} "
+            f"step {step}: the asset returned NaN or an infinity for `{section.role}` {numbers} "
             f"under the control `{control}`; the run stops here and can be resumed"
         )
     return values
@@ -467,7 +467,7 @@ class Plant:
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario of the mission.
     truth : Truth
         Damage, noise and faults.
     asset : Asset
@@ -562,8 +562,8 @@ class Plant:
         """Return the state of the asset as bytes."""
         return self._asset.save_state()
 
-    def restore(self, flown: History, asset_state: bytes) -> None:
+    def restore(self, flown_history: History, asset_state: bytes) -> None:
         """Continue after the steps of a history, from the state that the asset had then."""
-        self.step = len(flown.steps)
-        self._state = flown.state[-1]
+        self.step = len(flown_history.steps)
+        self._state = flown_history.state[-1]
         self._asset.restore_state(asset_state)

@@ -41,7 +41,7 @@ class _Bounds:
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     """
 
     def __init__(self, problem: DecisionProblem) -> None:
@@ -171,7 +171,7 @@ def plan_on_belief(
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     first : int, optional
         The control of the first step, if it is prescribed.
     gap : float
@@ -214,8 +214,8 @@ def _policy_at(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
         for belief in beliefs:
             rows = bounds.problem.next_beliefs(belief, control)
             backups.append(bounds.backup(control, rows))
-        known = bounds.vectors[bounds.control == control]
-        vectors = np.vstack((known, np.array(backups)))
+        vectors_of_control = bounds.vectors[bounds.control == control]
+        vectors = np.vstack((vectors_of_control, np.array(backups)))
         largest = np.unique(np.argmax(beliefs @ vectors.T, axis=1))
         vectors_by_control.append(vectors[largest])
     counts = [len(vectors) for vectors in vectors_by_control]

@@ -63,7 +63,7 @@ class DecisionProblem:
             return np.asarray(likelihood * self.transition.forward(control, belief))
         return self.transition.forward(control, likelihood * belief)
 
-    def expected_vector(self, control: int, chosen: Index, vectors: Float) -> Float:
+    def expected_vector(self, control: int, plan_of_class: Index, vectors: Float) -> Float:
         """Return the expected return after a step, by the state before the step.
 
         The observation of the step decides which plan is followed after it. The reward of the step
@@ -73,7 +73,7 @@ class DecisionProblem:
         ----------
         control : int
             The control of the step.
-        chosen : (K,) array
+        plan_of_class : (K,) array
             For each of K observations, the index of the plan that is followed after it.
         vectors : (N, S) array
             The expected return of each of N plans, if it starts from each of S states.
@@ -87,12 +87,12 @@ class DecisionProblem:
         if self.moves_first:
             # The observation depends on the state after the transition: take the expectation over
             # the observation in each such state, then over the transition.
-            after_transition = np.einsum("ks,ks->s", likelihood, vectors[chosen])
+            after_transition = np.einsum("ks,ks->s", likelihood, vectors[plan_of_class])
             return self.transition.expected_value(control, after_transition)
         # The observation depends on the state before the transition: sum over the plans of the
         # probability that the plan is chosen times its expected return.
         result: Float = np.zeros(len(self.prior))
-        for plan in np.unique(chosen).tolist():
-            probability = likelihood[chosen == plan].sum(axis=0)
+        for plan in np.unique(plan_of_class).tolist():
+            probability = likelihood[plan_of_class == plan].sum(axis=0)
             result += probability * self.transition.expected_value(control, vectors[plan])
         return result

@@ -83,11 +83,11 @@ class Learnt:
     Attributes
     ----------
     mean, standard_deviation : float
-        Its moments, in `unit`.
+        The moments of the quantity, in `unit`.
     lower, upper : float
         The bounds of its central 90 % interval, in `unit`.
     unit : str
-        Its unit.
+        The unit of the quantity.
     """
 
     mean: float
@@ -175,7 +175,7 @@ class Hypothesis:
     name : str
         `model`, `gauge 5 off`, ..., `none of these`.
     probability : float
-        Its posterior probability.
+        The posterior probability of the hypothesis.
     belief : (S,) array or None
         p(D_t | hypothesis, o_0..o_t); None if no state is believed under the hypothesis.
     """
@@ -198,11 +198,11 @@ class Estimate:
     log_evidence : float
         log p(o_t | o_0..o_{t-1}), under the model.
     carried : Carried
-        What the next step needs.
+        The arrays that the next step needs.
     learnt : dict of str to Learnt
         The posterior of each learnt quantity, by name.
     notices : tuple of Notice
-        What the operator should know of this step.
+        The notices to the operator in this step.
     suspicion : Suspicion or None
         How well the model explains the sensors; None if that is not watched.
     hypotheses : tuple of Hypothesis
@@ -292,12 +292,14 @@ class ExactFilter:
         if before is not None:
             previous = (before.arrays["log_filtered"], before.control_index)
         try:
-            filtered = filter_sequence(self.model, [control_index], log_likelihood[None], previous)
+            filtered_steps = filter_sequence(
+                self.model, [control_index], log_likelihood[None], previous
+            )
         except ImpossibleObservation:
             worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
             residuals = worst_residuals(observation, control_index) if worst_residuals else None
             raise ImpossibleObservation(self._name, step, residuals) from None
-        this_step = filtered[0]
+        this_step = filtered_steps[0]
         return Estimate(
             forecast=this_step.forecast,
             filtered=this_step.filtered,

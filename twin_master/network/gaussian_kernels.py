@@ -84,14 +84,14 @@ def _log_sum_exp(
         for b in range(len(total)):
             value = max(exponent[e, b] - largest[b], LEAST_EXPONENT)
             # value = whole * log 2 + fraction, the product in two parts to be exact.
-            whole = np.floor(value * INVERSE_LOG_TWO + 0.5)
-            fraction = (value - whole * LOG_TWO_HIGH) - whole * LOG_TWO_LOW
+            power_of_two = np.floor(value * INVERSE_LOG_TWO + 0.5)
+            fraction = (value - power_of_two * LOG_TWO_HIGH) - power_of_two * LOG_TWO_LOW
             # exp(fraction) by a rational approximation, times 2^whole by its bits.
             square = fraction * fraction
             even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
             odd = fraction * ((ODD[0] * square + ODD[1]) * square + ODD[2])
             mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
-            power_bits[b] = (np.int64(whole) + EXPONENT_BIAS) << FRACTION_BITS
+            power_bits[b] = (np.int64(power_of_two) + EXPONENT_BIAS) << FRACTION_BITS
         for b in range(len(total)):
             total[b] += mantissa[b] * power[b]
     for b in range(len(total)):

@@ -31,9 +31,9 @@ class Factor:
     Attributes
     ----------
     name : str
-        Its name, such as that of a region of the asset.
+        The name of the factor, such as that of a region of the asset.
     levels : tuple of float
-        Its values, strictly increasing, SI (a stiffness loss is a fraction).
+        The values of the factor, strictly increasing, SI (a stiffness loss is a fraction).
     """
 
     name: str

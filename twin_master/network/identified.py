@@ -83,17 +83,19 @@ class IdentifiedSensorModel(GaussianSensorModel):
         count = self.sensor_count
         values = self.check_observation(row[:count])
         covariance = self._covariance_of_row(row)
-        present = np.flatnonzero(~np.isnan(values))
-        if not present.size:
+        present_columns = np.flatnonzero(~np.isnan(values))
+        if not present_columns.size:
             return np.zeros((self.state_count, self.draw_count))
 
         # Covariance in each state: identification, noise and model error, interval of the state.
-        shape = (self.state_count, present.size, present.size)
-        total = np.array(np.broadcast_to(covariance[np.ix_(present, present)], shape))
-        diagonal = np.arange(present.size)
-        noise = self.independent_standard_deviation[:, control_index, present]
+        shape = (self.state_count, present_columns.size, present_columns.size)
+        total = np.array(
+            np.broadcast_to(covariance[np.ix_(present_columns, present_columns)], shape)
+        )
+        diagonal = np.arange(present_columns.size)
+        noise = self.independent_standard_deviation[:, control_index, present_columns]
         total[:, diagonal, diagonal] += noise**2
-        interval = self.interval[:, control_index, present]
+        interval = self.interval[:, control_index, present_columns]
         total += interval @ interval.swapaxes(1, 2)
         try:
             root = np.linalg.cholesky(total)
@@ -102,12 +104,14 @@ class IdentifiedSensorModel(GaussianSensorModel):
                 "the covariance of the observation is not positive definite"
             ) from None
 
-        residual = values[present] - self.value_per_draw[:, :, control_index, present]  # (E, S, G)
+        residual = (
+            values[present_columns] - self.value_per_draw[:, :, control_index, present_columns]
+        )  # (E, S, G)
         # root @ root.T is the covariance, so that the whitened residuals are independent.
         whitened_residual = np.linalg.solve(root, residual.transpose(1, 2, 0))  # (S, G, E)
         # The determinant of the covariance is the squared product of the diagonal of its root.
         half_log_determinant = np.log(np.einsum("sgg->sg", root)).sum(axis=1)
-        log_scale = half_log_determinant + present.size * LOG_ROOT_TWO_PI
+        log_scale = half_log_determinant + present_columns.size * LOG_ROOT_TWO_PI
         return np.asarray(-0.5 * np.sum(whitened_residual**2, axis=1) - log_scale[:, None])
 
     def _covariance_of_row(self, row: Float) -> Float:

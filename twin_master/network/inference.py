@@ -36,7 +36,7 @@ class Filtered:
     filtered : (..., S) array
         p(D_t | o_0..o_t).
     log_filtered : (..., S) array
-        Its logarithm, which the next step needs.
+        The logarithm of the filtered belief, which the next step needs.
     log_evidence : (...) array
         log p(o_t | o_0..o_{t-1}); the sum over steps is the log evidence of all observations.
     """
@@ -104,7 +104,7 @@ def _check_sequence(
     log_rows : (T, S) array
         A logarithm for each step and state.
     what : str
-        What the rows are, for the message.
+        The noun of the rows, for the message.
     """
     control = np.array(control_index, dtype=np.int64, order="C")
     check_shape("controls", control.shape, control.size)
@@ -186,19 +186,22 @@ def log_forecast(transition: TransitionModel, control: Index, log_filtered: Floa
 
 
 def smooth_many(
-    transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float
+    transition: TransitionModel,
+    control: Index,
+    filtered_beliefs: Float,
+    log_filtered_beliefs: Float,
 ) -> Float:
     """Smooth the beliefs (B, T, S) of B twins under controls (B, T); arguments are not checked."""
-    smoothed = np.empty_like(log_filtered)
+    smoothed_beliefs = np.empty_like(log_filtered_beliefs)
     backward_pass(
         transition.forward_lists,
         transition.backward_lists,
         control,
-        filtered,
-        log_filtered,
-        smoothed,
+        filtered_beliefs,
+        log_filtered_beliefs,
+        smoothed_beliefs,
     )
-    return smoothed
+    return smoothed_beliefs
 
 
 def filter_sequence(
@@ -230,10 +233,12 @@ def filter_sequence(
     """
     control, rows = _check_sequence(model, control_index, log_likelihood, what="log-likelihood")
     log_before, control_before = before or (model.log_prior, _NO_CONTROL)
-    filtered, failed = filter_many(model.transition, control, rows, log_before, control_before)
+    filtered_steps, failed = filter_many(
+        model.transition, control, rows, log_before, control_before
+    )
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
-    return filtered[0]
+    return filtered_steps[0]
 
 
 def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Float:
@@ -289,27 +294,41 @@ def predict(
     check_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
         raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
-    predicted = np.empty((horizon, len(belief)))
+    predicted_beliefs = np.empty((horizon, len(belief)))
     if horizon > 0:
-        predicted[0] = model.transition.forward(control_index, belief)
+        predicted_beliefs[0] = model.transition.forward(control_index, belief)
     if model.transition.is_product:
-        _predict_by_blocks(model.transition, policy, predicted)
+        _predict_by_blocks(model.transition, policy, predicted_beliefs)
     else:
         closed_loop = np.einsum("su,usn->sn", policy, model.transition.matrix)
         for h in range(1, horizon):
-            predicted[h] = predicted[h - 1] @ closed_loop
-    return Predicted(predicted, predicted[:, :, None] * policy)
+            predicted_beliefs[h] = predicted_beliefs[h - 1] @ closed_loop
+    return Predicted(predicted_beliefs, predicted_beliefs[:, :, None] * policy)
 
 
-def _predict_by_blocks(transition: TransitionModel, policy: Float, predicted: Float) -> None:
-    """Fill the rows of `predicted` (H, S) after the first, without the joint table (U, S, S)."""
-    for h in range(1, len(predicted)):
-        joint = predicted[h - 1][:, None] * policy
+def _predict_by_blocks(
+    transition: TransitionModel, policy: Float, predicted_beliefs: Float
+) -> None:
+    """Predict the beliefs of steps 2 to H from the first one, with little memory.
+
+    The table (U, S, S) of all transitions is not built, because it may be too large.
+
+    Parameters
+    ----------
+    transition : TransitionModel
+        The transitions of S states under U controls.
+    policy : (S, U) array
+        p(control | state).
+    predicted_beliefs : (H, S) array
+        The belief in each step; the rows after the first are filled in place.
+    """
+    for h in range(1, len(predicted_beliefs)):
+        joint = predicted_beliefs[h - 1][:, None] * policy
         next_by_control = [
             transition.forward(u, belief_with_control)
             for u, belief_with_control in enumerate(joint.T)
         ]
-        predicted[h] = np.sum(next_by_control, axis=0)
+        predicted_beliefs[h] = np.sum(next_by_control, axis=0)
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:

@@ -31,7 +31,7 @@ def observation_classes(
     sensor_model : GaussianSensorModel
         S states, U controls.
     generator : numpy.random.Generator
-        Draws the observations.
+        The source of random numbers for the observations.
     classes : int
         The largest number of classes.
     """

@@ -133,7 +133,7 @@ class PlannedPolicy:
 
 def decision_probability(
     transition: TransitionModel,
-    filtered: Float,
+    filtered_belief: Float,
     control: Index,
     policy: Float,
     on_belief: BeliefPolicy | None = None,
@@ -148,7 +148,7 @@ def decision_probability(
     ----------
     transition : TransitionModel
         The transitions between S states.
-    filtered : (B, S) array
+    filtered_belief : (B, S) array
         p(D_t | o_0..o_t).
     control : (B,) array
         The control in force in step t.
@@ -157,11 +157,11 @@ def decision_probability(
     on_belief : BeliefPolicy, optional
         A policy that takes the place of `policy`; it decides by p(D_{t+1} | o_0..o_t).
     ahead : bool
-        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t) instead of `filtered`.
+        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t) instead of `filtered_belief`.
     """
-    belief = filtered
+    belief = filtered_belief
     if ahead or on_belief is not None:
-        pairs = zip(control.tolist(), filtered, strict=True)
+        pairs = zip(control.tolist(), filtered_belief, strict=True)
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
     if on_belief is not None:
         # The policy is deterministic: its control has the probability one.
@@ -173,9 +173,9 @@ def decision_probability(
 
 def ration_controls(
     transition: TransitionModel,
-    filtered: Float,
+    filtered_belief: Float,
     before: Index,
-    chosen: Index,
+    chosen_controls: Index,
     policy: BeliefPolicy,
     scarce: Sequence[int],
     budget: int,
@@ -189,29 +189,31 @@ def ration_controls(
     ----------
     transition : TransitionModel
         The transitions between S states.
-    filtered : (B, S) array
+    filtered_belief : (B, S) array
         p(D_t | o_0..o_t).
     before : (B,) array
         The controls in force.
-    chosen : (B,) array
+    chosen_controls : (B,) array
         The next controls that were decided for each twin alone.
     policy : BeliefPolicy
-        The policy by which they were decided.
+        The policy that has decided on the controls.
     scarce : sequence of int
-        The controls of which there are few, such as inspections.
+        The scarce controls, such as inspections.
     budget : int
         The largest number of scarce controls.
     """
-    requesting_twins = np.flatnonzero(np.isin(chosen, scarce))
+    requesting_twins = np.flatnonzero(np.isin(chosen_controls, scarce))
     if len(requesting_twins) <= budget:
-        return chosen
-    predicted = [transition.forward(int(before[twin]), filtered[twin]) for twin in requesting_twins]
-    action_value = policy.action_value(np.array(predicted), transition.shape[0])
+        return chosen_controls
+    predicted_beliefs = [
+        transition.forward(int(before[twin]), filtered_belief[twin]) for twin in requesting_twins
+    ]
+    action_value = policy.action_value(np.array(predicted_beliefs), transition.shape[0])
     other_action_value = action_value.copy()
     other_action_value[:, scarce] = -np.inf
     gain = action_value[:, scarce].max(axis=1) - other_action_value.max(axis=1)
     refused_positions = np.argsort(-gain, kind="stable")[budget:]
-    rationed = chosen.copy()
+    rationed = chosen_controls.copy()
     rationed[requesting_twins[refused_positions]] = np.argmax(
         other_action_value[refused_positions], axis=1
     )
@@ -366,10 +368,10 @@ class _DecisionProcess:
         value : (S,) array
             The expected return from each state after the step.
         """
-        expected = [
+        expected_returns = [
             self.transition.expected_value(control, value) for control in range(len(self.discount))
         ]
-        return np.asarray(self.reward + self.discount * np.stack(expected, axis=1))
+        return np.asarray(self.reward + self.discount * np.stack(expected_returns, axis=1))
 
     def rounding_error(self, value: Float) -> Float:
         """Return the largest rounding error of an action value in each state: (S,).
@@ -426,13 +428,13 @@ class _DecisionProcess:
             action_value = self.action_value(value)
             gain = action_value.max(axis=1) - action_value[states, control]
             is_gain_real = gain > self.rounding_error(value)
-            better = np.where(is_gain_real, np.argmax(action_value, axis=1), control)
-            if np.array_equal(better, control):
+            better_control = np.where(is_gain_real, np.argmax(action_value, axis=1), control)
+            if np.array_equal(better_control, control):
                 return control, value
-            better_value = self.evaluate(certain[better], value)
+            better_value = self.evaluate(certain[better_control], value)
             if not better_value.sum() > value.sum():  # an improvement by rounding alone
                 return control, value
-            control = better
+            control = better_control
             value = better_value
 
 

@@ -69,7 +69,7 @@ def _fill_quantiles(
     sorted_values : SortedValues
         The values of each sensor.
     levels : (P,) array
-        The levels, increasing.
+        The cumulative probabilities of the quantiles, increasing.
     result : (B, P, G) array
         The quantiles, in the unit of the values; filled here.
     """
@@ -165,8 +165,8 @@ class QuantityModel:
         """Return a joint belief (..., S, U) as an array, or refuse its shape."""
         joint = np.asarray(joint, dtype=np.float64)
         what = "a joint belief, see `known_control`,"
-        leading = joint.shape[:-2]
-        check_shape(what, joint.shape, *leading, self.state_count, self.control_count)
+        leading_axes = joint.shape[:-2]
+        check_shape(what, joint.shape, *leading_axes, self.state_count, self.control_count)
         return joint
 
     def moments(self, joint: ArrayLike) -> tuple[Float, Float]:

@@ -210,19 +210,24 @@ class GaussianSensorModel(QuantityModel):
         return {}
 
     def check_observation(self, observation: ArrayLike) -> Float:
-        """Return observations (..., G) as an array, in which NaN stands for a lost sensor.
+        """Return observations as an array of floats, after a check of shape and values.
+
+        Parameters
+        ----------
+        observation : (..., G) array-like
+            The values of the G sensors, SI. NaN stands for the value of a lost sensor.
 
         Raises
         ------
         InvalidObservationError
-            If the shape is another one, or a value is infinite.
+            If the last axis does not have G values, or a value is infinite.
         """
         observation = np.array(observation, dtype=np.float64, order="C")
-        leading = observation.shape[:-1]
+        any_leading_axes = observation.shape[:-1]
         check_shape(
             "sensor values",
             observation.shape,
-            *leading,
+            *any_leading_axes,
             self.sensor_count,
             error=InvalidObservationError,
         )
@@ -297,7 +302,7 @@ class GaussianSensorModel(QuantityModel):
         Raises
         ------
         InvalidObservationError, InvalidModelError
-            If the shape is another one or a value is infinite; if there is no such control.
+            If the shape is wrong, if a value is infinite, or if there is no such control.
         """
         values, other_log_density = self.split_observation(observation)
         log_density = self._log_densities(values[None], [control_index], 1)[0, :, 0]
@@ -505,10 +510,10 @@ class GaussianSensorModel(QuantityModel):
         They are in standard deviations, by names such as "sensor 1".
         """
         observation = np.asarray(observation)[: self.sensor_count]
-        predicted = self.mean[:, control_index]
+        predicted_values = self.mean[:, control_index]
         deviation = self.total_standard_deviation[:, control_index]
         with np.errstate(over="ignore"):  # absurd observations overflow
-            residual = (observation - predicted) / deviation
+            residual = (observation - predicted_values) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
             best_state = int(np.argmin(distance.sum(axis=1)))
         worst_first = np.argsort(-distance[best_state])
@@ -533,7 +538,9 @@ class GaussianSensorModel(QuantityModel):
         return np.asarray(np.sqrt(variance))
 
 
-def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequence[str]) -> None:
+def check_noise(
+    key: str, deviation: ArrayLike, predicted_values: Float, units: Sequence[str]
+) -> None:
     """Refuse a noise that is larger than all values that the sensors of its unit can show.
 
     The cause is most likely a forgotten unit. All sensors of a unit are taken together, because a
@@ -545,7 +552,7 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
         The key of the noise in the scenario.
     deviation : float or (G,) array
         The standard deviation of the noise, SI.
-    predicted : (E, S, U, G) array
+    predicted_values : (E, S, U, G) array
         The sensor values without noise, SI.
     units : sequence of str
         The unit of each of the G sensors.
@@ -557,8 +564,8 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
         that it can show, and the likely unit.
     """
     noise = np.broadcast_to(np.asarray(deviation, dtype=np.float64), len(units))
-    lowest = predicted.min(axis=(0, 1, 2))
-    highest = predicted.max(axis=(0, 1, 2))
+    lowest = predicted_values.min(axis=(0, 1, 2))
+    highest = predicted_values.max(axis=(0, 1, 2))
     for sensor, (unit, sensor_noise) in enumerate(zip(units, noise.tolist(), strict=True)):
         same_unit = [index for index, other_unit in enumerate(units) if other_unit == unit]
         low = float(lowest[same_unit].min())

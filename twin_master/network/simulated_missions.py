@@ -35,7 +35,7 @@ def simulated_returns(
     Parameters
     ----------
     problem : DecisionProblem
-        The problem.
+        The decision problem, with its states, controls and observations.
     decide : callable
         The policy, see `Decide`.
     missions : int
@@ -52,11 +52,11 @@ def simulated_returns(
     uniform_observation = uniform[:, 1]
     belief = np.tile(problem.prior, (missions, 1))
     states = _draw_indices(belief, uniform_transition[steps])
-    filtered = belief.copy()
+    filtered_beliefs = belief.copy()
     returns = np.zeros(missions)
     discount_product = np.ones(missions)
     for step in range(steps):
-        control = decide(belief, filtered, step)
+        control = decide(belief, filtered_beliefs, step)
         returns += discount_product * np.einsum("bs,sb->b", belief, problem.reward[:, control])
         discount_product *= problem.discount[control]
         for control_index in np.unique(control).tolist():
@@ -82,7 +82,7 @@ def simulated_returns(
                 unnormalized_filtered = unnormalized
             else:
                 unnormalized_filtered = belief[missions_with_control] * likelihood[observation]
-            filtered[missions_with_control] = _normalize(unnormalized_filtered)
+            filtered_beliefs[missions_with_control] = _normalize(unnormalized_filtered)
             belief[missions_with_control] = _normalize(unnormalized)
     return returns
 

@@ -43,7 +43,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
         Distributions along the last axis: finite, not negative, and each with a sum of one within
         `ROW_SUM_TOLERANCE`.
     name : str
-        What the matrix is, for the message.
+        The noun of the matrix, for the message.
 
     Raises
     ------
@@ -106,16 +106,19 @@ def check_shape(
     Parameters
     ----------
     what : str
-        What the array is, for the message.
+        The noun of the array, for the message.
     shape : tuple of int
-        Its shape.
+        The shape of the array.
     *expected : int or str
         The expected length of each axis; a word, such as "draws", stands for any length.
     error : type
         The error that is raised.
     """
     pairs = zip(expected, shape, strict=False)
-    differs = any(isinstance(wanted, int) and wanted != length for wanted, length in pairs)
+    differs = any(
+        isinstance(expected_length, int) and expected_length != length
+        for expected_length, length in pairs
+    )
     if len(shape) != len(expected) or differs:
         lengths = ", ".join(map(str, expected))
         if len(expected) == 1:
@@ -141,19 +144,19 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     parts : dict of str to float
         The size of each array [bytes], by a description in words.
     advice : str
-        What the user can do to make them smaller, for the message.
+        The advice on how to make the arrays smaller, for the message.
 
     Raises
     ------
     InvalidModelError
         If the arrays do not fit in memory; the message lists their sizes.
     """
-    needed = sum(parts.values())
+    needed_memory = sum(parts.values())
     available = available_memory()
-    if needed > available:
+    if needed_memory > available:
         listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
         raise InvalidModelError(
-            f"this does not fit in memory: {listed}, together {needed / 1e9:.3g} GB, and "
+            f"this does not fit in memory: {listed}, together {needed_memory / 1e9:.3g} GB, and "
             f"{available / 1e9:.3g} GB are left: {advice}."
         )
 

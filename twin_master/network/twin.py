@@ -61,7 +61,7 @@ def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[st
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     leaving : float
         The factor on the probabilities of each factor of the state to leave a level.
     """
@@ -81,8 +81,8 @@ def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
     """Return the transitions of each factor under a control, as the scenario states them."""
     transition = scenario.transition
     if transition.kind == "independent_tables":
-        stated = transition.tables[control]
-        return {name: np.asarray(stated[name], np.float64) for name in scenario.state_names}
+        stated_tables = transition.tables[control]
+        return {name: np.asarray(stated_tables[name], np.float64) for name in scenario.state_names}
     tables = {}
     for factor in scenario.state:
         probability = probability_of(transition.probability, control, factor.name)
@@ -99,7 +99,7 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
     Parameters
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     leaving : float
         The factor on the probabilities of each factor of the state to leave a level.
 
@@ -128,7 +128,7 @@ class TwinStep(Estimate):
     decision_probability : (U,) array
         policy(U | D) averaged over the belief on which the twin decides.
     next_control : int
-        Its mode, the first of equals: the control to fly in step t + 1.
+        The most probable next control, the first of equals: the control to fly in step t + 1.
     """
 
     step: int
@@ -383,7 +383,7 @@ class Twin:
     @property
     def carried(self) -> tuple[Carried, ...]:
         """The arrays that the estimator carried on from each of the steps `first_kept`..t."""
-        return tuple(kept.carried for kept in self._smoothed_steps())
+        return tuple(kept_step.carried for kept_step in self._smoothed_steps())
 
     def save_state(self) -> bytes:
         """Return everything that the twin keeps, for `restore_state`."""
@@ -403,10 +403,10 @@ class Twin:
     def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
         """Return the state after a number of steps, with some of them kept."""
         arrays: dict[str, NDArray[Any]] = {"steps": np.array([steps, self._proposed])}
-        for index, kept in enumerate(kept_steps):
-            arrays[f"{index}/observation"] = kept.observation
-            arrays[f"{index}/control"] = np.array(kept.carried.control_index)
-            for name, value in kept.carried.arrays.items():
+        for index, kept_step in enumerate(kept_steps):
+            arrays[f"{index}/observation"] = kept_step.observation
+            arrays[f"{index}/control"] = np.array(kept_step.carried.control_index)
+            for name, value in kept_step.carried.arrays.items():
                 arrays[f"{index}/carried/{name}"] = value
         return arrays_to_bytes(arrays)
 
@@ -422,8 +422,10 @@ class Twin:
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
         with InvalidModelError.instead_of(*causes, before="this is not a saved state of a twin: "):
-            stored = arrays_from_bytes(state, "the state of the twin")
-            arrays = {_FORMER_COUNT.sub("steps", name): value for name, value in stored.items()}
+            stored_arrays = arrays_from_bytes(state, "the state of the twin")
+            arrays = {
+                _FORMER_COUNT.sub("steps", name): value for name, value in stored_arrays.items()
+            }
             steps, proposed = arrays["steps"].tolist()
             kept_steps: list[_KeptStep] = []
             while f"{len(kept_steps)}/control" in arrays:

@@ -17,7 +17,7 @@ from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.planner import value_iteration
 
 _MOST_PARTS = 4
-"""Largest number of beliefs of which a row is composed; the corners are not counted."""
+"""Largest number of beliefs that compose a row; the corners are not counted."""
 _ROUNDED_PROBABILITY = 0.15
 """Probabilities below this fraction of the largest are left out of a simplified belief."""
 _MOST_PRODUCTS = 1e9
@@ -42,7 +42,7 @@ class SparseBeliefs(NamedTuple):
     state : (entries,) array
         The state of each entry.
     probability : (entries,) array
-        Its probability.
+        The probability of this state.
     """
 
     start: Index
@@ -156,7 +156,7 @@ class _NextRows:
     belief_and_control : (N, U, P) array
         The parts of each next belief: flat indices of a belief and a control in (J, U).
     weight : (N, U, P) array
-        Their weights.
+        The weights of these beliefs.
     certain_probability : (N, C) array
         The probability of each of the C states whose corner is one of the beliefs.
     first_row : (J U,) array
@@ -293,8 +293,10 @@ class UpperBound:
                 # Bound at all next beliefs, with fixed compositions. Then a Bellman backup at all
                 # beliefs: sum over the next beliefs of each belief and control.
                 drop = self._drop.ravel()[next_rows.belief_and_control]
-                bound = next_rows.corner_bound + np.einsum("kup,kup->ku", next_rows.weight, drop)
-                bound_later = np.add.reduceat(bound.max(axis=1), next_rows.first_row)
+                bound_by_control = next_rows.corner_bound + np.einsum(
+                    "kup,kup->ku", next_rows.weight, drop
+                )
+                bound_later = np.add.reduceat(bound_by_control.max(axis=1), next_rows.first_row)
                 bound_later = bound_later.reshape(-1, controls)
                 self._value = np.minimum(self._value, reward + problem.discount * bound_later)
                 # The value of a belief that is a corner also lowers the bound by the corners: that
@@ -322,10 +324,10 @@ class UpperBound:
                 compositions.append(self._compose(rows))
                 certain_probabilities.append(rows[:, corner_states])
         row_counts = [len(composition.bound) for composition in compositions]
-        chosen = np.concatenate([composition.chosen for composition in compositions])
+        chosen_beliefs = np.concatenate([composition.chosen for composition in compositions])
         return _NextRows(
             corner_bound=np.concatenate([part.corner_bound for part in compositions]),
-            belief_and_control=chosen * controls + np.arange(controls)[:, None],
+            belief_and_control=chosen_beliefs * controls + np.arange(controls)[:, None],
             weight=np.concatenate([composition.weight for composition in compositions]),
             certain_probability=np.concatenate(certain_probabilities),
             first_row=np.cumsum([0, *row_counts[:-1]]),

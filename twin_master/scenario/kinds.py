@@ -180,20 +180,20 @@ class BeliefSection(KindSection):
     """What the twin believes: the model that predicts its observations."""
 
     @abstractmethod
-    def source(self, scenario: Any, flown: Any) -> Any:
+    def source(self, scenario: Any, flown_source: Any) -> Any:
         """Return the source of the twin's predictions.
 
         Parameters
         ----------
         scenario : Scenario
             The scenario. Its class is defined in a module that imports this one.
-        flown : AssetSource
+        flown_source : AssetSource
             The source of the asset that flies.
 
         Returns
         -------
         AssetSource
-            The source; `flown` itself if the twin believes the asset.
+            The source; `flown_source` itself if the twin believes the asset.
         """
 
 

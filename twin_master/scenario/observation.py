@@ -1,4 +1,4 @@
-"""The tables of a scenario on what is observed and how well: sensors, or modes of a record."""
+"""The tables of a scenario about its observations: sensors, or modes of a record."""
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise

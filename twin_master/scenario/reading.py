@@ -80,22 +80,22 @@ def _belief_of_format_1(asset: Mapping[str, object]) -> Table:
     return belief
 
 
-def _asset_of_format_1(former: Mapping[str, object]) -> Table:
+def _asset_of_format_1(former_table: Mapping[str, object]) -> Table:
     """Convert the table `asset` from format 1 to format 2.
 
     The caller has removed the keys on the believed model, except `design`. In format 1 the kind
     `fmu` was also used for scripts and wing designs, and the kind `coupled` for SSP files. A table
     could have keys of other kinds, which had no effect; they are removed.
     """
-    asset = dict(former)
+    asset = dict(former_table)
     design = asset.pop("design", None)
     kind = asset.pop("kind", "fmu")
     packed_design: Table = {}
-    if kind == "fmu" and "file" not in former:
-        kind = "script" if "script" in former else "design"
+    if kind == "fmu" and "file" not in former_table:
+        kind = "script" if "script" in former_table else "design"
         if kind == "design":
             packed_design = _table_of_design(design)
-    elif kind == "coupled" and "file" in former:
+    elif kind == "coupled" and "file" in former_table:
         kind = "ssp"
     unused_keys: tuple[str, ...] = ()
     if kind not in ("coupled", "ssp"):
@@ -123,9 +123,9 @@ class LoadedScenario:
     Attributes
     ----------
     scenario : Scenario
-        The scenario.
+        The scenario of the mission, checked.
     path : Path
-        The file.
+        The path of the file.
     content_hash : str
         The SHA-256 of the file's content.
     remark : str

@@ -151,8 +151,8 @@ class Scenario(ScenarioTables):
         **changes : object
             The new values by key.
         """
-        changed = getattr(self, table).model_copy(update=changes)
-        return self.model_copy(update={table: changed})
+        changed_table = getattr(self, table).model_copy(update=changes)
+        return self.model_copy(update={table: changed_table})
 
     def _file_tables(self) -> dict[str, FileSection]:
         """Return the tables whose files a run folder has copies of, by name."""

@@ -119,9 +119,9 @@ class Section(toml_file.Section):
         the message here names.
         """
         required = [name for name, field in cls.model_fields.items() if field.is_required()]
-        missing = [name for name in required if name not in table]
-        if any(name in cls.units for name in missing):
-            documented = [cls._documented_key(name) for name in missing]
+        missing_names = [name for name in required if name not in table]
+        if any(name in cls.units for name in missing_names):
+            documented = [cls._documented_key(name) for name in missing_names]
             raise missing_keys(documented, f"`{documented[0]}` is missing")
 
     @classmethod
@@ -191,14 +191,14 @@ def _schema_in_unit(schema: Any, divisor: float) -> Any:
         return [_schema_in_unit(entry, divisor) for entry in schema]
     if not isinstance(schema, dict):
         return schema
-    scaled: Table = {}
+    schema_in_unit: Table = {}
     for key, value in schema.items():
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if key in _BOUNDS_OF_SCHEMA and is_number:
-            scaled[key] = value * divisor
+            schema_in_unit[key] = value * divisor
         else:
-            scaled[key] = _schema_in_unit(value, divisor)
-    return scaled
+            schema_in_unit[key] = _schema_in_unit(value, divisor)
+    return schema_in_unit
 
 
 def _check_percentage(key: object, value: object) -> None:
@@ -252,7 +252,7 @@ def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
     Parameters
     ----------
     what : str
-        What is named, in the singular, for the message: "state".
+        The noun of the named things, in the singular, for the message: "state".
     names : sequence of str
         All names.
     """
@@ -261,22 +261,22 @@ def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
     return is_repeated, message
 
 
-def unknown_name_fault(name: str, known: Sequence[str], key: str, what: str) -> Fault:
+def unknown_name_fault(name: str, known_names: Sequence[str], key: str, what: str) -> Fault:
     """Return the possible fault that a name is not among the known ones.
 
     Parameters
     ----------
     name : str
         The name.
-    known : sequence of str
+    known_names : sequence of str
         The names that it may be.
     key : str
         The key that holds the name, for the message.
     what : str
-        What is named, in the singular, for the message: "control".
+        The noun of the named things, in the singular, for the message: "control".
     """
-    message = f"`{key}` must name a {what} ({', '.join(known)}), but `{name}` was given"
-    return name not in known, message
+    message = f"`{key}` must name a {what} ({', '.join(known_names)}), but `{name}` was given"
+    return name not in known_names, message
 
 
 def incomplete_table_fault(
@@ -293,10 +293,12 @@ def incomplete_table_fault(
     key : str
         The location of the table in the file, for the message: "rewards.control".
     what : str
-        What is named, in the singular, for the message: "control".
+        The noun of the named things, in the singular, for the message: "control".
     """
-    present = ", ".join(table) or "none"
-    message = f"`{key}` must have one entry for each {what} ({', '.join(names)}), and has {present}"
+    present_names = ", ".join(table) or "none"
+    message = (
+        f"`{key}` must have one entry for each {what} ({', '.join(names)}), and has {present_names}"
+    )
     return set(table) != set(names), message
 
 
@@ -308,6 +310,6 @@ def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
     unit : str
         The unit of the stored levels; "1" for a fraction, which is printed in percent.
     percent : str
-        What the unit of percentages is called.
+        The printed unit of percentages.
     """
     return (100.0, percent) if unit == "1" else (1.0, unit)

@@ -80,8 +80,8 @@ def quantity_titles(name: str) -> QuantityTitles:
     parameter.
     """
     if name in SCHEMA["quantities"]:
-        stored, heading, short = SCHEMA["quantities"][name]
-        return QuantityTitles(stored, heading, short)
+        stored_title, heading, short_title = SCHEMA["quantities"][name]
+        return QuantityTitles(stored_title, heading, short_title)
     title = parameter_title(name)
     return QuantityTitles(title, capital(title), title)
 
@@ -143,7 +143,7 @@ def _learnt_quantities(
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     prior : mapping of str to Learnt
         The prior of each quantity, by the name that the estimator gives it.
     """

@@ -29,7 +29,7 @@ def printed_figures(figures: Sequence[Figure]) -> list[PrintedFigure]:
         All figures of the mission.
     """
     values = {figure.key: figure.value for figure in figures}
-    printed = []
+    figures_in_text = []
     for figure in figures:
         deviation = None
         if figure.key.endswith(_MEAN):
@@ -37,8 +37,8 @@ def printed_figures(figures: Sequence[Figure]) -> list[PrintedFigure]:
         reference = ""
         if figure.reference is not None:
             reference = _printed_number(figure.reference, deviation)
-        printed.append(PrintedFigure(_printed_number(figure.value, deviation), reference))
-    return printed
+        figures_in_text.append(PrintedFigure(_printed_number(figure.value, deviation), reference))
+    return figures_in_text
 
 
 def _printed_number(value: FigureValue, deviation: FigureValue) -> str:

@@ -195,12 +195,12 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
 def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
     """Return the group of the filtered belief, with decisions, evidence and residuals."""
     flight = result.flight
-    expected = _expected_in_flight(result, flight.filtered, smoothed=False)
-    values = _belief_variables(result, flight.filtered, expected)
-    values["noise_standard_deviation"] = expected.noise
+    expectation = _expected_in_flight(result, flight.filtered, is_smoothed=False)
+    values = _belief_variables(result, flight.filtered, expectation)
+    values["noise_standard_deviation"] = expectation.noise
     values["decision_probability"] = flight.decision_probability
     values["log_evidence"] = flight.log_evidence
-    values["residual"] = (flight.observed - expected.mean) / expected.noise
+    values["residual"] = (flight.observed - expectation.mean) / expectation.noise
     values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
     # The belief on which the next control is decided; a plan over beliefs uses the predicted one
     decided_on = result.scenario.planner.decide_on
@@ -218,9 +218,9 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
 
 def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
     """Return the group of the smoothed belief."""
-    smoothed = result.flight.smoothed
-    expected = _expected_in_flight(result, smoothed, smoothed=True)
-    values = _belief_variables(result, smoothed, expected)
+    smoothed_belief = result.flight.smoothed
+    expectation = _expected_in_flight(result, smoothed_belief, is_smoothed=True)
+    values = _belief_variables(result, smoothed_belief, expectation)
     fields = {"lead": "step", "given": "all observations"}
     return builder.group("smoothed", _entries_of(values), fields)
 
@@ -232,17 +232,17 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
     expectations are computed for each span and concatenated.
     """
     flight = result.flight
-    predicted = flight.predicted
+    predicted_belief = flight.predicted
     expected_parts = []
     control_probabilities = []
     for knowledge, span in result.spans:
         history_of_span = replace(flight, steps=flight.steps[span])
         expected_in_span, control_probability = expected_ahead(
-            history_of_span, knowledge, predicted[span]
+            history_of_span, knowledge, predicted_belief[span]
         )
         expected_parts.append(expected_in_span)
         control_probabilities.append(control_probability)
-    values = _belief_variables(result, predicted, concatenate_expectations(expected_parts))
+    values = _belief_variables(result, predicted_belief, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
     fields = {
         "lead": "step horizon",
@@ -251,7 +251,7 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
     return builder.group("predicted", _entries_of(values), fields)
 
 
-def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool) -> Expectation:
+def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
     """Return the sensors and rewards expected in each step of a flight.
 
     Each step is evaluated with the model that the twin believed in it.
@@ -262,7 +262,7 @@ def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool)
         The mission, of T steps.
     belief : (T, states) array
         The belief over states in each step.
-    smoothed : bool
+    is_smoothed : bool
         Whether the belief is smoothed, and not filtered.
     """
     flight = result.flight
@@ -270,23 +270,23 @@ def _expected_in_flight(result: MissionResult, belief: Float, *, smoothed: bool)
     for knowledge, span in result.spans:
         history_of_span = replace(flight, steps=flight.steps[span])
         expected_parts.append(
-            expected_in_steps(history_of_span, knowledge, belief[span], smoothed=smoothed)
+            expected_in_steps(history_of_span, knowledge, belief[span], is_smoothed=is_smoothed)
         )
     return concatenate_expectations(expected_parts)
 
 
 def _belief_variables(
-    result: MissionResult, belief: Float, expected: Expectation
+    result: MissionResult, belief: Float, expectation: Expectation
 ) -> dict[str, ArrayLike]:
     """Return the variables that the filtered, smoothed and predicted groups share.
 
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     belief : (..., states) array
         The probability of each state.
-    expected : Expectation
+    expectation : Expectation
         The sensors and rewards expected under this belief.
     """
     states = result.knowledge.model.states
@@ -294,12 +294,12 @@ def _belief_variables(
         "probability": belief,
         "mean": states.mean(belief),
         "standard_deviation": states.standard_deviation(belief),
-        "quantity_mean": expected.mean,
-        "quantity_standard_deviation": expected.standard_deviation,
-        "quantity_lower": expected.lower,
-        "quantity_upper": expected.upper,
-        "reward_mean": expected.reward_mean,
-        "reward_standard_deviation": expected.reward_standard_deviation,
+        "quantity_mean": expectation.mean,
+        "quantity_standard_deviation": expectation.standard_deviation,
+        "quantity_lower": expectation.lower,
+        "quantity_upper": expectation.upper,
+        "reward_mean": expectation.reward_mean,
+        "reward_standard_deviation": expectation.reward_standard_deviation,
     }
 
 
@@ -379,9 +379,10 @@ class _TableMaker:
         return columns
 
     def health(self) -> Columns:
-        """Return the table of the state factors: true values, and moments of the beliefs.
+        """Return the columns of `health.csv`: the state of the asset in each step.
 
-        The true values are left out if the run does not know them.
+        For each state factor, such as the stiffness loss of a region, these are the true value, if
+        the run knows the truth, and mean and standard deviation of filtered and smoothed belief.
         """
         variables = {}
         if "truth" in self.groups:
@@ -402,12 +403,14 @@ class _TableMaker:
 
     def decisions(self) -> Columns:
         """Return the table of controls, rewards and decisions."""
-        observed = self.groups["observed"]
-        filtered = self.groups["filtered"]
-        probability = filtered["decision_probability"].values
+        observed_group = self.groups["observed"]
+        filtered_group = self.groups["filtered"]
+        probability = filtered_group["decision_probability"].values
         columns = dict(self.steps)
-        columns["control"] = self.controls[observed["control_index"].values]
-        columns |= _columns("{}_reward", filtered["reward"].values, filtered["reward_mean"].values)
+        columns["control"] = self.controls[observed_group["control_index"].values]
+        columns |= _columns(
+            "{}_reward", filtered_group["reward"].values, filtered_group["reward_mean"].values
+        )
         columns |= _columns("decision_probability_{}", self.controls, probability)
         columns["next_control"] = self.controls[probability.argmax(axis=1)]
         return columns

@@ -1,4 +1,4 @@
-"""The figures of a mission, each beside the one that the scenario gives as its reference."""
+"""The figures of a mission, each with the reference value that the scenario gives."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -219,12 +219,12 @@ def find_policy_switch(
     return None
 
 
-def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
+def filtered_rms_error(model: GraphicalModel, filtered_belief: Float, true_state: Float) -> Float:
     """Return the root mean square, over the steps, of the error of each filtered state factor.
 
     The error is the filtered mean minus the true value, SI.
     """
-    error = model.states.mean(filtered) - true_state
+    error = model.states.mean(filtered_belief) - true_state
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
@@ -239,7 +239,7 @@ def summarise(
     Parameters
     ----------
     result : MissionResult
-        The mission.
+        The results of the mission.
     reward_mean : (steps, 3) array
         The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
     misfit : (states, controls, sensors) array, optional
@@ -332,9 +332,9 @@ def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
 
 def _error_bound_figures(result: MissionResult) -> Iterator[FigureGroup]:
     """Yield the largest certified strain error, if the asset reports it."""
-    bound = result.flight.monitors.get("strain_error_bound")
-    if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
-        yield FigureGroup("bound", {}, [1e6 * float(bound.max())])
+    error_bounds = result.flight.monitors.get("strain_error_bound")
+    if error_bounds is not None and {*result.scenario.observation.sensor_units} == {"1"}:
+        yield FigureGroup("bound", {}, [1e6 * float(error_bounds.max())])
 
 
 def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
@@ -479,20 +479,20 @@ def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
 def control_changes(
     controls: Sequence[str], control_index: Index, step_name: str, first_step: int = 0
 ) -> str:
-    """Return in words when the control changed, such as "left 3g for 2g at step 31".
+    """Return a description of the changes of control, such as "left 3g for 2g at step 31".
 
     Parameters
     ----------
     controls : sequence of str
         The names of the controls.
     control_index : (steps,) array
-        The index of the control flown in each step.
+        The index of the control in each step.
     step_name : str
-        What a step is called.
+        The word for a step, such as "turn".
     first_step : int
         The number of the first step.
     """
-    # The steps whose control is not that of the step before
+    # The steps whose control differs from that of the step before
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
@@ -502,9 +502,9 @@ def control_changes(
         control = controls[int(control_index[step])]
         changes.append(f"left {previous} for {control} at {step_name} {first_step + step}")
     sentence = ", ".join(changes)
-    unnamed = len(steps) - len(changes)
-    if unnamed > 0:
-        sentence += f", and {counted(unnamed, 'more change')}"
+    further_changes = len(steps) - len(changes)
+    if further_changes > 0:
+        sentence += f", and {counted(further_changes, 'more change')}"
     return sentence
 
 

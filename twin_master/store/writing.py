@@ -43,7 +43,7 @@ def write_run(
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     groups : mapping of str to NetcdfGroup
         The groups by name.
     attributes : mapping of str to object
@@ -105,11 +105,11 @@ def store_flight(
     Parameters
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     config : dict
         The content of `config.json`.
     result : MissionResult
-        The mission.
+        The results of the mission.
     origin : FlownAndBelieved
         What was flown, and what the twin believed, in words.
     steps : int
@@ -196,7 +196,7 @@ class RunOutcome:
     Attributes
     ----------
     folder : Path
-        The run folder.
+        The path of the run folder.
     report : Path or None
         The report in it; None if there is none.
     figures : tuple of Figure
@@ -228,10 +228,10 @@ class RunOutcome:
         return open_run(self.folder)
 
     def _repr_html_(self) -> str:
-        """Return the figures of the run beside their references, for a notebook."""
+        """Return the figures of the run with their reference values, for a notebook."""
         rows = []
-        for figure, printed in zip(self.figures, printed_figures(self.figures), strict=True):
-            rows.append([figure.title, printed.value, figure.unit, printed.reference])
+        for figure, printed_figure in zip(self.figures, printed_figures(self.figures), strict=True):
+            rows.append([figure.title, printed_figure.value, figure.unit, printed_figure.reference])
         headings = ("result", "this run", "unit", "reference")
         return html_table(f"Run in {self.folder}", headings, rows, self.notices)
 

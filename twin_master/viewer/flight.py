@@ -86,7 +86,7 @@ class _JournalledKnowledge(NamedTuple):
     Attributes
     ----------
     begin : int
-        Where this line begins in the journal [bytes].
+        The position in the journal at which this line begins [bytes].
     knowledge : Knowledge
         The model of the twin, with its plan.
     """
@@ -212,7 +212,7 @@ class Flight:
         record : dict
             The line.
         begin : int
-            Where the line begins [bytes].
+            The position at which the line begins [bytes].
         """
         is_step = "filtered" in record
         if is_step and record["step"] == self.steps:
@@ -301,8 +301,10 @@ class Flight:
 
     def true_states_in(self, records: Sequence[StepRecord]) -> Float:
         """Return the true values of K state factors in n steps, (n, K), SI; NaN if unknown."""
-        unknown = [None] * len(self.scenario.state)
-        return np.array([array_from_json(record.get("state", unknown)) for record in records])
+        unknown_values = [None] * len(self.scenario.state)
+        return np.array(
+            [array_from_json(record.get("state", unknown_values)) for record in records]
+        )
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
         """Return the belief of the twin in each of n steps at the time of the step.
@@ -327,20 +329,22 @@ class Flight:
 
     def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
         """Return the belief of the twin in n steps, in all of which it had the given knowledge."""
-        filtered = np.array([record["filtered"] for record in records])
+        filtered_beliefs = np.array([record["filtered"] for record in records])
         controls = [record["control_index"] for record in records]
-        joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
+        joint = known_control(
+            filtered_beliefs, controls, len(knowledge.model.controls)
+        )  # (n, S, U)
         if knowledge.expectation is None:
             observed_rows = np.array([array_from_json(record["observed"]) for record in records])
-            expected = _expectation_without_learning(knowledge, joint, observed_rows)
+            expectation = _expectation_without_learning(knowledge, joint, observed_rows)
         else:
-            expected = self._expectation_with_learning(knowledge.expectation, joint, records)
+            expectation = self._expectation_with_learning(knowledge.expectation, joint, records)
         return StepBeliefs(
-            probability=filtered,
+            probability=filtered_beliefs,
             is_believed=np.array(
                 [is_state_believed(_unexplained_probability(record)) for record in records]
             ),
-            expected=expected,
+            expected=expectation,
             control_probability=np.array([record["decision_probability"] for record in records]),
         )
 
@@ -360,12 +364,12 @@ class Flight:
         """
         parts = []
         observations = self.observations_in(records)
-        for record, joint_of_step, observed in zip(records, joint, observations, strict=True):
+        for record, joint_of_step, observed_row in zip(records, joint, observations, strict=True):
             # Only the control in force has a probability that is not zero
             control = slice(record["control_index"], record["control_index"] + 1)
             learnt = _learnt_quantities(record)
             belief = joint_of_step[None, :, control]  # (1, S, 1)
-            parts.append(expectation.from_marginals(learnt, belief, control, observed))
+            parts.append(expectation.from_marginals(learnt, belief, control, observed_row))
         return concatenate_expectations(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
@@ -374,26 +378,26 @@ class Flight:
         n is the number of steps that the scenario predicts (`mission.prediction_steps`).
         """
         knowledge = self._knowledge_in(record)
-        filtered = array_from_json(record["filtered"])
+        filtered_belief = array_from_json(record["filtered"])
         control = record["control_index"]
         horizon = self.scenario.mission.prediction_steps
-        predicted = predict(
-            knowledge.model, filtered, control, knowledge.plan.policy, horizon
+        predicted_beliefs = predict(
+            knowledge.model, filtered_belief, control, knowledge.plan.policy, horizon
         ).predicted
         unexplained = _unexplained_probability(record)
         # p(state, control) = p(state) p(control | state), for n steps, S states, U controls
-        joint = predicted[..., None] * knowledge.policy_with_doubt(unexplained)  # (n, S, U)
+        joint = predicted_beliefs[..., None] * knowledge.policy_with_doubt(unexplained)  # (n, S, U)
         if knowledge.expectation is None:
-            expected = _expectation_without_learning(knowledge, joint, None)
+            expectation = _expectation_without_learning(knowledge, joint, None)
         else:
             all_controls = slice(None)
-            expected = knowledge.expectation.from_marginals(
+            expectation = knowledge.expectation.from_marginals(
                 _learnt_quantities(record), joint, all_controls, None
             )
         return StepBeliefs(
-            probability=predicted,
-            is_believed=np.full(len(predicted), is_state_believed(unexplained)),
-            expected=expected,
+            probability=predicted_beliefs,
+            is_believed=np.full(len(predicted_beliefs), is_state_believed(unexplained)),
+            expected=expectation,
             control_probability=joint.sum(axis=-2),
         )
 
@@ -412,7 +416,7 @@ def _expectation_without_learning(
     Parameters
     ----------
     knowledge : Knowledge
-        What the twin knows.
+        The knowledge of the twin.
     joint : (n, S, U) array
         The beliefs over states and controls.
     rows : (n, G + I) array or None

@@ -276,11 +276,11 @@ class FlightPage:
         dict
             Arrays by name; NaN if there is no value, or if no state is believed.
         """
-        expected = beliefs.expected
-        reward_margin = NORMAL_95 * expected.reward_standard_deviation
-        sensor_mean = expected.mean
+        expectation = beliefs.expected
+        reward_margin = NORMAL_95 * expectation.reward_standard_deviation
+        sensor_mean = expectation.mean
         # The uncertain state and the noise are independent: their variances add up
-        deviation = np.hypot(expected.standard_deviation, expected.noise)
+        deviation = np.hypot(expectation.standard_deviation, expectation.noise)
         if self._shows_deviations:
             if observations is not None:
                 observations = (observations - sensor_mean) / deviation
@@ -290,9 +290,9 @@ class FlightPage:
         sensor_margin = NORMAL_95 * deviation
         values: dict[str, object] = {
             **self._state_values(beliefs),
-            "reward": expected.reward_mean,
-            "reward_lower": expected.reward_mean - reward_margin,
-            "reward_upper": expected.reward_mean + reward_margin,
+            "reward": expectation.reward_mean,
+            "reward_lower": expectation.reward_mean - reward_margin,
+            "reward_upper": expectation.reward_mean + reward_margin,
             "sensor": scale * sensor_mean,
             "sensor_lower": scale * (sensor_mean - sensor_margin),
             "sensor_upper": scale * (sensor_mean + sensor_margin),

@@ -25,7 +25,7 @@ class Broker:
     host : str
         The host of the broker.
     port : int
-        Its port.
+        The port of the broker.
     topic : str
         The topic of the observations.
     user : str or None

@@ -32,7 +32,7 @@ class Clock:
     origin : float or None
         The time [s] of step 0; None before the first time has come.
     only_step : int or None
-        The only step of which a time has come so far; None once another time agrees with it.
+        The only step whose time is known so far; None once another time agrees with it.
     """
 
     def __init__(self, section: WatchSection) -> None:

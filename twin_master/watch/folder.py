@@ -81,7 +81,7 @@ class GivenPatch(NamedTuple):
 
 
 def _do_nothing() -> None:
-    """Do nothing; the default for what is called between two steps."""
+    """Do nothing; the default of the function that is called between two steps."""
 
 
 class Watch:
@@ -103,7 +103,7 @@ class Watch:
     Attributes
     ----------
     source : AssetSource
-        What the twin believes of the asset.
+        The source of the model that the twin believes.
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel
@@ -338,7 +338,7 @@ class Watch:
         Parameters
         ----------
         **fields : object
-            The entries of the line beside the last step, the next control and the intake.
+            The entries of the line in addition to the last step, the next control and the intake.
         """
         line = {
             "step": self.twin.steps - 1,
@@ -528,7 +528,7 @@ class Watch:
         self._show_adoption(record)
 
     def _show_adoption(self, model: ModelRecord) -> None:
-        """Tell the operator how well the patched model fits, beside the former one."""
+        """Tell the operator how well the patched model fits, and how well the former one did."""
         comparisons = []
         for name, value in model["before"].items():
             if value is not None:

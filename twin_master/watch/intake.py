@@ -69,7 +69,7 @@ class _QueuedReading:
     reading : Reading
         The reading.
     status : StepStatus
-        What was received of its step.
+        Whether a message of the step has come, and with its control.
     """
 
     step: int
@@ -171,9 +171,9 @@ class Intake:
         # After a gap the queue holds missing steps, then the message itself. A watch that is
         # resumed meanwhile reads this message again, so that it is not counted yet.
         is_read_again = self.has_queued_readings
-        received = self.counts.received - 1 if is_read_again else self.counts.received
+        received_count = self.counts.received - 1 if is_read_again else self.counts.received
         state: JsonObject = {
-            "counts": vars(self.counts) | {"received": received},
+            "counts": vars(self.counts) | {"received": received_count},
             "given": "".join(str(int(status)) for status in self._statuses),
             "origin": self._clock.origin,
             "source": self._previous_position if is_read_again else self._position,
@@ -393,20 +393,20 @@ class Intake:
         The sentence is empty if no message came, or if they were of use: if at least one message
         had the reading of a sensor, and fewer than `REFUSALS_IN_A_ROW` were refused at the end.
         """
-        received = counted(self._received_here, "message")
-        refused = self.stream.refused_in_a_row
+        received_messages = counted(self._received_here, "message")
+        refused_in_a_row = self.stream.refused_in_a_row
         has_no_readings = self._with_readings_here == 0
         if not self._received_here:
             return ""
-        if refused and (refused >= REFUSALS_IN_A_ROW or has_no_readings):
+        if refused_in_a_row and (refused_in_a_row >= REFUSALS_IN_A_ROW or has_no_readings):
             return (
-                f"The watch ended while messages were refused: the last {refused} of {received}, "
-                f"the last one because {self.stream.last_reason}."
+                f"The watch ended while messages were refused: the last {refused_in_a_row} of "
+                f"{received_messages}, the last one because {self.stream.last_reason}."
             )
         if has_no_readings:
             return (
-                f"None of {received} has a reading of any {self._words.sensor}: the belief follows "
-                "the transitions alone."
+                f"None of {received_messages} has a reading of any {self._words.sensor}: the "
+                "belief follows the transitions alone."
             )
         return ""
 

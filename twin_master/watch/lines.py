@@ -105,7 +105,7 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
 
 @lru_cache(1000)
 def _hash_of_beginning(beginning: bytes) -> str:
-    """Return the SHA-256 of the beginning of a file, by which a renamed file is recognised."""
+    """Return the SHA-256 of the beginning of a file; it recognises a file that was renamed."""
     return sha256(beginning).hexdigest()
 
 

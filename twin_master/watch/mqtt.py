@@ -37,7 +37,7 @@ class Topic(Feed):
     topic : str
         The topic of the observations.
     scenario : Scenario
-        The scenario by which they are read.
+        The scenario whose sensors the messages name.
     on_error : callable
         Called with the error that keeps decisions from being published. They are then left until
         the watch is taken up again.

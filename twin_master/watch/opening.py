@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def begin_watch(
-    resolved: Scenario,
+    resolved_scenario: Scenario,
     file: Mapping[str, str],
     folder: Path,
     progress: Progress,
@@ -58,7 +58,7 @@ def begin_watch(
 
     Parameters
     ----------
-    resolved : Scenario
+    resolved_scenario : Scenario
         The scenario, resolved.
     file : mapping of str to str
         The name and the hash of the file of the scenario.
@@ -76,11 +76,11 @@ def begin_watch(
     RunFolderError
         If the folder exists and is not to be replaced.
     """
-    source = believed_source(resolved)
+    source = believed_source(resolved_scenario)
     source.check()
     files = source.files() | _client_files_to_discard(folder)
     opened = run_folder.new_run_folder(
-        resolved, file, folder, files, replace=replace_run, watched=True
+        resolved_scenario, file, folder, files, replace=replace_run, watched=True
     )
     with opened as (config, located_scenario):
         yield Watch(folder, config, located_scenario, progress, sibling)
@@ -102,7 +102,10 @@ def _client_files_to_discard(folder: Path) -> dict[str, bytes]:
 
 @contextmanager
 def resume_watch(
-    folder: Path, loaded: LoadedScenario | None, progress: Progress, sibling: Watch | None = None
+    folder: Path,
+    loaded_scenario: LoadedScenario | None,
+    progress: Progress,
+    sibling: Watch | None = None,
 ) -> Iterator[Watch]:
     """Give the watch in an existing folder while the folder is locked.
 
@@ -110,7 +113,7 @@ def resume_watch(
     ----------
     folder : Path
         The folder of the watch.
-    loaded : LoadedScenario or None
+    loaded_scenario : LoadedScenario or None
         The scenario that the user expects in the folder; None takes any.
     progress : Progress
         Shows stages and notes.
@@ -126,7 +129,7 @@ def resume_watch(
         raise NotResumableError(
             f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
         )
-    with run_folder.hold_run_folder(folder, loaded) as (config, scenario):
+    with run_folder.hold_run_folder(folder, loaded_scenario) as (config, scenario):
         try:
             run_folder.check_versions(folder, config, scenario.mission.seed)
             resumed = Watch(folder, config, scenario, progress, sibling)
@@ -330,14 +333,14 @@ def watch(
     TwinMasterError, FiniteElementError, CalibrationError
         If the watch cannot go on, with one clear sentence; what was observed is kept.
     """
-    loaded = None if scenario is None else load_scenario(scenario)
+    loaded_scenario = None if scenario is None else load_scenario(scenario)
     overrides = as_overrides(overrides)
     progress = progress or SilentProgress()
     patch = _given_patch(model_patch, from_step, resume=resume)
-    if loaded is None and (folder is None or not resume):
+    if loaded_scenario is None and (folder is None or not resume):
         raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
-    folder = _folder_of_watch(loaded, folder)
-    reading_scenario = _scenario_for_reading(loaded, folder, allow_unknown=allow_unknown)
+    folder = _folder_of_watch(loaded_scenario, folder)
+    reading_scenario = _scenario_for_reading(loaded_scenario, folder, allow_unknown=allow_unknown)
     if teach:
         _check_teaching(reading_scenario, cause_search)
 
@@ -351,7 +354,9 @@ def watch(
     )
     if replace:
         _check_recording_is_kept(feed, folder)
-    opened = _open_watch(loaded, folder, overrides, progress, resume=resume, replace=replace)
+    opened = _open_watch(
+        loaded_scenario, folder, overrides, progress, resume=resume, replace=replace
+    )
     with opened as watched:
         try:
             begun(watched)
@@ -377,25 +382,25 @@ def _given_patch(
     return GivenPatch(Path(model_patch), from_step)
 
 
-def _folder_of_watch(loaded: LoadedScenario | None, folder: Path | str | None) -> Path:
+def _folder_of_watch(loaded_scenario: LoadedScenario | None, folder: Path | str | None) -> Path:
     """Return the folder that the user names, or the default one of the scenario."""
     if folder is not None:
         return Path(folder)
-    assert loaded is not None, "a watch without a scenario is resumed in a folder"
-    return Path("runs", loaded.scenario.mission.name)
+    assert loaded_scenario is not None, "a watch without a scenario is resumed in a folder"
+    return Path("runs", loaded_scenario.scenario.mission.name)
 
 
 def _scenario_for_reading(
-    loaded: LoadedScenario | None, folder: Path, *, allow_unknown: bool
+    loaded_scenario: LoadedScenario | None, folder: Path, *, allow_unknown: bool
 ) -> Scenario:
-    """Return the scenario by which observations are read, with absolute paths.
+    """Return the scenario whose sensors the observations name, with absolute paths.
 
     It is the loaded scenario, or, for a resumed watch without one, that of the folder.
     """
-    if loaded is None:
+    if loaded_scenario is None:
         scenario = run_folder.read_scenario(folder).with_paths_from(folder)
     else:
-        scenario = loaded.scenario.with_paths_from(loaded.path.parent)
+        scenario = loaded_scenario.scenario.with_paths_from(loaded_scenario.path.parent)
     if allow_unknown:
         scenario = scenario.with_changes("watch", allow_unknown=True)
     return scenario
@@ -418,7 +423,7 @@ def _check_recording_is_kept(feed: Feed | Broker, folder: Path) -> None:
 
 
 def _open_watch(
-    loaded: LoadedScenario | None,
+    loaded_scenario: LoadedScenario | None,
     folder: Path,
     overrides: Overrides,
     progress: Progress,
@@ -432,12 +437,14 @@ def _open_watch(
             "a watch is resumed with the inputs in its folder: leave out options that would change "
             "them."
         )
-    if resume or loaded is None:
-        return resume_watch(folder, loaded, progress)
-    resolved = resolve_scenario(loaded, overrides)
-    opened = begin_watch(resolved, loaded.file, folder, progress, replace_run=replace)
-    if loaded.remark:
-        progress.note(loaded.remark)
+    if resume or loaded_scenario is None:
+        return resume_watch(folder, loaded_scenario, progress)
+    resolved_scenario = resolve_scenario(loaded_scenario, overrides)
+    opened = begin_watch(
+        resolved_scenario, loaded_scenario.file, folder, progress, replace_run=replace
+    )
+    if loaded_scenario.remark:
+        progress.note(loaded_scenario.remark)
     return opened
 
 

@@ -1,4 +1,4 @@
-"""A patch of the model that a watch believes: the patched model, and its trial beside the other.
+"""A patch of the model that a watch believes: the patched model, and its trial against the old.
 
 The outcome of a trial follows from the journal up to one of its lines. So it can be computed
 beside the watch, which goes on meanwhile.
@@ -166,20 +166,20 @@ def _log_evidence(history: History, compared: ComparedSteps) -> float:
     return sum(step.twin_step.log_evidence for step in steps)
 
 
-def merge_patches(believed: Path | None, new: Path) -> bytes:
+def merge_patches(believed: Path | None, new_patch: Path) -> bytes:
     """Return the content of a patch file with the effects of two patches.
 
     Parameters
     ----------
     believed : Path or None
         The file of the patch that is believed already, if any.
-    new : Path
+    new_patch : Path
         The file of the patch that is added.
     """
     if believed is None:
-        return new.read_bytes()
+        return new_patch.read_bytes()
     believed_record = json.loads(believed.read_text(encoding="utf-8"))
-    new_record = json.loads(new.read_text(encoding="utf-8"))
+    new_record = json.loads(new_patch.read_text(encoding="utf-8"))
     merged_record = {
         "schema": new_record["schema"],
         "effects": believed_record["effects"] + new_record["effects"],
@@ -189,7 +189,7 @@ def merge_patches(believed: Path | None, new: Path) -> bytes:
 
 
 def describe_policy_change(before: Knowledge, after: Knowledge) -> str:
-    """Return how the policy of a model differs from that of another one, in a sentence.
+    """Return a sentence on the difference between the policies of two models.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class RecordedFeed(Feed):
     Parameters
     ----------
     path : Path
-        The file.
+        The path of the file.
     scenario : Scenario
         The scenario of the asset.
     follow : bool
@@ -103,7 +103,7 @@ class RecordedFeed(Feed):
         line : bytes
             The line, with its line feed.
         begin : int
-            Where the line begins in its file [bytes].
+            The position in the file at which the line begins [bytes].
         """
         return line
 
@@ -225,7 +225,7 @@ class FolderFeed(RecordedFeed):
         line : bytes
             The line, with its line feed if it is complete.
         begin : int
-            Where the line begins in the journal [bytes].
+            The position in the journal at which the line begins [bytes].
         """
         record = record_of_line(line, self.path)  # None if the checksum or the JSON is wrong
         if record is None and line.endswith(b"\n"):
@@ -239,11 +239,11 @@ class FolderFeed(RecordedFeed):
             return Refused("the line has another layout")
 
     def _message_of(self, line: JournalLine) -> Message | Refused | None:
-        """Return the observation in a line of the journal; None if no message came of its step.
+        """Return the observation in a line of the journal; None if its step had no message.
 
         A journal of an asset with other sensors or controls is refused.
         """
-        observed = array_from_json(line["observed"])
+        observed_values = array_from_json(line["observed"])
         control = int(line["control_index"])
         line_step = int(line["step"])
         step = int(line.get("observation_step", line_step))
@@ -257,9 +257,11 @@ class FolderFeed(RecordedFeed):
             return None
         count = self.scenario.observation.count
         width = self.scenario.row_width
-        if len(observed) not in (count, width) or control >= len(self.scenario.control):
+        if len(observed_values) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         row = np.full(width, np.nan)
-        row[: len(observed)] = observed  # a journal without covariances has only the sensors
+        row[: len(observed_values)] = (
+            observed_values  # a journal without covariances has only the sensors
+        )
         has_assumed_control = status is not StepStatus.WITH_CONTROL
         return Message(row, control, step=step, assumed=has_assumed_control)

@@ -34,7 +34,7 @@ class RejectedFile:
         reason : str
             Why it was refused.
         text : str
-            The text of the message, of which the beginning is kept.
+            The text of the message; only its beginning is kept.
         """
         if self._path is None or self._line_count >= REJECTED_KEPT:
             return

@@ -1,4 +1,4 @@
-"""The files of a watch beside its journal: `run.nc`, tables, summary and report."""
+"""The files of a watch in addition to its journal: `run.nc`, tables, summary and report."""
 
 from collections.abc import Sequence
 from dataclasses import replace

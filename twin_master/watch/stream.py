@@ -67,7 +67,7 @@ class StreamNotices:
         waiting : bool
             Whether the message after a gap will be read again.
         """
-        refused = {
+        refusal_record = {
             "count": self.refused_in_a_row,
             "steps": self._refused_steps,
             "reason": self.last_reason,
@@ -78,7 +78,7 @@ class StreamNotices:
             "clock": self._clock_is_reported,
             "blind": self.is_blind,
             "names": list(self._reported_slips),
-            "refused": refused if self.refused_in_a_row else None,
+            "refused": refusal_record if self.refused_in_a_row else None,
         }
         # A journal leaves out what is zero, false or empty
         return {key: value for key, value in state.items() if value}
@@ -89,11 +89,11 @@ class StreamNotices:
         self._clock_is_reported = state.get("clock", False)
         self.is_blind = state.get("blind", False)
         self._reported_slips = list(state.get("names", ()))
-        refused = state.get("refused", {})
-        self.refused_in_a_row = refused.get("count", 0)
-        self._refused_steps = list(refused.get("steps", ()))
-        self.last_reason = refused.get("reason", "")
-        self._refusals_are_reported = refused.get("told", False)
+        refusal_record = state.get("refused", {})
+        self.refused_in_a_row = refusal_record.get("count", 0)
+        self._refused_steps = list(refusal_record.get("steps", ()))
+        self.last_reason = refusal_record.get("reason", "")
+        self._refusals_are_reported = refusal_record.get("told", False)
 
     def note_gap(self, first_missing: int, next_step: int, unit: str) -> None:
         """Add a notice about a gap: steps without a message, before a step that has one.

@@ -50,7 +50,7 @@ class PortForce(Primitive):
 
     @property
     def proportional(self) -> tuple[str, ...]:
-        """Names of the numbers by which the force scales; it is zero if the first one is zero."""
+        """Names of the parameters that scale the force; without the first one there is no force."""
         first_number = next(iter(self.units))
         return (first_number,)
 

@@ -123,15 +123,16 @@ def speed_after(
 ) -> float:
     """Return the speed of a port after the law has acted on it alone for a duration [s].
 
-    The solution of s' = -strength |s - l|^p sgn(s - l) in closed form, for each exponent p. With
-    `passes_zero`, dry friction keeps its sign when the speed passes zero, instead of stopping the
-    port there.
+    With the level l and the exponent p of the law, the speed s obeys s' = -strength |s - l|^p
+    sgn(s - l), which has a closed solution for each exponent. With `passes_zero`, dry friction
+    keeps its sign when the speed passes zero, instead of stopping the port there.
     """
     exponent = law[EXPONENT]
     above_level = speed - law[LEVEL]
     size = abs(above_level)
     impulse = strength * duration
     is_inactive = size == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0)
+    # The power of a tiny speed would overflow; its change is negligible.
     if is_inactive or (exponent > 1.0 and size < 1e-60):
         return speed
     if exponent == 0.0:

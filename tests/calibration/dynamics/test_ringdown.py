@@ -43,7 +43,7 @@ def ring_down(
 def fit_record(time, signal, width=0.0):
     """Return the fit of all samples, with free frequencies."""
     record = RingDownRecord(time, signal, averaging_width=width)
-    return fit_ring_down(record, free=True, start=FROM_FIRST_SAMPLE)
+    return fit_ring_down(record, frequencies_fitted=True, start=FROM_FIRST_SAMPLE)
 
 
 # ---------------------------------------------------------------- modes are recovered
@@ -122,7 +122,9 @@ def test_a_fast_record_is_decimated_and_cropped(fast_record):
 def test_modes_of_a_fast_record_are_recovered(fast_record, digits):
     time = fast_record.time if digits is None else np.round(fast_record.time, digits)
 
-    first, second = fit_ring_down(RingDownRecord(time, fast_record.signal), free=True).modes
+    first, second = fit_ring_down(
+        RingDownRecord(time, fast_record.signal), frequencies_fitted=True
+    ).modes
 
     assert first.frequency == pytest.approx(5.65, rel=1e-4)
     assert second.frequency == pytest.approx(29.97, rel=1e-3)

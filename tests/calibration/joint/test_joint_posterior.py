@@ -313,7 +313,7 @@ def record_trials(seed, softening=0.0, scatter=0.0):
 
 def test_the_frequency_of_a_wing_that_softens_has_the_deviation_of_its_course():
     softening = 0.07
-    trials = fit_trials(record_trials(1, softening), free=True, start=-1.0)
+    trials = fit_trials(record_trials(1, softening), frequencies_fitted=True, start=-1.0)
 
     deviation = readings_by_name(trials)["frequency_1"].deviation
 
@@ -328,7 +328,9 @@ def test_frequencies_of_spectral_peaks_carry_their_bias():
     """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
     records = record_trials(2)
     by_peak = readings_by_name(fit_trials(records, start=-1.0))["frequency_2"]
-    by_fit = readings_by_name(fit_trials(records, free=True, start=-1.0))["frequency_2"]
+    by_fit = readings_by_name(fit_trials(records, frequencies_fitted=True, start=-1.0))[
+        "frequency_2"
+    ]
 
     bias = abs(by_peak.value - F2)
     assert bias > 5.0 * by_fit.deviation
@@ -349,7 +351,7 @@ def values_of(trials, reading):
 def fit_scattered(count, scatter):
     """Return the fits of some trials with scattered frequencies, which take seconds."""
     records = record_trials(1, scatter=scatter)[:count]
-    return fit_trials(records, free=True, start=-1.0)
+    return fit_trials(records, frequencies_fitted=True, start=-1.0)
 
 
 @pytest.mark.parametrize(("count", "scatter"), [(1, 0.05), (2, 0.05), (5, 0.05), (5, 0.0)])

@@ -486,7 +486,7 @@ def test_displacements_are_those_of_the_full_model(field, full_response, full_di
 def test_strains_are_those_of_the_full_model(coarse_operators, cell_data, full_displacement):
     in_middle = np.full((1, 3), 0.5)
     (strain,) = np.moveaxis(
-        coarse_operators.wing_mesh.strains(full_displacement, local=in_middle), 1, 0
+        coarse_operators.wing_mesh.strains(full_displacement, local_positions=in_middle), 1, 0
     )
 
     _, spanwise_strain, *_ = cell_data["strain"].T
