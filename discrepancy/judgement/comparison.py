@@ -366,7 +366,9 @@ class Comparison(ABC, Generic[HypothesisT]):
         is_counted = np.zeros(len(not_refuted), dtype=bool)
         for index, hypothesis in enumerate(not_refuted):
             families = family_place_pairs(hypothesis)
-            is_counted[index] = any(asked <= families for asked in families_asked_about)
+            is_counted[index] = any(
+                asked_families <= families for asked_families in families_asked_about
+            )
         if not is_counted.any():
             return 0.0
         return float(np.exp(logsumexp(scores[is_counted]) - logsumexp(scores)))

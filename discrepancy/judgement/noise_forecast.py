@@ -96,8 +96,10 @@ class NoiseForecast:
             by_name[name] = max(by_name.get(name, 0.0), size)
         largest = max(by_name.values(), default=0.0)
         ranked = sorted(by_name, key=lambda name: -by_name[name])
-        named = [name for name in ranked if by_name[name] >= LEAST_PART_IN_IMITATION * largest]
-        return tuple(named[:MOST_NAMED_UNKNOWNS]) if largest > 0.0 else ()
+        named_unknowns = [
+            name for name in ranked if by_name[name] >= LEAST_PART_IN_IMITATION * largest
+        ]
+        return tuple(named_unknowns[:MOST_NAMED_UNKNOWNS]) if largest > 0.0 else ()
 
     def _squared_distance(self, change: ScreenedChange, noise_factor: float) -> float:
         """Return G(n) of the module docstring, where n is the square of the noise factor."""
@@ -109,10 +111,10 @@ class NoiseForecast:
         """Return J d (n,) and |d|^2 of a change."""
         overlaps = np.zeros(len(self._information))
         squared_change = 0.0
-        first = 0
+        first_entry = 0
         for rows, indices in self._trials:
-            trial_change = change.vector[first : first + rows.residual.size]
-            first += rows.residual.size
+            trial_change = change.vector[first_entry : first_entry + rows.residual.size]
+            first_entry += rows.residual.size
             overlaps[indices] += rows.jacobian @ trial_change
             squared_change += float(trial_change @ trial_change)
         return overlaps, squared_change
@@ -125,18 +127,18 @@ class NoiseForecast:
 
 def _names_of_unknowns(problem: Problem) -> list[str]:
     """Return the names of all unknowns: those that trials share, then those of each trial."""
-    shared = problem.shared
+    layout = problem.shared
     names = []
     for index, parameter in enumerate(problem.model.parameters):
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
         names.append(
-            f"{parameter.name!r} ({shared.centre[index]:.4g} ± {shared.scale[index]:.2g}{unit})"
+            f"{parameter.name!r} ({layout.centre[index]:.4g} ± {layout.scale[index]:.2g}{unit})"
         )
-    for index, channel in enumerate(shared.gain_channels, start=shared.parameter_count):
-        stated = "not stated"
-        if shared.precision[index] > 0.0:
-            stated = f"stated to {100.0 * shared.scale[index]:.3g} %"
-        names.append(f"the gain of {channel} ({stated})")
+    for index, channel in enumerate(layout.gain_channels, start=layout.parameter_count):
+        stated_text = "not stated"
+        if layout.precision[index] > 0.0:
+            stated_text = f"stated to {100.0 * layout.scale[index]:.3g} %"
+        names.append(f"the gain of {channel} ({stated_text})")
     for data in problem.trials:
         names += _names_of_trial_unknowns(problem, data)
     return names
@@ -150,11 +152,11 @@ def _names_of_trial_unknowns(problem: Problem, data: TrialData) -> list[str]:
     names = []
     for index, column in enumerate(layout.zero_columns):
         channel = trial.channels[column]
-        stated = "not stated"
+        stated_text = "not stated"
         if layout.precision[index] > 0.0:
             factor, unit = UNITS[problem.campaign.channels[channel].quantity].drawn
-            stated = f"stated to {factor * layout.scale[index]:.3g} {unit}"
-        names.append(f"the zero of {channel} ({stated})")
+            stated_text = f"stated to {factor * layout.scale[index]:.3g} {unit}"
+        names.append(f"the zero of {channel} ({stated_text})")
     names += ["how the trials begin"] * (initial_end - zeros_end)
     for index in layout.offset_inputs[: inputs_end - initial_end]:
         names.append(f"the constant of {trial.inputs[index].name}")
