@@ -501,13 +501,13 @@ def view_beside(
     is_wanted : bool
         Whether to show the mission at all.
     server : ViewServer, optional
-        What shows the mission; the view of one flight if left out.
+        The server that shows the mission; the view of one flight if left out.
 
     Yields
     ------
     callable
-        To be called with the folder of the mission once it exists; it does nothing if `is_wanted` is
-        false.
+        Show the mission in a folder; to be called once the folder exists. Without `is_wanted` the
+        function does nothing.
     """
     if not is_wanted:
         yield lambda _folder: None
