@@ -278,7 +278,7 @@ class Wiring:
             The end.
         causalities : tuple of str
             The causalities that the variable may have.
-        role, needed : str
+        role, requirement : str
             The role of the end, and the requirement that it must meet, for the message.
         """
         variable = self.variable(end)
