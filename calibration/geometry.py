@@ -61,8 +61,9 @@ class MeasuredLength:
     def __post_init__(self) -> None:
         if abs(self.measured / self.designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
-                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm "
-                "were designed, more than 10 % apart: check the units (both in mm) and the wing."
+                f"{self.name} measures {self.measured * 1e3:g} mm, but the design has "
+                f"{self.designed * 1e3:g} mm, a difference of more than 10 %: check the units "
+                "(both in mm) and the wing."
             )
 
     @property
@@ -217,8 +218,8 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
         if abs(value / designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
                 f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
-                f"{designed * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with "
-                "--design."
+                f"{designed * 1e3:.1f} mm, a difference of more than 10 %: give the design of this "
+                "wing with --design."
             )
     try:
         return design.changed(planform=planform)

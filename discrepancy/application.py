@@ -168,12 +168,12 @@ def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> 
     certainty = {
         VerdictKind.NAMED: "named",
         VerdictKind.NAMED_IN_PART: "named in part: the remainder has no name",
-        VerdictKind.FAMILY: "of which the family is named, not the law",
+        VerdictKind.FAMILY: "with a named family, but no named law",
         VerdictKind.GROUP: (
             "one of a group that the data cannot tell apart, and not a name (group: "
             "{', '.join(stored.verdict.group)})"
         ),
-        VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
+        VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: not a name",
     }
     return certainty[patch.verdict]
 

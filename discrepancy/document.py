@@ -58,7 +58,7 @@ _MEANING_OF_VALUE = {
     "logger": 'Name of the logger, or "*" for all.',
     "loss": "Lost fraction of the stiffness.",
     "mass": "Added mass.",
-    "offset": "Added reading; of a `channel_offset` a formula in the `time` of the trial.",
+    "offset": "Added reading; for a `channel_offset` a formula in the `time` of the trial.",
     "order": "Order of the law or filter.",
     "phase": "Phase of the sine.",
     "port": "Name of the port.",
@@ -89,7 +89,7 @@ _JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
 _NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
 _BEGIN = {
     "type": ["number", "null"],
-    "description": "Begin in the time of the trial; null if it is open.",
+    "description": "Beginning in the time of the trial; null if it is open.",
     "unit": "s",
 }
 _END = {**_BEGIN, "description": "End in the time of the trial; null if it is open."}

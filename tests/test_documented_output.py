@@ -9,6 +9,8 @@ import pytest
 from benchmarks.pictures.picture import PRINTED_NUMBER, agrees
 from tests import command_line
 from tests.conftest import REFERENCE
+from twin_master.fleet.reading import COUNTS_OF_FLEETS, PRINTED_FIGURES_OF_FLEETS
+from twin_master.scenario.schema import FIGURES
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -51,6 +53,41 @@ def test_the_commands_of_a_page_print_what_it_says(page, folder, published, tmp_
     answered = [line.rstrip() for answer in answers for line in answer.splitlines()]
     missing = [line for line in block(page, "text") if not any(same_line(line, other) for other in answered)]
     assert missing == []
+
+
+BLOCK = re.compile(r"^```(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+ROW = re.compile(r" ?(\S(?:.*?\S)?)  +\S")
+"""The first cell of a row of a printed table: two blanks end it."""
+
+
+def named_rows() -> re.Pattern[str]:
+    """Return what the rows of the tables of `run` and `fleet run` are called, with any names in fields."""
+    titles = [title for group in FIGURES.values() for title, _unit in group.values()]
+    titles += [figure.title for figure in PRINTED_FIGURES_OF_FLEETS.values()]
+    titles += COUNTS_OF_FLEETS
+    pieces = [re.split(r"\{\w+\}", title) for title in titles]
+    return re.compile("|".join(".+".join(map(re.escape, piece)) for piece in pieces))
+
+
+def quoted_tables() -> dict[str, list[str]]:
+    """Return the names of the rows of each table of figures that a page quotes, by page."""
+    tables: dict[str, list[str]] = {}
+    for path in (DOCS.parent / "README.md", *DOCS.rglob("*.md")):
+        for language, text in BLOCK.findall(path.read_text("utf-8")):
+            if language not in ("", "text"):
+                continue
+            rows = [row[1] for row in map(ROW.match, text.splitlines()) if row]
+            if any("rms error" in row for row in rows):
+                tables.setdefault(path.name, []).extend(row for row in rows if row != "result")
+    return tables
+
+
+def test_the_rows_of_quoted_tables_are_called_as_they_are_printed():
+    """Figures may be older than the code; the names of the rows must not be."""
+    tables, names = quoted_tables(), named_rows()
+    assert tables.keys() >= {"README.md", "another_asset.md", "coupling.md", "fleets.md", "scenarios.md"}
+    former = {page: [row for row in rows if not names.fullmatch(row)] for page, rows in tables.items()}
+    assert {page: rows for page, rows in former.items() if rows} == {}
 
 
 def test_a_line_with_another_number_is_not_the_same():

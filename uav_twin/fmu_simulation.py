@@ -155,12 +155,12 @@ def _refuse_options_that_contradict(
         )
     if binding is not None and has_experiment_options:
         raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says "
-            "these itself."
+            "--stop-time, --step-size and --set are for a simulation without --binding, because a "
+            "binding states these itself."
         )
     if interpolation is not None and inputs is None:
         raise FmuInputError(
-            "--interpolation says how inputs go on between the rows of --inputs: give these."
+            "--interpolation is for the course between the rows of --inputs: give --inputs, too."
         )
 
 
@@ -276,8 +276,8 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise FmuInputError(
-                f"--set {text} is not understood; write NAME=VALUE: a number, true or false, the "
-                "name of an enumeration's item, a text, or several values with commas between."
+                f"--set {text} cannot be read; write NAME=VALUE: a number, true or false, the name "
+                "of an enumeration's item, a text, or several values with commas between."
             )
         values[name] = value
     return values

@@ -108,8 +108,8 @@ def _refuse_uneven_time(record: RingDownRecord) -> None:
     usual_step = np.median(step)
     sample = int(np.argmax(np.abs(step - usual_step)))
     raise ExperimentDataError(
-        f"{record.source}: time must run upwards in even steps, but after sample {sample + 1} "
-        f"it moves by {step[sample]:.6g} s where {usual_step:.6g} s is usual."
+        f"{record.source}: times must increase in equal steps, but after sample {sample + 1} the "
+        f"step is {step[sample]:.6g} s instead of the usual {usual_step:.6g} s."
     )
 
 

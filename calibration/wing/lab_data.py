@@ -268,7 +268,7 @@ def read_lab_folder(
     if record_files and targets != "published":
         lab = _with_ring_downs(lab, path, record_files, frequencies_fitted=frequencies_fitted)
     elif record_files:
-        lab = _with_origin(lab, 3, f"records left aside as asked; {_PUBLISHED[3]}", read=False)
+        lab = _with_origin(lab, 3, f"records ignored as requested; {_PUBLISHED[3]}", read=False)
     mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
     if mass_file is not None:
         lab = _with_weighed_mass(lab, mass_file)

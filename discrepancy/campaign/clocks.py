@@ -129,7 +129,7 @@ def merge_clocks(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
             f"{unread_titles[0]!r} are known, but a load must be known whenever a channel is read."
         )
-    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    remark = f"{_stamped_columns_text(clocks)}: the clocks are equal and are merged into one"
     if not clocks_are_equal:
         remark = (
             f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
@@ -152,9 +152,7 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
     """
     remark = ""
     if filled_loads:
-        remark += (
-            f"; loads are filled in there as they go between their samples: {listing(filled_loads)}"
-        )
+        remark += f"; loads are interpolated there: {listing(filled_loads)}"
     if outside:
         stamps = counted(outside, "stamp")
         remark += f"; {stamps} before or after their records {is_or_are(outside)} left out"

@@ -206,7 +206,7 @@ class LaboratoryImport:
         if kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
             if self._questionnaire.stated_answer("begins", file) is not None and kind:
                 raise CampaignFileError(
-                    f"--begins is for forced and driven trials, and {file} is {kind}."
+                    f"--begins is for forced and driven trials, but {file} is {kind}."
                 )
             return None
         choices = [*map(str, Start)]
@@ -227,7 +227,7 @@ class LaboratoryImport:
         if is_noise or not is_a_choice:
             if self._questionnaire.stated_answer("held-out", file) is not None:
                 raise CampaignFileError(
-                    f"--held-out is for trials, and {file} holds samples at rest."
+                    f"--held-out is for trials, but {file} holds samples at rest."
                 )
             return False
         expected = "whether it is held out for the proof and not fitted, yes or no"

@@ -198,13 +198,13 @@ class TrialSection(records.TrialKeys):
         recorded_in_time = (records.TrialKind.FORCED, records.TrialKind.DRIVEN)
         if self.begins is not None and kind not in recorded_in_time:
             raise ValueError(
-                f"the trial {self.name!r} is {kind.value}, and `begins` is for forced and driven "
-                "ones; a ring-down states it by its `release`"
+                f"the trial {self.name!r} is {kind.value}, but `begins` is for forced and driven "
+                "trials; a ring-down states it by its `release`"
             )
         if self.hold is not None and kind is not records.TrialKind.FORCED:
             raise ValueError(
-                f"the trial {self.name!r} is {kind.value}, and its `hold` is for the force of a "
-                "forced one: for a driven trial, set it in its [[input]]"
+                f"the trial {self.name!r} is {kind.value}, but its `hold` is for the force of a "
+                "forced trial: for a driven trial, set it in its [[input]]"
             )
         for region, loss in self.health.items():
             if region != "deviation" and loss > 1.0:

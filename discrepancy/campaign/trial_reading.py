@@ -284,7 +284,7 @@ def _read_channel(
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):
             raise CampaignFileError(
-                f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, and "
+                f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, but "
                 f"{table.name} has {counted(len(values), 'row')}."
             )
         used[row - 1] = False

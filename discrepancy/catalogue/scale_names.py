@@ -13,7 +13,7 @@ from discrepancy.catalogue.effect_in_setting import EffectInSetting, Target
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.system.scales import PortScale
-from fe.runtime.patch import EVERY_CHANNEL
+from fe.runtime.patch import EVERY_CHANNEL, RegionStiffnessLoss
 
 LARGEST_SHARE = 0.9
 """Largest friction force at a port, as a fraction of its elastic force."""
@@ -179,8 +179,8 @@ def _largest_release(context: BuildContext) -> float:
 def _largest_region_loss(context: BuildContext) -> float:
     """Return the largest further loss of stiffness of the damage region that the place names.
 
-    The losses that the campaign states and the further loss multiply. Together they may reach the
-    largest loss for which the model holds.
+    The losses that the campaign and a patch of the model state, and the further loss, multiply.
+    Together they may reach the largest loss for which the model holds.
     """
     region = context.target.name
     model = context.setting.model
@@ -190,8 +190,11 @@ def _largest_region_loss(context: BuildContext) -> float:
         for trial in context.setting.campaign.trials
         if region in trial.regions
     ]
-    largest_stated_loss = max(stated_losses, default=0.0)
-    return max(1.0 - (1.0 - largest_loss) / (1.0 - largest_stated_loss), 0.0)
+    remaining = 1.0 - max(stated_losses, default=0.0)
+    for primitive in model.patch:
+        if isinstance(primitive, RegionStiffnessLoss) and primitive.region == region:
+            remaining *= 1.0 - primitive.loss
+    return max(1.0 - (1.0 - largest_loss) / remaining, 0.0)
 
 
 def _station_of_end(end: int, context: BuildContext) -> float:

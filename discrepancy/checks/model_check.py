@@ -80,8 +80,8 @@ def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[
         names = ", ".join(f"{name!r} ({ratio:.0%})" for name, ratio in undetermined.items())
         noun = "parameters" if len(undetermined) > 1 else "parameter"
         sentence = (
-            f"The records do not determine the calibrated {noun} {names} (in brackets: posterior "
-            "over prior standard deviation): an effect that acts like them cannot be "
+            f"The records do not determine the calibrated {noun} {names} (in per cent: "
+            "posterior over prior standard deviation): an effect that acts like them cannot be "
             "distinguished from them; record trials in which they act, or state narrower priors."
         )
         yield DataFault(FaultKind.UNOBSERVABLE, sentence)

@@ -167,7 +167,7 @@ class LocalUnknowns:
 
     @cached_property
     def ends_by_kind(self) -> list[int]:
-        """The index after the last of the zeros, initial state, input constants, and time zero."""
+        """The indices after the zeros, initial state, input constants, and time zero."""
         counts = (
             self.zero_count,
             prod(self.initial_shape),

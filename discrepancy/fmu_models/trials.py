@@ -43,7 +43,8 @@ def effect_parameters(
         effect = f"effect.{effects[primitive.kind]}"
         if f"{effect}.active" in {*known_parameters, *parameters}:
             raise ModelError(
-                f"Of the two primitives {primitive.kind!r} {model_name} carries one ({effect})."
+                f"Only one of the two primitives {primitive.kind!r} can be carried by {model_name} "
+                f"({effect})."
             )
         parameters[f"{effect}.active"] = 1.0
         for key, value in primitive.to_mapping().items():

@@ -189,8 +189,8 @@ class FmuVariables:
         if len(names) != len(variables):
             raise ModelError(
                 f"The FMU model {self._description.name!r}: the output {section.name!r} stands for "
-                f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as "
-                "many."
+                f"{counted(len(names), 'name')}, but its variable stands for {len(variables)}; "
+                "give the same number for both."
             )
         outputs = []
         for name, variable in zip(names, variables, strict=True):

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -272,6 +273,13 @@ def _moved_text(unknown: MovedUnknown) -> str:
         stated = f"stated to {100.0 * deviation:.3g} %"
         return f"the {name} by {100.0 * value:+.3g} % ({stated}; {distance})"
     if unknown.stated == 0.0:
-        return f"the {name} to {value:.3g}{unit} (stated to {deviation:.3g}{unit}; {distance})"
+        factor = 1.0
+        if name.startswith("zero of ") and unknown.unit == UNITS[Quantity.STRAIN].si:
+            factor, strain_unit = UNITS[Quantity.STRAIN].drawn
+            unit = f" {strain_unit}"
+        return (
+            f"the {name} to {factor * value:.3g}{unit} (stated to {factor * deviation:.3g}{unit}; "
+            f"{distance})"
+        )
     stated = f"{unknown.stated:.4g} ± {deviation:.2g}"
     return f"{name!r} from {stated} to {value:.4g}{unit} ({distance})"

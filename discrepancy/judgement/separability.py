@@ -10,7 +10,7 @@ units of the noise variance, sigma^2.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
+
+from .noise_forecast import NoiseForecast
 
 CONFUSION_DISTANCE = 9.0
 """Squared distance below which two effects form a confusion group [sigma^2]."""
@@ -58,6 +60,12 @@ class Detectability:
         The unit of the parameter.
     typical : float
         The prior median of the parameter (one prior deviation for a signed one).
+    noise_factor : float
+        How many times smaller the noise would have to be for the effect to be detected at that
+        median; 1 if it is detected, infinite if less noise would not help.
+    imitated_by : tuple of str
+        If less noise would not help, the unknowns that can change the readings as the effect does,
+        with what is stated of them.
     """
 
     effect: Effect
@@ -68,6 +76,8 @@ class Detectability:
     detectable: float = inf
     unit: str = "1"
     typical: float = 0.0
+    noise_factor: float = 1.0
+    imitated_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -184,7 +194,9 @@ def compute_separability(
     """
     problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
-    screen = Screen(problem, fit(problem, Candidate(), start, iterations=1))
+    no_effect = fit(problem, Candidate(), start, iterations=1)
+    screen = Screen(problem, no_effect)
+    forecast = NoiseForecast(problem, no_effect)
     detectability: list[Detectability] = []
     visible: list[_VisibleEffect] = []
     for effect in effects:
@@ -204,7 +216,10 @@ def compute_separability(
         distance = min(
             reference.squared_size, small_reference.change.squared_size / small_reference.factor**2
         )
-        detectability.append(_detectability(effect, reference, distance))
+        row = _detectability(effect, reference, distance)
+        if distance < DETECTION_DISTANCE:
+            row = _with_forecast(row, reference, small_reference, forecast)
+        detectability.append(row)
         if reference.squared_size > VISIBILITY_DISTANCE:
             visible.append(_VisibleEffect(effect.identifier, reference, [reference, *grid_changes]))
     identifiers = tuple(effect.identifier for effect in visible)
@@ -329,6 +344,37 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
                 typical=typical,
             )
     return Detectability(effect, "", change.term.place, distance)
+
+
+def _with_forecast(
+    row: Detectability,
+    reference: ScreenedChange,
+    small_reference: "_SmallChange",
+    forecast: NoiseForecast,
+) -> Detectability:
+    """Return how well an effect can be detected, with what would make it detectable.
+
+    Parameters
+    ----------
+    row : Detectability
+        An effect that is not detected at its prior median.
+    reference : ScreenedChange
+        The change by the effect at its prior median.
+    small_reference : _SmallChange
+        The same change at a small magnitude.
+    forecast : NoiseForecast
+        The distances at smaller noise.
+    """
+    if row.distance <= 0.0:
+        return replace(row, noise_factor=inf)
+    # both distances count, since a large change may saturate
+    small_distance = DETECTION_DISTANCE * small_reference.factor**2
+    factor = max(
+        forecast.noise_factor(reference, DETECTION_DISTANCE),
+        forecast.noise_factor(small_reference.change, small_distance),
+    )
+    imitated_by = () if isfinite(factor) else forecast.imitating_unknowns(reference)
+    return replace(row, noise_factor=factor, imitated_by=imitated_by)
 
 
 # ---------------------------------------------------------------- distances

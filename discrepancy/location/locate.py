@@ -205,8 +205,9 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     if not phrases:
         return ()
     return (
-        f"Single samples lie beyond {_LEAST_OUTLIER:g} deviations of noise and rest while their "
-        f"neighbours do not: {', '.join(phrases)}; if they are errors of the data, leave them out.",
+        f"Single samples lie beyond {_LEAST_OUTLIER:g} standard deviations of both the noise and "
+        f"the other residuals, but their neighbours do not: {', '.join(phrases)}; if they are "
+        "errors of the data, leave them out.",
     )
 
 

@@ -1,7 +1,7 @@
 """Texts on what a campaign can decide: visible effects, and effects that look alike."""
 
 from collections.abc import Collection, Sequence
-from math import inf, isfinite
+from math import isfinite
 
 import numpy as np
 
@@ -133,7 +133,7 @@ def campaign_needs(
             effects_by_identifier[name].acts_on for name in group if name in effects_by_identifier
         ]
         sentences.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
-    sentences += _sentence_on_hidden_effects(separability)
+    sentences += _sentences_on_hidden_effects(separability)
     without_noise = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if without_noise:
         sentences.append(
@@ -154,7 +154,7 @@ def _sentence_on_group(
     kinds_of_effects: Sequence[frozenset[TrialKind]],
     missing_kinds: Collection[TrialKind],
 ) -> str:
-    """Return which trials would distinguish effects that look alike, or that loads must vary.
+    """Return a sentence on trials or changes of load that distinguish similar effects.
 
     Parameters
     ----------
@@ -179,10 +179,11 @@ def _sentence_on_group(
     return f"To tell {names} apart, add {texts_of_kinds}: some of them act there and others do not."
 
 
-def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
-    """Return the sentence on effects that these data show only if they are large.
+def _sentences_on_hidden_effects(separability: Separability) -> list[str]:
+    """Return the sentences on effects that these data show only if they are large.
 
-    It is empty if there are no such effects.
+    One is on the effects that less noise would show, one on those that the stated deviations of
+    other unknowns hide. There is none without such effects.
     """
     hidden = [
         detectability
@@ -192,21 +193,56 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
         and isfinite(detectability.detectable)
         and detectability.distance < DETECTION_DISTANCE
     ]
+    hidden_by_noise = [row for row in hidden if isfinite(row.noise_factor)]
+    hidden_by_unknowns = [row for row in hidden if not isfinite(row.noise_factor)]
+    return [
+        *_sentence_on_noise(hidden_by_noise),
+        *_sentences_on_unknowns(hidden_by_unknowns),
+    ]
+
+
+def _sentence_on_noise(hidden: Sequence[Detectability]) -> list[str]:
+    """Return the sentence on the effects that less noise would show; empty if there are none."""
     if not hidden:
         return []
-    nearest = max(hidden, key=lambda detectability: detectability.distance)
-    # the squared distance grows with the square of the size of an effect
-    factor = inf
-    if nearest.distance > 0.0:
-        factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5
-    names = [detectability.effect.identifier.replace("_", " ") for detectability in hidden]
+    nearest = min(hidden, key=lambda detectability: detectability.noise_factor)
+    factor = nearest.noise_factor
+    names = [_name_in_sentence(detectability) for detectability in hidden]
     improvement = f"with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials"
     if len(names) == 1:
         return [
             f"At its prior median {names[0]} would not be detectable; it would be {improvement}."
         ]
-    first = nearest.effect.identifier.replace("_", " ")
     return [
-        f"At their prior medians {listing(names)} would not be detectable; {first} would be the "
-        f"first, {improvement}."
+        f"At their prior medians {listing(names)} would not be detectable; "
+        f"{_name_in_sentence(nearest)} would be the first, {improvement}."
     ]
+
+
+def _sentences_on_unknowns(hidden: Sequence[Detectability]) -> list[str]:
+    """Return the sentences on the effects that other unknowns imitate within their deviations.
+
+    There is one sentence for each set of unknowns.
+    """
+    effects_by_unknowns: dict[tuple[str, ...], list[str]] = {}
+    for detectability in hidden:
+        names = effects_by_unknowns.setdefault(detectability.imitated_by, [])
+        names.append(_name_in_sentence(detectability))
+    sentences = []
+    for unknowns, names in effects_by_unknowns.items():
+        medians = "At its prior median" if len(names) == 1 else "At their prior medians"
+        beginning = f"{medians} {listing(names)} would not be detectable, and less noise or more "
+        if not unknowns:
+            sentences.append(f"{beginning}trials would not help: these trials hardly depend on it.")
+            continue
+        sentences.append(
+            f"{beginning}trials would not help: within what is stated, {listing(unknowns)} can "
+            "change the readings alike. Calibrate these more closely, or add a channel or a kind "
+            "of trial that tells them apart."
+        )
+    return sentences
+
+
+def _name_in_sentence(detectability: Detectability) -> str:
+    """Return the identifier of an effect in words."""
+    return detectability.effect.identifier.replace("_", " ")

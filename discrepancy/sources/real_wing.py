@@ -108,8 +108,9 @@ def real_wing(
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
             f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
             f"{1e3 * interval:.3g} ms.",
-            f"Noise of the signal: scatter between the trials, {1e6 * deviation:.3g} microvolt, "
-            f"and the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
+            "The noise of the signal has two parts: the scatter between the trials, "
+            f"{1e6 * deviation:.3g} microvolt, and the reading error that all trials share, "
+            f"{1e6 * READING_ERROR:.3g} microvolt.",
         )
     }
     trials: list[dict[str, object]] = []

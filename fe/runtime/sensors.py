@@ -186,7 +186,8 @@ def _rotate_gauges(
         return
     if transverse is None or shear is None:
         raise InvalidPatchError(
-            "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
+            "A gauge is turned, but the model does not give the transverse and shear strains that "
+            "its reading depends on."
         )
     cosine = np.cos(angles[turned_columns])
     sine = np.sin(angles[turned_columns])

@@ -141,7 +141,7 @@ class AffineStructure:
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
-    """Number of the load for tracking: the two tracked modes add most to its compliance."""
+    """Number of the load whose compliance chooses the two tracked modes, which add most to it."""
 
     @property
     def unknowns(self) -> int:
@@ -189,7 +189,7 @@ class AffineStructure:
         return affine_sum([*factors.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
-        """Return the value of a load's control at which the load is examined alone.
+        """Return the value of a load's control for an examination of this load alone.
 
         That is the nominal value, or one if the nominal value is zero, at which there is no load.
         It is one for a constant load.

@@ -151,9 +151,9 @@ class MatrixFiles:
         """
         if len(self.rows) < len(self.places):
             raise MeshError(
-                f"{where}: several rows of the matrices carry one name, as those of expanded "
-                "shells and beams do, and rows that turn cannot be told from rows that shift; "
-                "give the load as a vector."
+                f"{where}: several rows of the matrices have the same name, as for shells and "
+                "beams that were expanded to solids, so that rotations cannot be distinguished "
+                "from displacements; give the load as a vector."
             )
         no_rotations = (0.0, 0.0, 0.0)
         values = (*field, *no_rotations)

@@ -139,8 +139,7 @@ class LoadControl(Ranged):
         yield from super().faults()
         yield (
             not any(self.range),
-            "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it "
-            "takes",
+            "with its nominal value 0 it would always be 0; give its `minimum` and `maximum`",
         )
 
 

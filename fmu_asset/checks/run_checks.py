@@ -265,8 +265,8 @@ class RunChecks:
             text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
             return CheckResult("problem", text)
         text = (
-            f"It takes {self._binding.binding.step_size:g} s only; `decimation` observes every "
-            "n-th step."
+            f"It accepts only the step size {self._binding.binding.step_size:g} s; `decimation` "
+            "observes every n-th step."
         )
         return CheckResult("warning", text)
 

@@ -75,8 +75,10 @@ class Exchange:
             messages = resolver.misfits()
             if len(messages) < 2:
                 raise
-            title = f"{len(messages)} entries of the binding {binding.title} do not fit the FMU:"
-            raise BindingError("\n".join([title, *messages])) from None
+            title = f"{len(messages)} entries of the binding {binding.title} do not fit the FMU."
+            # The title names the binding and its file, so that each message need not.
+            short = [text.replace(f" of the binding {binding.title}", "") for text in messages]
+            raise BindingError(" ".join([title, *short])) from None
 
     def _resolve(self, resolver: BindingResolver, configuration: list[InitialValue]) -> None:
         """Lay out what is exchanged with the FMU.

@@ -380,8 +380,8 @@ def step_count(histories: Sequence[tuple[InputSlot, Float]], steps: int | None) 
             source = slot.label
         elif len(numbers) != count:
             raise FmuInputError(
-                f"{slot.label} has {len(numbers)} steps, but {source} says {count}; give as many "
-                "of each."
+                f"{slot.label} has {len(numbers)} steps, but {source} has {count}; give the same "
+                "number for both."
             )
     if not count:
         raise FmuInputError(

@@ -248,7 +248,8 @@ class BindingResolver:
         count = len(vector.variables)
         if count != force_count:
             raise BindingError(
-                f"{location} has {count} values and the force {force_count}; give as many."
+                f"{location} has {count} values, but the force has {force_count}; give the same "
+                "number for both."
             )
         are_inputs = {self._is_input(variable) for variable in vector.variables}
         if len(are_inputs) > 1:

@@ -258,8 +258,9 @@ def _patched_members(
         return members
     if arrays is None:
         raise PatchFileError(
-            "The patch changes structure or loads, for which the FMU needs the wing in the basis "
-            "for patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
+            "The patch changes structure or loads, for which the FMU needs the arrays of the "
+            "patched wing: give them as `arrays`, as `fe.reduction.model_cache.patch_arrays` "
+            "returns them."
         )
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(

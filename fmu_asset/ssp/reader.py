@@ -380,7 +380,7 @@ class _SystemReader:
                     raise package_error(
                         self.package,
                         f"{str(connector)!r} is set and transformed on its way to {str(target)!r}; "
-                        "set that instead.",
+                        "set the latter instead.",
                     )
             self.settings[target] = self.settings[connector]
             return

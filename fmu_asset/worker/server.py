@@ -68,9 +68,9 @@ def _sandbox_hint() -> str:
         call = f"{event.name}({', '.join(argument_texts)})"
         attempt = f"; the last that its Python code tried was {call}"
     return (
-        f" The system refused it something (Permission denied{attempt}), as its sandbox does: what "
-        "it needs can be granted by `read`, `write`, `ports` or `programs` in the table [limits] "
-        "of its binding."
+        f" The system refused a call of the FMU (Permission denied{attempt}), as its sandbox does: "
+        "grant what it needs by `read`, `write`, `ports` or `programs` in the table [limits] of "
+        "its binding."
     )
 
 

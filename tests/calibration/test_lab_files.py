@@ -156,7 +156,7 @@ def test_the_published_figures_are_those_of_the_authors_folder(authors_folder):
 
 def test_ring_downs_of_the_authors_are_left_aside_if_asked(authors_folder):
     assert [origin.read for origin in authors_folder.origins] == [True, True, False]
-    assert "left aside" in authors_folder.origins[2].text
+    assert "ignored as requested" in authors_folder.origins[2].text
     assert authors_folder.trials is None
 
 

@@ -211,13 +211,13 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     larger = replace(found.proof.closed, value=-0.3)
     assert not has_applicable_effects(found.verdict, replace(found.proof, closed=larger))
     applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
-    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
+    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: not a name.")
     stored = read_patch(applied.path)
     assert stored.verdict is VerdictKind.UNEXPLAINED
     assert [effect.identifier for effect in stored.effects] == ["stiffness_drift"]
     assert stored.sentence.startswith(applied.sentence)
     with pytest.raises(
-        ModelError, match="only laws at the ports of a lumped model can stand in its own file"
+        ModelError, match="only laws at the ports of a lumped model can be written into its own file"
     ):
         apply_verdict(tmp_path / "verdict", tmp_path / "patched.toml")
 
@@ -231,7 +231,10 @@ def test_files_are_not_taken_from_their_owner(laboratory, tmp_path, monkeypatch)
     there.write_text("mine", encoding="utf-8")
     for words, message in (
         (("--out", "there.toml"), "there.toml exists: choose another --out or give --replace"),
-        (("--out", str(laboratory / "rig.toml"), "--replace"), "is what the patched model is made of"),
+        (
+            ("--out", str(laboratory / "rig.toml"), "--replace"),
+            "is a file from which the patched model is made",
+        ),
         (("--out", "model.xml"), "must end in one of .toml, .json, .fmu"),
         (("--out", "model.fmu"), "only a wing is packed with its effects"),
         (("--member", "free_play"), "has no group: leave it out"),
@@ -289,7 +292,7 @@ def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     beneath = (str(laboratory / "rig.toml"), str(tmp_path / "first.json"))
     assert choose_model(tmp_path / "verdict" / "patch.json").beneath == beneath
     for file in (*beneath, tmp_path / "verdict" / "verdict.json", tmp_path / "verdict" / "patch.json"):
-        with pytest.raises(FileNotWrittenError, match="is what the patched model is made of"):
+        with pytest.raises(FileNotWrittenError, match="is a file from which the patched model is made"):
             apply_verdict(tmp_path / "verdict", file, replace=True)
     second = apply_verdict(tmp_path / "verdict", tmp_path / "second.toml").path
     laws = tomllib.loads(second.read_text(encoding="utf-8"))["law"]

@@ -96,7 +96,7 @@ def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path, librar
     notes = noted(monkeypatch)
     with pytest.raises(RunFolderError, match="holds a run already"):
         fly(folder, library_file)
-    assert [note.endswith("the run that was there is back.") for note in notes] == [True] * (moves == 1)
+    assert [note.endswith("the previous run was restored.") for note in notes] == [True] * (moves == 1)
     kept = "first" if moves == 1 else "second"
     assert kept in (folder / "config.json").read_text(encoding="utf-8")
     assert (folder / "notes.txt").exists() is (moves == 1)

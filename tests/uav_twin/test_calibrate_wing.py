@@ -82,7 +82,7 @@ def test_a_laboratory_is_simulated_with_its_truth_and_its_records_are_fitted(tmp
             frequency = found[f"mode {mode}, natural frequency"]
             assert frequency == pytest.approx(modes.frequency[place], rel=near), options
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"ringdown.svg", "ringdown.png"}
-    assert "only one read off a plot does" in refused(*ringdown, "--extremes")
+    assert "only a record read off a plot has them" in refused(*ringdown, "--extremes")
 
 
 def test_a_wing_that_is_an_fmu_is_measured_as_the_model_is(wing, tmp_path):

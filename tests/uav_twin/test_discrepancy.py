@@ -101,7 +101,7 @@ def test_everything_that_is_not_said_is_named_at_once():
         "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
         "--unit NAME=... for 'F', 'Weg' and 'q' (such as mm, kN or ms",
         "--quantity NAME=... for 'U' (signal or voltage: V is a unit of each)",
-        "--release NAME=... for 'swing.csv' (how far the point was held",
+        "--release NAME=... for 'swing.csv' (displacement at which the release point was held",
     ):
         assert part in sentence
     assert sentence.strip().endswith("To have the outputs of your model listed, give --model.")

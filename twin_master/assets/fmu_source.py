@@ -336,8 +336,8 @@ class FmuSource(AssetSource):
             if not calibrated_values:
                 raise
             raise MissionInputError(
-                f"{error} The calibration has {', '.join(calibrated_values)}: give one of what is "
-                "flown, or name the parameter in `asset.parameters`."
+                f"{error} The calibration has {', '.join(calibrated_values)}: give a calibration "
+                "of the asset that flies, or name the parameter in `asset.parameters`."
             ) from error
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:

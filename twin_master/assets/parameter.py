@@ -277,8 +277,8 @@ def check_calibration(
         raise MissionInputError(
             f"the calibration of {record.asset} is of the model {record.model} with the design "
             f"{record.design_hash:.12}, and {where}, which the twin believes, has the design "
-            f"{design_hash[:12]}: calibrate what is believed, or let the twin believe what was "
-            "calibrated."
+            f"{design_hash[:12]}: calibrate the believed model, or let the twin believe the "
+            "calibrated one."
         )
     for name, (low, high) in ranges.items():
         if name in names and not low <= record.mean(name) <= high:

@@ -84,7 +84,7 @@ class NamedStructure(AssetSource):
         calibration=SAME_NAMES,
         parameter="give it in a table [[parameter]]",
         static_test=(
-            "the calibration source `static_test` is for wings: of a structure give `file`, or "
+            "the calibration source `static_test` is for wings: for a structure give `file`, or "
             "`normal` or `fixed` with `mean`."
         ),
     )

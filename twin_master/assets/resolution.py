@@ -174,7 +174,7 @@ def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) 
     """
     if file_count > 1:
         raise MissionInputError(
-            "one asset flies: give one of an SSP file, --fmu and --strain-library."
+            "only one asset can fly: give only one of an SSP file, --fmu and --strain-library."
         )
     if overrides.strain_library and (overrides.binding or overrides.library):
         raise MissionInputError(

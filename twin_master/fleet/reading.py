@@ -412,7 +412,7 @@ class _PrintedFigure(NamedTuple):
     unit: str = ""
 
 
-_PRINTED_FIGURES = {
+PRINTED_FIGURES_OF_FLEETS = {
     f"fallback within {WITHIN} ": _PrintedFigure(
         f"assets whose control changed within {WITHIN} steps of the damage that called for it",
         100.0,
@@ -429,6 +429,15 @@ _PRINTED_FIGURES = {
     ),
 }
 """How figures are printed, by the beginning of their keys; others are counts of assets."""
+COUNTS_OF_FLEETS = (
+    "twins",
+    "flown",
+    "failed in flight",
+    "ended early",
+    "raised an alarm",
+    "left a gauge out",
+)
+"""Titles of the counts of assets, which are their keys."""
 
 
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
@@ -439,7 +448,7 @@ def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[lis
     rows = []
     for key in keys:
         printed_figure = _PrintedFigure(key)
-        for beginning, description in _PRINTED_FIGURES.items():
+        for beginning, description in PRINTED_FIGURES_OF_FLEETS.items():
             if key.startswith(beginning):
                 printed_figure = description._replace(
                     title=description.title.format(of=key.removeprefix(beginning))

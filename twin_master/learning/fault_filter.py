@@ -76,7 +76,7 @@ class FaultFilter:
         self._gauge_belief_shape = (sensors, len(_GAINS), len(chosen_draws), states)
         if np.prod(self._gauge_belief_shape, dtype=float) > _MOST_BELIEF_NUMBERS:
             raise InvalidModelError(
-                f"noticing keeps a belief over {states} states and {len(chosen_draws)} draws for "
+                f"notices need a belief over {states} states and {len(chosen_draws)} draws for "
                 f"each of {sensors * len(_GAINS)} faults of gauges, which are more than "
                 f"{_MOST_BELIEF_NUMBERS} numbers: take fewer levels or state factors, or leave out "
                 "`notice`"

@@ -80,7 +80,7 @@ class WatchfulEstimator:
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(
-                "noticing needs the average over the draws outside the product over the sensors: "
+                "notices need the average over the draws outside the product over the sensors: "
                 "inside, each sensor has a parameter of its own"
             )
         self._inner = inner_estimator

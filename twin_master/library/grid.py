@@ -332,7 +332,7 @@ def grid_of_scenario(
     if gives_other_parameter or values_by_role["control"] or values_by_role["load"]:
         raise MissionInputError(
             f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the "
-            "rest is said by the scenario."
+            "scenario gives the rest."
         )
     levels = {factor.name: factor.levels for factor in scenario.state}
     values = parameters.get(draws.name, tuple(draws.values.tolist()))

@@ -122,9 +122,9 @@ def caption_belief(run: Run, figure: Figure) -> ReportFigure:
 def caption_learnt(run: Run, figure: Figure) -> ReportFigure:
     """Return the figure of the learnt quantities, with its title and caption."""
     sensor_sentence = (
-        f"Of the {run.sensors.word}s on the left: the one named, which departs most from its "
-        "prior, has the band, and grey are the means of the others; on the right all of them, "
-        "and as a blue band their prior."
+        f"On the left, the band is that of the {run.sensors.word} in the title, which departs most "
+        "from its prior, and grey lines are the means of the others. On the right are all of "
+        "them, with their prior as a blue band."
     )
     truth_sentence = "The truth is that of the simulated asset; the twin does not know it."
     has_sensors = any(quantity.is_per_sensor for quantity in run.learnt_quantities)

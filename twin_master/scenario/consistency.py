@@ -261,7 +261,7 @@ class ScenarioTables(Section):
             yield unknown_name_fault(gain.state, self.state_names, "truth.gains.state", "state")
 
     def _reward_faults(self) -> Iterator[Fault]:
-        """Yield (is present, message) of each possible fault: sensors of the rewards."""
+        """Yield (is present, message) of each possible fault of the sensors that rewards name."""
         rewards = self.rewards
         sensor_count = self.observation.count
         limited_count = sensor_count

@@ -245,7 +245,7 @@ class MessageReader:
         )
         if has_sensors and not any(map(self.likely_name, shown_names)):
             sentence += (
-                "; what is meant to be passed over begins with `_`, or is allowed by "
+                "; a name that shall be ignored must begin with `_`, or be allowed by "
                 "--allow-unknown"
             )
         return sentence

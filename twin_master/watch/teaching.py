@@ -50,7 +50,7 @@ def check_teachable(scenario: Scenario) -> None:
     """
     if scenario.notice is None:
         raise MissionInputError(
-            "--teach begins with an alarm, and this scenario gives none: `notice` is off."
+            "--teach begins with an alarm, but this scenario raises none: `notice` is off."
         )
     if not scenario.searchable:
         states = ", ".join(scenario.state_names)
@@ -62,9 +62,9 @@ def check_teachable(scenario: Scenario) -> None:
 def _no_wing_error(reason: str) -> MissionInputError:
     """Return the error for a scenario whose asset is not a wing that can be taught."""
     return MissionInputError(
-        "--teach looks for what the model of a wing lacks: strains under the damage states z1 and "
-        f"z2, predicted by a design or a calibration, are needed, and this scenario has {reason}: "
-        "leave --teach out; alarms are raised without it, too."
+        "--teach looks for what the model of a wing lacks. It needs strains under the damage "
+        "states z1 and z2 that a design or a calibration predicts, but this scenario has "
+        f"{reason}: leave --teach out; alarms are raised without it, too."
     )
 
 
@@ -137,7 +137,9 @@ class Teaching:
             journal_size = journal_size or end
             is_header = begin == 0
             if not is_header and line["standing"]["begin"] != begin:
-                raise damaged_line_error(path, begin, "lines before it are missing, or not its own")
+                raise damaged_line_error(
+                    path, begin, "lines before it are missing, or belong to another journal"
+                )
             if journal_size - begin > CHECKED_BYTES:
                 break
         if "standing" in last_line:

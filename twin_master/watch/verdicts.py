@@ -176,7 +176,7 @@ def trial_sentence(verdict: VerdictRecord, outcome: PatchOutcome, step_name: str
         f"{outcome.gained_evidence:.3g} nats of evidence"
     )
     if outcome.gained_evidence < LEAST_GAIN:
-        return f"{comparison}, {LEAST_GAIN:g} are needed, and is not adopted."
+        return f"{comparison}, but {LEAST_GAIN:g} are needed: it is not adopted."
     if not is_adopted(verdict, outcome):
         command = command_to_believe(verdict["folder"], first_step)
         return (

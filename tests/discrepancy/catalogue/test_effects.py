@@ -313,7 +313,7 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory():
     assert not setting.scales.ports["air"].turns
     remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
     for effect in chosen(*remember):
-        assert "motion that turns" in (effect.unavailable(setting) or "")
+        assert "moves back and forth" in (effect.unavailable(setting) or "")
     assert chosen("quadratic_damping")[0].unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns

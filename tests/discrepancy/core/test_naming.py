@@ -185,7 +185,7 @@ def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
     verdict, found, fit = reach_verdict(fine.problem(2, patch), kit.chosen("load_cell"))
     assert verdict.kind is kind, verdict.sentence
     if kind is VerdictKind.NOTHING_MISSING:
-        assert "below 0.1 % of what it acts on" in verdict.sentence
+        assert "below 0.1 % of the quantity" in verdict.sentence
         assert verdict.effects == ()
         assert fit is found.no_effect
         assert found.best().candidate.identifiers == ("load_cell",)
@@ -351,7 +351,7 @@ def test_only_names_are_remarked_on_and_likeness_counts_both_ways():
     # members of a set are no likenesses of each other
     both = look_alike_remark(verdict_on("inertia_relief", "washout"), kit.CATALOGUE)
     assert " do together, within the noise" in both
-    assert not {"washout", "inertia_relief"} & set(both.split("look alike,")[1].replace(",", " ").split())
+    assert not {"washout", "inertia_relief"} & set(both.split("look similar,")[1].replace(",", " ").split())
 
 
 def test_a_group_says_last_what_these_trials_cannot_test():

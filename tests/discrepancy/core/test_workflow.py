@@ -141,7 +141,7 @@ def test_a_gain_far_from_its_prior_is_remarked_on():
     for campaign, far in ((spoilt(1, change), True), (LABORATORY.measured(1), False)):
         remarks = " ".join(judged(campaign, EFFECTS[:1], thorough=False).verdict.remarks)
         assert ("The gain of the channel 'x2'" in remarks) is far
-        assert ("of its stated deviations" in remarks) is far
+        assert ("differs from its stated value" in remarks) is far
 
 
 def test_effects_that_lack_a_port_are_remarked_on_with_the_port_to_declare():
@@ -236,7 +236,7 @@ def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name():
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert found.verdict.effects == ()
     assert "('mass' 11.0, 'stiffness' 1" in found.verdict.sentence
-    assert "with one channel these data cannot tell them apart" in found.verdict.sentence
+    assert "with one channel, these data cannot distinguish the two" in found.verdict.sentence
 
 
 def test_a_law_beside_which_something_slow_is_left_is_named_in_part():

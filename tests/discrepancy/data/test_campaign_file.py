@@ -174,7 +174,7 @@ def test_inputs_come_out_in_si(tmp_path):
         rows = "".join(f"{k},{first if k == 0 else 1},{20 + k},{k}\n" for k in range(10))
         pushed = ("second.csv", "", f"time,force,plate,turned\n{rows}")
         remarks = " ".join(read_campaign(campaign_folder(tmp_path / "a", HEATED, forced, pushed)).remarks)
-        assert ("'second' is taken to begin at rest under what acts" in remarks) is (first != 0)
+        assert ("'second' is taken to begin at rest under the loads" in remarks) is (first != 0)
 
 
 def test_the_documented_campaign_is_read(tmp_path):

@@ -71,7 +71,7 @@ def test_equal_clocks_become_one_though_printed_otherwise(tmp_path):
     (trial,) = found.campaign("lab").trials
     assert (len(trial.time), trial.used.all()) == (40, True)
     assert found.clock_sentences == [
-        "lab.csv: 'acc1' by 'Time' and 'acc2' by 'Time 2': the clocks are equal and become one."
+        "lab.csv: 'acc1' by 'Time' and 'acc2' by 'Time 2': the clocks are equal and are merged into one."
     ]
 
 

@@ -65,7 +65,7 @@ def test_what_is_left_of_each_prior():
         assert not fatal(pushed(scale))
     slippery = model_of(CART_FILE.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }"))
     (found,) = unobservable_parameter_faults(campaign, slippery)
-    assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
+    assert "do not determine the calibrated parameter 'damping_factor' (100%)" in found.sentence
     (fault,) = check_against_model(campaign, slippery)
     assert (fault.kind, fault.fatal) == (FaultKind.UNOBSERVABLE, False)
 

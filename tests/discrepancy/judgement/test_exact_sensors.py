@@ -40,9 +40,10 @@ def test_what_the_campaign_calls_exact_and_the_data_do_not_is_named_with_the_key
     investigation = found(**wrong, **{key: 0.0})
     assert investigation.verdict.kind is not VerdictKind.NOTHING_MISSING
     (remark,) = told(investigation)
-    start = f"The {noun} of the channel 'displacement' is exact in the campaign; give `{key}`: left free, "
+    start = f"The {noun} of the channel 'displacement' is exact in the campaign; give `{key}`: if it is "
+    start += "fitted, the misfit of the model without any effect falls by "
     assert remark.startswith(start)
-    share = float(remark.removeprefix(start).split()[2])
+    share = float(remark.removeprefix(start).split()[0])
     assert 90.0 <= share <= 100.0
     free = found(**wrong, **{key: np.inf if noun == "zero" else 0.1})
     assert free.verdict.kind is VerdictKind.NOTHING_MISSING

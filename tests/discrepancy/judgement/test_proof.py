@@ -80,7 +80,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other()
     other = [replace(item, noise_deviation=3.0 * item.noise_deviation) for item in after.trials]  # its own
     gain = prove_effects(before, replace(after, trials=tuple(other))).log_score_gain
     assert gain == pytest.approx(proof.log_score_gain)
-    assert proof.remaining.startswith("These data show no remains")
+    assert proof.remaining.startswith("These data show no remaining error")
     none = prove_effects(before, before)
     assert none.closed.value == 0.0
     assert none.log_score_gain == none.log_score_gain_error == 0.0

@@ -9,18 +9,17 @@ import pytest
 from discrepancy.catalogue.library import library
 from discrepancy.files.verdict import read_verdict_file, write_verdict
 from discrepancy.fits.normal_equations import normal_equations
-from discrepancy.judgement.moved_unknowns import unknowns_moved_within_prior
+from discrepancy.judgement.moved_unknowns import moved_sentence, unknowns_moved_within_prior
 from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import render_report, verdict_card
 from discrepancy.report.printed import verdict_lines
 from discrepancy.report.sensor_table import MOST_PRINTED_SENSORS, printed_sensor_table
-from discrepancy.verdict import SensorValue, VerdictKind
+from discrepancy.verdict import MovedUnknown, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
 from reporting.page import Table
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import ORIGIN, chosen, simulated
-from tests.discrepancy.system.test_regions_of_structures import beam_file, model  # noqa: F401
 
 GAIN = 0.03
 """Relative error of the gain that is hidden in the channel g2."""
@@ -35,15 +34,15 @@ def with_stated_gains(campaign, deviation, *names):
 
 
 @pytest.fixture(scope="module")
-def wide_gain(model):  # noqa: F811
+def wide_gain(beam_model):
     """The beam under static loads, whose gauge g2 reads 3 % too much and is stated to 5 %."""
-    campaign = simulated(model, "static", 3)
+    campaign = simulated(beam_model, "static", 3)
     trials = [
         replace(trial, values=trial.values * (1.0 + GAIN * (np.array(trial.channels) == "g2")))
         for trial in campaign.trials
     ]
     campaign = with_stated_gains(replace(campaign, trials=tuple(trials)), 0.05, "g2")
-    return investigate(campaign, model, chosen("load_cell", "region_stiffness_loss"), seed=3)
+    return investigate(campaign, beam_model, chosen("load_cell", "region_stiffness_loss"), seed=3)
 
 
 def test_the_deviations_are_those_of_all_unknowns_together():
@@ -112,11 +111,11 @@ def test_of_many_channels_the_farthest_are_printed():
     assert [row[0] for row in printed.rows] == names[-MOST_PRINTED_SENSORS:]
 
 
-def test_nothing_missing_says_which_gain_an_error_may_hide_in(model):  # noqa: F811
+def test_nothing_missing_says_which_gain_an_error_may_hide_in(beam_model):
     """A stiffness loss of 20 % hides in gains that are stated to 12 %."""
     hidden = ("region_stiffness_loss", {"loss": 0.2}, "z2")
-    campaign = with_stated_gains(simulated(model, "static", 3, hidden), 0.12)
-    verdict = investigate(campaign, model, library(), seed=3).verdict
+    campaign = with_stated_gains(simulated(beam_model, "static", 3, hidden), 0.12)
+    verdict = investigate(campaign, beam_model, library(), seed=3).verdict
     assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
     moved = {unknown.name: unknown for unknown in verdict.moved_within_prior}
     assert "gain of g3" in moved
@@ -128,14 +127,20 @@ def test_nothing_missing_says_which_gain_an_error_may_hide_in(model):  # noqa: F
     assert "gain of g3 moved by" in verdict_card(verdict)
 
 
-def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(model):  # noqa: F811
-    verdict = investigate(simulated(model, "static", 3), model, chosen("load_cell"), seed=3).verdict
+def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(beam_model):
+    verdict = investigate(simulated(beam_model, "static", 3), beam_model, chosen("load_cell"), seed=3).verdict
     assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
     farthest = verdict.moved[0]
     assert abs(farthest.deviations) > 2.0
     assert f"{abs(farthest.deviations):.1f} deviations)" in verdict.sentence
     assert "where an error of the model may hide" in verdict.sentence
     assert farthest.name in verdict_card(verdict)
+
+
+def test_a_moved_zero_has_the_unit_of_the_report():
+    moved = MovedUnknown("zero of g2 in 'unloading'", 0.0, 8e-7, -1.8e-6, -2.25, "1")
+    told = "the zero of g2 in 'unloading' to -1.8 µε (stated to 0.8 µε; 2.2 deviations)"
+    assert told in moved_sentence([moved])
 
 
 def test_a_prior_that_is_narrow_hides_nothing():

@@ -174,7 +174,7 @@ def test_where_the_model_is_far_off_no_cell_is_judged():
         trials.append(replace(item, leverage=np.ones_like(item.leverage), sensitivity=wide))
     found = locate(replace(told, trials=tuple(trials)))
     assert not any(cell.axis != "frequency" for cell in found.cells)
-    assert any("no cell of the map can be judged" in remark for remark in found.remarks)
+    assert any("no single cell of the map can be judged" in remark for remark in found.remarks)
 
 
 def test_what_noise_records_say():

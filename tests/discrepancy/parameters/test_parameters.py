@@ -222,8 +222,8 @@ def test_what_is_not_told_is_said():
     assert found.kept_share("p3") == pytest.approx(1.0, abs=0.05)
     said = " ".join(found.findings)
     assert "does not tell p3: " in said
-    assert "does not tell p1" not in said  # half of its variance is gone
-    assert "p1 and p2 are told together and hardly apart" in said
+    assert "does not determine p1" not in said  # half of its variance is gone
+    assert "p1 and p2 are determined in combination" in said
     # one that is not told keeps its prior as it is cut off
     found = calibrate_parameters(campaign_of(noisy(weak, 1.02, 2.6, seed=2)), choice_of(weak, *WEAK))
     assert np.sum((found.samples[:, 1] == 1.25) | (found.samples[:, 1] == 3.75)) == 0
@@ -239,8 +239,8 @@ def test_what_is_not_told_is_said():
         # the model refuses what lies outside, as an FMU does
         (0.85, (1.0, 0.05, 0.9, 1.1), (0.9, 1.1), "p1 reaches the end of its range, 0.9 to 1.1", True),
         # within its range it refuses what the posterior holds: it ends there, and says so
-        (1.096, (1.0, 0.2, 0.5, 1.5), (0.0, 1.1), "(it is not known): the posterior has nothing there", True),
-        (0.9, (1.0, 0.2, 0.5, 1.5), (0.0, 1.1), "(it is not known): the posterior has nothing there", False),
+        (1.096, (1.0, 0.2, 0.5, 1.5), (0.0, 1.1), "(it is not known): the posterior leaves", True),
+        (0.9, (1.0, 0.2, 0.5, 1.5), (0.0, 1.1), "(it is not known): the posterior leaves", False),
         (0.8, (1.0, 0.02, 0.5, 1.5), (0.0, 9.0), "prior deviations below what curve.toml states", True),
     ],
 )  # fmt: skip

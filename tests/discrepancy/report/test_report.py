@@ -200,7 +200,7 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
-        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5, n + 2.0)
         for n, effect in enumerate(FEW[:count])
     )
     (told,) = (
@@ -208,7 +208,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
         for line in campaign_needs(
             Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
         )
-        if "would not be seen" in line
+        if "would not be detectable" in line
     )
     first = FEW[0].identifier.replace("_", " ")
     assert told.count(first) == (1 if count == 1 else 2)
@@ -254,10 +254,10 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
         ),
     )  # fmt: skip
     for words in (
-        "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",
+        "displacement 3.1 standard deviations of the noise over 0.25 s, swinging at 2 Hz",
         "<td>No flight trial.</td><td>washout and inertia relief</td>",
         "<td>Screened out</td><td>free play (0.3 nat)</td>",
-        "stands for most of what is missing",
+        "explains most of what is missing",
     ):
         assert words in text
     assert remainders_sentence(replace(drag.verdict, remainders=())) == ""
@@ -408,7 +408,7 @@ def test_an_old_verdict_is_not_lost(drag, tmp_path):
     assert not (folder / "notes.txt").exists()
     assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
     (other / "chapter.tex").write_text("x", encoding="utf-8")
-    for place, words in ((other, "left unchanged"), (other / "chapter.tex", "no folder")):
+    for place, words in ((other, "left unchanged"), (other / "chapter.tex", "not a folder")):
         with pytest.raises(FileNotWrittenError, match=words):
             check_verdict_folder(place, replace_it=True)
 

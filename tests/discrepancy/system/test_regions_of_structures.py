@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,17 +33,6 @@ LOSS = 0.2
 RIVALS = chosen("region_stiffness_loss", "gauge_gain", "load_cell", "breathing_crack")
 
 
-@pytest.fixture(scope="module")
-def beam_file(write_beam, tmp_path_factory) -> Path:
-    """The file of the beam with the damage regions z1 and z2."""
-    return write_beam(tmp_path_factory.mktemp("beam"))
-
-
-@pytest.fixture(scope="module")
-def model(beam_file):
-    return choose_model(beam_file).model
-
-
 @pytest.fixture
 def fmu_model(beam_file, tmp_path):
     """The FMU of the beam, described by the file that is written beside it."""
@@ -68,15 +56,15 @@ def check_that_the_loss_is_named(verdict) -> None:
 
 
 @pytest.mark.parametrize("kind", ["static", "ringdown"])
-def test_a_loss_in_a_region_is_named_with_its_size(kind, model) -> None:
+def test_a_loss_in_a_region_is_named_with_its_size(kind, beam_model) -> None:
     """In static trials the whole catalogue is compared, in ring-downs what is most alike."""
     effects = library() if kind == "static" else RIVALS
-    campaign = simulated(model, kind, 3, ("region_stiffness_loss", {"loss": LOSS}, "z2"))
-    check_that_the_loss_is_named(investigate(campaign, model, effects, seed=3).verdict)
+    campaign = simulated(beam_model, kind, 3, ("region_stiffness_loss", {"loss": LOSS}, "z2"))
+    check_that_the_loss_is_named(investigate(campaign, beam_model, effects, seed=3).verdict)
 
 
-def test_without_a_loss_nothing_is_named(model) -> None:
-    verdict = investigate(simulated(model, "static", 3), model, library(), seed=3).verdict
+def test_without_a_loss_nothing_is_named(beam_model) -> None:
+    verdict = investigate(simulated(beam_model, "static", 3), beam_model, library(), seed=3).verdict
     assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
 
 
@@ -87,7 +75,7 @@ def test_a_loss_is_named_beside_the_fmu_of_the_structure(fmu_model) -> None:
 
 @pytest.mark.parametrize("kind_of_model", ["structure", "fmu"])
 def test_a_patch_takes_the_stiffness_that_the_stated_loss_leaves(kind_of_model, request) -> None:
-    model = request.getfixturevalue("model" if kind_of_model == "structure" else "fmu_model")
+    model = request.getfixturevalue("beam_model" if kind_of_model == "structure" else "fmu_model")
     trial = asked(TrialKind.STATIC, np.arange(2.0), force=np.array([0.0, 30.0]), run="A")
     at_mean = {"parameters": model.prior_mean()}
     stated = {"health": np.array([[0.1, 0.3], [0.1, 0.3]])}
@@ -107,6 +95,9 @@ def test_a_large_loss_ends_where_the_model_does(write_beam, tmp_path) -> None:
         trial.health[:, trial.regions.index("z2")] = 0.2
     (primitive,) = hiding(campaign, model, "region_stiffness_loss", {"loss": 0.9}, "z2")
     assert 1.0 - 0.8 * (1.0 - primitive.loss) == pytest.approx(0.3)
+    patched = model.with_patch(ModelPatch((RegionStiffnessLoss("z2", 0.1),)))
+    (primitive,) = hiding(campaign, patched, "region_stiffness_loss", {"loss": 0.9}, "z2")
+    assert 1.0 - 0.8 * 0.9 * (1.0 - primitive.loss) == pytest.approx(0.3)
 
 
 def test_the_wing_loses_stiffness_anywhere_along_its_span_instead() -> None:
@@ -122,10 +113,10 @@ def test_the_wing_loses_stiffness_anywhere_along_its_span_instead() -> None:
     np.testing.assert_array_equal(patched, wing.wing.stiffness(1.0, (LOSS, *healthy[1:])))
 
 
-def test_an_unknown_region_is_refused(model) -> None:
+def test_an_unknown_region_is_refused(beam_model) -> None:
     trial = asked(TrialKind.STATIC, np.arange(2.0), force=np.array([0.0, 30.0]), run="A")
     with refused(ModelError, "damage region 'z7', but the model 'beam' has z1, z2"):
-        seen(model, trial, OUTPUTS, RegionStiffnessLoss("z7", LOSS), parameters=model.prior_mean())
+        seen(beam_model, trial, OUTPUTS, RegionStiffnessLoss("z7", LOSS), parameters=beam_model.prior_mean())
     wing = WingModel.of_design().wing
     with refused(InvalidPatchError, "damage region 'z7', but the wing has z1, z2"):
         wing.stiffness(1.0, (), ModelPatch((RegionStiffnessLoss("z7", LOSS),)))
@@ -171,9 +162,9 @@ def test_the_residuals_of_a_model_without_regions_have_none(tmp_path) -> None:
         assert stored.trial.health.shape == (len(stored.trial.time), 0)
 
 
-def test_a_stated_loss_of_a_region_that_is_not_there_is_refused(model) -> None:
-    campaign = simulated(model, "static", 3)
+def test_a_stated_loss_of_a_region_that_is_not_there_is_refused(beam_model) -> None:
+    campaign = simulated(beam_model, "static", 3)
     first, *others = campaign.trials
     lost = replace(first, regions=("z1", "rib"), health=first.health + np.array([0.0, 0.1]))
     with refused(ModelError, "loss of the damage region 'rib', but the model 'beam' has z1, z2"):
-        investigate(replace(campaign, trials=(lost, *others)), model, RIVALS)
+        investigate(replace(campaign, trials=(lost, *others)), beam_model, RIVALS)

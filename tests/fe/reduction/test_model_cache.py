@@ -179,7 +179,7 @@ def test_a_model_that_cannot_be_kept_is_still_given(
 
     assert reduced_model(coarse_design).design_hash == coarse_design.hash
 
-    assert "could not be kept" in caplog.text
+    assert "could not be stored" in caplog.text
 
 
 def test_the_cache_lies_in_the_home_folder_if_nothing_else_is_said(monkeypatch):

@@ -127,15 +127,14 @@ def test_all_entries_that_do_not_fit_the_fmu_are_told_at_once_with_the_file(fore
     path = tmp_path / "room.toml"
     path.write_text(UNFIT, encoding="utf-8")
 
-    with pytest.raises(BindingError) as caught:
+    with refused(BindingError, "3 entries of the binding room") as caught:
         FmiAsset(foreign_fmu("room2"), path)
 
-    first, *others = str(caught.value).splitlines()
-    assert first == f"3 entries of the binding room ({path}) do not fit the FMU:"
-    for line, entry in zip(
-        others, ("control.power", "load.outside", "observation.room"), strict=True
-    ):
-        assert line.startswith(f"{entry} of the binding room ({path}) ")
+    message = str(caught.value)
+    assert message.count(str(path)) == 1
+    assert message.startswith(f"3 entries of the binding room ({path}) do not fit the FMU. ")
+    for entry in ("control.power names 'heatr'", "load.outside", "observation.room"):
+        assert message.count(f". {entry}") == 1 or message.count(f"? {entry}") == 1
 
 
 def test_inputs_that_nobody_sets_are_named_with_their_start_values(room):

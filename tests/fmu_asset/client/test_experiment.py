@@ -61,7 +61,7 @@ def test_a_stop_time_of_the_binding_is_told(foreign_fmu) -> None:
 
 def test_a_start_without_an_end_names_the_key(foreign_fmu) -> None:
     words = (
-        r"(?s)told no end of the experiment.*"
+        r"(?s)No end of the experiment.*"
         r"give `stop_time` in the table \[binding\].*must be given"
     )
     asset = FmiAsset(foreign_fmu("siren2", WANTS_A_DAY), bound(900.0, SIREN))

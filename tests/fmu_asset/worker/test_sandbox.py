@@ -134,7 +134,9 @@ def test_what_is_not_its_own_is_out_of_reach(attempting, target, key, row) -> No
     """And the same FMU reaches it where the sandbox is off: it is the sandbox that holds."""
     reason, told = row.get("reason", "Permission denied"), target(row["what"])
     error = refused(attempting(row["call"], told), rf"(?s)step 2 .*it cannot have {told}: {reason}")
-    assert ("granted by `read`, `write`, `ports`" in str(error)) == (reason == "Permission denied")
+    assert ("grant what it needs by `read`, `write`, `ports`" in str(error)) == (
+        reason == "Permission denied"
+    )
     assert key.read_text() == "the private key"
     assert not (key.parent / "made").exists()
     granted(attempting(row["call"], told, sandbox=False))
@@ -144,7 +146,7 @@ def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
     attempting, key, spring_mass
 ) -> None:
     silent = attempting("look_into(TARGET)", key, "SILENT")
-    refused(silent, r"The system refused it something \(Permission denied\)")
+    refused(silent, r"The system refused a call of the FMU \(Permission denied\)")
     words = rf"\(Permission denied; the last .* tried was open\('{key}', 'r'\)\)"
     with (
         FmiAsset(spring_mass, SPRING_BINDING) as asset,

@@ -370,7 +370,7 @@ def test_of_an_asset_in_no_state_that_is_believed_a_fleet_tells_no_state(fleet_f
     for fleet in (folder, tmp_path / "out"):
         page = write_fleet_report(fleet).read_text()
         assert page.count("not believed") >= 3
-        assert "worst off" not in page
+        assert "with the most damage" not in page
 
 
 def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):

@@ -232,7 +232,7 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
     for step, record in enumerate(journal(tmp_path)):
         other = encode_line(record | {"next_control": 1 - record["next_control"]})
         path.write_bytes(b"".join([*lines[: step + 1], other, *lines[step + 2 :]]))
-        with pytest.raises(NotResumableError, match=f"decided otherwise after step {step} .*--replace"):
+        with pytest.raises(NotResumableError, match=f"has another decision after step {step} .*--replace"):
             part(known, tmp_path)
 
 

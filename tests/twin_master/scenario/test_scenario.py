@@ -309,7 +309,7 @@ def test_what_options_change_and_what_stays_the_scenarios(folder):
         ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
         ("model_mismatch", (), {"fmu": "x.fmu"}, "binding"),
         ("three_fmus", (), {"fmu": "x.fmu"}, "the scenario couples several"),
-        ("three_fmus", (), {"fmu": "x.fmu", "ssp": "x.ssp"}, "give one of an SSP file"),
+        ("three_fmus", (), {"fmu": "x.fmu", "ssp": "x.ssp"}, "give only one of an SSP file"),
     ],
 )
 def test_what_does_not_go_together_is_refused(folder, name, changes, given, sentence):

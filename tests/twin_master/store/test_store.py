@@ -147,7 +147,7 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
     expected = in_credible_set(MODEL, belief, SCENARIO.scripted_history())
     np.testing.assert_array_equal(in_credible_set(model, belief, truth), expected)
     assert expected.sum() == 6
-    with pytest.raises(InvalidModelError, match="no level of factor"):
+    with pytest.raises(InvalidModelError, match="not a level of factor"):
         model.states.index((0.3 * unit, 0.0))
 
 

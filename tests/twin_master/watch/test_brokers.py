@@ -225,7 +225,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")  # the first attempt fails, and the wish is kept
     failed = command(*words, "--no-report", "--replace").stderr
     assert "refuses the twin" in failed
-    assert "Nothing was observed yet: once this is mended" in failed
+    assert "Nothing was observed yet: correct the cause" in failed
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
     done = command(*words, "--no-report", "--resume")
     beginning.join()

@@ -251,7 +251,7 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
     whole, half = messages("step,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n")
     assert (whole.step, whole.observed[0]) == (12, 1e-4)
-    assert "no number" in str(half)
+    assert "not a number" in str(half)
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
     refused = CsvFeed(path, knowledge.scenario).messages(None)
     assert all(isinstance(fed[0], Refused) for fed in refused)

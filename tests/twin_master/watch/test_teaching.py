@@ -174,7 +174,7 @@ def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(n
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
-        ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
+        ("named", -0.002, "nats of evidence, but 3 are needed: it is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
@@ -328,7 +328,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
     assert (verdict["step"], model["step"]) == (32, 45)
     assert verdict["to_step"] < 32
     assert model["model"]["from_step"] < 20
-    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
+    assert model["model"]["notice"]["sentence"].endswith("these data cannot tell which of them is true.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
     twin, patched = (one.knowledge.twin() for one in noticing.models)

@@ -388,7 +388,7 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
         with pytest.raises(MissionInputError, match="choose another --out"):
             uav_twin.watch(scenario, source, passed, replace=True)
     assert len(journal(passed)) == 2
-    with pytest.raises(MissionInputError, match="give nothing beside --resume"):
+    with pytest.raises(MissionInputError, match="leave out options that would change them"):
         uav_twin.watch(None, recorded, folder, {"seed": 3}, resume=True)
     uav_twin.watch(None, recorded, folder, decide=decide, resume=True, steps=30, report=False)
     (folder / "summary.json").unlink()  # as a kill before the end leaves it

@@ -1,0 +1,164 @@
+"""Whether less noise would show an effect, or what else allows the same change of the readings.
+
+Let d be the change of the readings by an effect, over their noise, J the derivatives of the
+readings by the unknowns that are fitted under every hypothesis (one row for each), and P the prior
+precisions of these unknowns. With a noise variance that is n times smaller, the squared distance of
+the effect from the model without it is
+
+    G(n) = min over u of n |d - J' u|^2 + u' P u.
+
+It grows with n only until the unknowns imitate the change. Then their prior deviations limit it,
+and neither less noise nor more trials of the same kind help.
+"""
+
+from math import inf, sqrt
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.units import UNITS
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import normal_equations
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import ScreenedChange
+from discrepancy.fits.trial_data import TrialData
+
+LARGEST_NOISE_FACTOR = 100.0
+"""How many times smaller the noise may have to be; more is beyond any instrument."""
+LEAST_PART_IN_IMITATION = 0.2
+"""Change of the readings by an unknown, over the largest one, from which the unknown is named."""
+MOST_NAMED_UNKNOWNS = 3
+"""Largest number of unknowns that are named."""
+
+
+class NoiseForecast:
+    """The squared distances of effects from the model without them, at smaller noise.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    fit : CandidateFit
+        The fit without effect.
+    """
+
+    def __init__(self, problem: Problem, fit: CandidateFit) -> None:
+        noise_precision = np.where(
+            problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
+        )
+        equations = normal_equations(problem, fit, Candidate(), noise_precision)
+        self._trials = equations.trials
+        self._information = np.zeros_like(equations.matrix)
+        for rows, indices in self._trials:
+            self._information[np.ix_(indices, indices)] += rows.jacobian @ rows.jacobian.T
+        self._prior_precision = equations.matrix - self._information
+        self._names = _names_of_unknowns(problem)
+
+    def noise_factor(self, change: ScreenedChange, detection_distance: float) -> float:
+        """Return how many times smaller the noise must be for an effect to be detected.
+
+        Parameters
+        ----------
+        change : ScreenedChange
+            The change of the readings by the effect.
+        detection_distance : float
+            The squared distance at which an effect is detected.
+
+        Returns
+        -------
+        float
+            The factor; infinite if `LARGEST_NOISE_FACTOR` is not enough.
+        """
+        low = 1.0
+        high = LARGEST_NOISE_FACTOR
+        if self._squared_distance(change, high) < detection_distance:
+            return inf
+        # the distance grows with the factor, so bisection finds where it reaches the wanted one
+        while high / low > 1.001:
+            middle = sqrt(low * high)
+            if self._squared_distance(change, middle) < detection_distance:
+                low = middle
+            else:
+                high = middle
+        return high
+
+    def imitating_unknowns(self, change: ScreenedChange) -> tuple[str, ...]:
+        """Return the unknowns that imitate the change by an effect at much smaller noise.
+
+        Those that change the readings most come first. They are named with what is stated of them.
+        """
+        overlaps, _ = self._overlaps(change)
+        imitation = self._imitation(overlaps, LARGEST_NOISE_FACTOR)
+        changes_of_readings = np.sqrt(np.diag(self._information)) * np.abs(imitation)
+        by_name: dict[str, float] = {}
+        for name, size in zip(self._names, changes_of_readings.tolist(), strict=True):
+            by_name[name] = max(by_name.get(name, 0.0), size)
+        largest = max(by_name.values(), default=0.0)
+        ranked = sorted(by_name, key=lambda name: -by_name[name])
+        named = [name for name in ranked if by_name[name] >= LEAST_PART_IN_IMITATION * largest]
+        return tuple(named[:MOST_NAMED_UNKNOWNS]) if largest > 0.0 else ()
+
+    def _squared_distance(self, change: ScreenedChange, noise_factor: float) -> float:
+        """Return G(n) of the module docstring, where n is the square of the noise factor."""
+        overlaps, squared_change = self._overlaps(change)
+        imitation = self._imitation(overlaps, noise_factor)
+        return noise_factor**2 * (squared_change - float(overlaps @ imitation))
+
+    def _overlaps(self, change: ScreenedChange) -> tuple[FloatArray, float]:
+        """Return J d (n,) and |d|^2 of a change."""
+        overlaps = np.zeros(len(self._information))
+        squared_change = 0.0
+        first = 0
+        for rows, indices in self._trials:
+            trial_change = change.vector[first : first + rows.residual.size]
+            first += rows.residual.size
+            overlaps[indices] += rows.jacobian @ trial_change
+            squared_change += float(trial_change @ trial_change)
+        return overlaps, squared_change
+
+    def _imitation(self, overlaps: FloatArray, noise_factor: float) -> FloatArray:
+        """Return the scaled unknowns (n,) that imitate a change with the overlaps J d (n,)."""
+        matrix = self._information + self._prior_precision / noise_factor**2
+        return np.asarray(np.linalg.solve(matrix, overlaps))
+
+
+def _names_of_unknowns(problem: Problem) -> list[str]:
+    """Return the names of all unknowns: those that trials share, then those of each trial."""
+    shared = problem.shared
+    names = []
+    for index, parameter in enumerate(problem.model.parameters):
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        names.append(
+            f"{parameter.name!r} ({shared.centre[index]:.4g} ± {shared.scale[index]:.2g}{unit})"
+        )
+    for index, channel in enumerate(shared.gain_channels, start=shared.parameter_count):
+        stated = "not stated"
+        if shared.precision[index] > 0.0:
+            stated = f"stated to {100.0 * shared.scale[index]:.3g} %"
+        names.append(f"the gain of {channel} ({stated})")
+    for data in problem.trials:
+        names += _names_of_trial_unknowns(problem, data)
+    return names
+
+
+def _names_of_trial_unknowns(problem: Problem, data: TrialData) -> list[str]:
+    """Return the names of the unknowns of a trial, without the name of the trial."""
+    trial = data.trial
+    layout = data.unknowns
+    zeros_end, initial_end, inputs_end, times_end = layout.ends_by_kind
+    names = []
+    for index, column in enumerate(layout.zero_columns):
+        channel = trial.channels[column]
+        stated = "not stated"
+        if layout.precision[index] > 0.0:
+            factor, unit = UNITS[problem.campaign.channels[channel].quantity].drawn
+            stated = f"stated to {factor * layout.scale[index]:.3g} {unit}"
+        names.append(f"the zero of {channel} ({stated})")
+    names += ["how the trials begin"] * (initial_end - zeros_end)
+    for index in layout.offset_inputs[: inputs_end - initial_end]:
+        names.append(f"the constant of {trial.inputs[index].name}")
+    names += ["the time of the release"] * (times_end - inputs_end)
+    for column in layout.health_columns:
+        names.append(f"the stated loss of {trial.regions[column]}")
+    return names
