@@ -189,7 +189,7 @@ def _xml_value(value: float | None, kind: str) -> str | None:
     Parameters
     ----------
     value : float or None
-        The value.
+        The number, or None for a missing attribute.
     kind : str
         The type of the variable: Boolean, Real, or one of whole numbers.
     """
@@ -245,7 +245,7 @@ def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
     Parameters
     ----------
     table : sequence of FmuVariable
-        The table.
+        The variables in the order of their value references.
     """
     arrays = []
     for stem, group in groupby(table, _array_stem):

@@ -50,7 +50,7 @@ class TitledTable(NamedTuple):
     Attributes
     ----------
     table : Table
-        The table.
+        The table to add.
     title, caption : str
         The text above it.
     """

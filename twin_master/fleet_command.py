@@ -491,23 +491,25 @@ class ViewServer:
 
 
 @contextmanager
-def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Callable[[Path], None]]:
+def view_beside(
+    is_wanted: bool, server: ViewServer | None = None
+) -> Iterator[Callable[[Path], None]]:
     """Show a mission in the browser, in a process of its own; at the end wait for Ctrl-C.
 
     Parameters
     ----------
-    wanted : bool
+    is_wanted : bool
         Whether to show the mission at all.
     server : ViewServer, optional
-        What shows the mission; the view of one flight if left out.
+        The server that shows the mission; the view of one flight if left out.
 
     Yields
     ------
     callable
-        To be called with the folder of the mission once it exists; it does nothing if `wanted` is
-        false.
+        Show the mission in a folder; to be called once the folder exists. Without `is_wanted` the
+        function does nothing.
     """
-    if not wanted:
+    if not is_wanted:
         yield lambda _folder: None
         return
     import multiprocessing

@@ -329,7 +329,7 @@ def most_compliant_modes(load: FloatArray, squares: FloatArray, shapes: FloatArr
     Parameters
     ----------
     load : (n,) array
-        The load.
+        The load [N] whose compliance ranks the modes.
     squares : (m,) array
         Squared angular frequencies [rad^2/s^2].
     shapes : (n, m) array

@@ -271,7 +271,10 @@ def second_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes the second half of the impulse of step `k`; correct friction that reversed."""
+    """Give the modes the other half of the laws' impulse, in step `k` of duration `h` [s].
+
+    If the friction at a port has reversed within the step, its impulse is corrected.
+    """
     half = 0.5 * h
     # drift of the whole stiffness
     if ports.stiffness_rate != 0.0:

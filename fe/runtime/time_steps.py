@@ -79,9 +79,9 @@ def step_boundaries(
     system : ModalSystem
         The modes of the structure, without the forces of laws.
     laws : PortLaws
-        The laws at its ports.
+        The laws at the ports of the structure.
     time : (N,) array
-        The stamps [s].
+        The time stamps [s].
     refinement : int
         Factor on the number of steps.
     least : int

@@ -233,20 +233,21 @@ class ModalIntegrator:
     def _held_by_force(
         self, rest_state: TransientState, force: float, holding_load: int
     ) -> tuple[TransientState, float]:
-        """Return the equilibrium of a structure with laws that is held aside, and the force.
+        """Return the equilibrium of a structure that a force holds displaced, and the force.
 
-        The point is held at the displacement that the force causes without laws, so that laws
-        change the force: with a, the response of the ports to a unit force there, and a_0, that of
-        the point itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
+        The point is held at the displacement that the given force would cause without laws. The
+        laws change the force that is needed for this displacement. With the forces F of the laws,
+        the compliance C of the ports, the response a of the ports to a unit force at the point, and
+        the response a_0 of the point itself, the ports are at x = x_linear - (C - a a^T / a_0) F.
 
         Parameters
         ----------
         rest_state : TransientState
-            The equilibrium before.
+            The equilibrium before the structure is held.
         force : float
-            The holding force without laws [N].
+            The holding force that would be needed without laws [N].
         holding_load : int
-            Number of the load that holds the structure.
+            The number of the load that holds the structure.
         """
         response = self.structure.unit_responses[:, holding_load]
         ports = self._responses.port_positions[:, holding_load]

@@ -61,7 +61,7 @@ def gauge_rows(
     mesh : StructureMesh
         The mesh, with its nodes in metres.
     gauges : tuple of Gauge
-        The gauges.
+        The strain gauges, with point, direction, length and width.
 
     Returns
     -------
@@ -119,7 +119,7 @@ def _averaging_points(
     mesh : StructureMesh
         The mesh, with its nodes in metres.
     gauge : Gauge
-        The gauge.
+        The strain gauge, with its length and width.
     point, direction, normal : (3,) array
         The middle of the gauge [m], and unit vectors along it and normal to the surface.
     where : str

@@ -217,7 +217,7 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
     label : str
         The name of the array.
     value : int
-        The value.
+        The value whose names are sought.
     block : int
         The index of the block of elements that have it.
     """

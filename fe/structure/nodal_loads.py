@@ -67,7 +67,7 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
     mesh : StructureMesh
         The mesh, with its nodes in metres.
     load : MeshLoad
-        The load.
+        The load: an acceleration, a pressure on faces, or a force.
     where : str
         The name of the load in sentences.
 
@@ -101,7 +101,7 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     mesh : StructureMesh
         The mesh, with its nodes in metres.
     port : MeshPort
-        The port.
+        The port, with its point or nodes and its direction.
     where : str
         The name of the port in sentences.
 

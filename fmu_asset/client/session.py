@@ -112,7 +112,7 @@ class FmiAsset(SteppedFmu):
         Parameters
         ----------
         content : bytes
-            The state.
+            The state that `save_state` returned.
 
         Raises
         ------

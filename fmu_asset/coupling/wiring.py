@@ -211,7 +211,7 @@ class Wiring:
         Parameters
         ----------
         connection : Connection
-            The connection.
+            The connection to check and add.
         source_of_target : dict of Endpoint to Endpoint
             The sources of the connections before it, by target; it is added to them.
         """
@@ -275,10 +275,10 @@ class Wiring:
         Parameters
         ----------
         end : Endpoint
-            The end.
+            The end of a connection: a component and its variable, or a connector of the system.
         causalities : tuple of str
             The causalities that the variable may have.
-        role, needed : str
+        role, requirement : str
             The role of the end, and the requirement that it must meet, for the message.
         """
         variable = self.variable(end)

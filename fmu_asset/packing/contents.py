@@ -327,7 +327,7 @@ def with_identity(
     ----------
     members : mapping of str to bytes
         The files by name.
-    old_identity, new : ContentIdentity
+    old_identity, new_identity : ContentIdentity
         The tag and GUID in the files, and those to be written instead.
     """
     renamed_members = {}
@@ -336,10 +336,8 @@ def with_identity(
         if name.endswith(_TEXT_SUFFIXES):
             # The GUID is first: in a template it is the same placeholder as the tag.
             for pattern in _GUID_PATTERNS.get(name, ()):
-                old_guid, new_guid = (
-                    pattern.format(old_identity.guid),
-                    pattern.format(new_identity.guid),
-                )
+                old_guid = pattern.format(old_identity.guid)
+                new_guid = pattern.format(new_identity.guid)
                 new_content = new_content.replace(old_guid.encode(), new_guid.encode())
             new_content = new_content.replace(old_identity.tag.encode(), new_identity.tag.encode())
         renamed_members[name.replace(old_identity.tag, new_identity.tag)] = new_content

@@ -149,7 +149,7 @@ class PatchFile:
         Parameters
         ----------
         primitive : Primitive
-            The primitive.
+            The primitive change of the model.
         outputs : sequence of (str, str)
             Name and quantity of each output of the FMU.
         effect_label : str

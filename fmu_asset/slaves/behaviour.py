@@ -222,7 +222,7 @@ class StructureBehaviour:
         parameters : mapping of str to float
             The parameters at the time of that state, by name.
         state : sequence of float
-            The state.
+            The numbers of the state, as they were saved.
 
         Raises
         ------
@@ -397,7 +397,7 @@ class StructureBehaviour:
         Parameters
         ----------
         active : ActiveEffects
-            The effects.
+            The effects that are on, with their values.
         outputs : list of float
             The true outputs of the structure.
         duration, end : float
@@ -434,7 +434,7 @@ class StructureBehaviour:
         Parameters
         ----------
         active : ActiveEffects
-            The effects.
+            The effects that are on, with their values.
         channels : int
             The number of channels C; the first are the gauges.
 

@@ -189,11 +189,11 @@ def _add_number(
     Parameters
     ----------
     table : VariableTable
-        The table.
+        The table to which the variable is added.
     name : str
         The name of the variable.
     primitive : mapping
-        The primitive.
+        The primitive change that has the number.
     key : str
         The key of the number in the primitive.
     start : mapping of str to float
@@ -359,7 +359,7 @@ class SwitchableEffects:
         Parameters
         ----------
         active : ActiveEffects
-            The effects.
+            The effects that are on, with their values.
         values : (C,) ndarray
             The true values of the channels.
         strains_across : (2, C) ndarray, optional
@@ -421,7 +421,7 @@ class SwitchableEffects:
         damping : (float, float)
             The Rayleigh coefficients of mass [1/s] and stiffness [s].
         active : ActiveEffects
-            The effects.
+            The effects that are on, with their values.
         """
         assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, active.values)

@@ -246,7 +246,7 @@ class _SystemReader:
         Parameters
         ----------
         element : XmlElement
-            The connection.
+            The XML element of the connection.
         side : {"start", "end"}
             The side of the connection.
         path : str
@@ -303,7 +303,7 @@ class _SystemReader:
         name : str
             The name, in which an element may stand before one of the dots.
         setting : ComponentSetting
-            The value.
+            The value to set, with its unit.
         path : str
             The path of the element whose binding gives it.
         """

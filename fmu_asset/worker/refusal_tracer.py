@@ -156,7 +156,7 @@ class RefusalTracer:
         thread : int
             The number of the thread that made the call.
         call : SystemCall
-            The call.
+            The system call that was refused.
         arguments : list of int
             The arguments of the call.
         """

@@ -202,7 +202,7 @@ def _grant_paths(
     ----------
     rules : int
         The file descriptor of the set of rules.
-    grants, own, shared
+    grants, scratch_folder, fmu_folder
         As in `confine`.
     all_rights : int
         The mask of all rights to files that the kernel's Landlock knows.

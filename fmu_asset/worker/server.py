@@ -282,9 +282,9 @@ class _Server:
         replies = np.empty((len(requests), len(instance.reply)))
         sent = 0
 
-        def report(done: int) -> None:
+        def report(steps_done: int) -> None:
             nonlocal sent
-            self._answer(Answer.PART, replies[sent:done].tobytes())
-            sent = done
+            self._answer(Answer.PART, replies[sent:steps_done].tobytes())
+            sent = steps_done
 
         instance.run(requests, replies, report)

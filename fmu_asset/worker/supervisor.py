@@ -75,7 +75,7 @@ def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoRetu
 
     Parameters
     ----------
-    scratch, shared : str
+    scratch, fmu_folder : str
         The folder of the worker, and that of the extracted FMU. They are removed here only if the
         twin is dead, which otherwise removes them.
     grants : str

@@ -220,7 +220,7 @@ class ObservationLibrary:
         Parameters
         ----------
         name : str
-            The parameter.
+            The name of the parameter.
         draws : (N,) array
             The values of the parameter.
 

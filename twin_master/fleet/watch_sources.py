@@ -186,7 +186,7 @@ class TopicSource:
     has_ended = False  # a broker may send more at any time
 
     def __init__(self, watcher: Watcher, group: Group, authority: Path | None) -> None:
-        broker = parse_broker(group.observations, authority, many=True)
+        broker = parse_broker(group.observations, authority, has_many_assets=True)
         self._watcher = watcher
         self._group = group
         self._topic_prefix = broker.topic.removesuffix("+")

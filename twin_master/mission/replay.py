@@ -45,7 +45,7 @@ class SettledState(NamedTuple):
     Attributes
     ----------
     step : int
-        The step.
+        The number of the last step that cannot be revised any more.
     twin_state : bytes
         The state, as `Twin.save_state` returns it.
     """

@@ -43,9 +43,9 @@ class SortedValues(NamedTuple):
     state_and_control : (G, N) array
         The index of the pair of state and control to which a value belongs.
     draw_weight : (G, N) array
-        The probability of the draw to which it belongs.
+        The probability of the draw to which a value belongs.
     value : (G, N) array
-        The value.
+        The values of each sensor, SI, the smallest first.
     """
 
     state_and_control: Index

@@ -515,10 +515,10 @@ class GaussianSensorModel(QuantityModel):
         with np.errstate(over="ignore"):  # absurd observations overflow
             residual = (observation - predicted_values) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
-            best_state = int(np.argmin(distance.sum(axis=1)))
-        worst_first = np.argsort(-distance[best_state])
+            best_fitting_state = int(np.argmin(distance.sum(axis=1)))
+        worst_first = np.argsort(-distance[best_fitting_state])
         return {
-            f"sensor {index + 1}": float(residual[best_state, index])
+            f"sensor {index + 1}": float(residual[best_fitting_state, index])
             for index in worst_first[:_WORST_LISTED]
         }
 

@@ -171,7 +171,7 @@ def find_scenario(name: str) -> Path:
     )
 
 
-def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
+def load_scenario(scenario_or_file: LoadedScenario | str | Path) -> LoadedScenario:
     """Read and check a scenario file, and switch the alarms of its twin on by default.
 
     A file without the key `notice` gets the default table `notice`, unless `obstacle_to_notices`
@@ -180,7 +180,7 @@ def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
 
     Parameters
     ----------
-    given : LoadedScenario, str or Path
+    scenario_or_file : LoadedScenario, str or Path
         The name of a shipped scenario, or the path of a file. A `LoadedScenario` is returned
         unchanged.
 
@@ -195,9 +195,9 @@ def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
         If there is no such scenario, the file cannot be read or is not TOML, or a key of it is
         unknown, missing or has a wrong value. The message names the file and the key.
     """
-    if isinstance(given, LoadedScenario):
-        return given
-    path = find_scenario(str(given))
+    if isinstance(scenario_or_file, LoadedScenario):
+        return scenario_or_file
+    path = find_scenario(str(scenario_or_file))
     table = read_toml(path, ScenarioError, what="scenario")
     content_hash = hashlib.sha256(path.read_bytes()).hexdigest()
     scenario = parse_scenario(table, str(path))

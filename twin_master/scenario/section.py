@@ -267,7 +267,7 @@ def unknown_name_fault(name: str, known_names: Sequence[str], key: str, what: st
     Parameters
     ----------
     name : str
-        The name.
+        The name in the file.
     known_names : sequence of str
         The names that it may be.
     key : str

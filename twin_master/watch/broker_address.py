@@ -49,7 +49,9 @@ def is_broker(observations: str) -> bool:
     return observations.startswith(("mqtt://", "mqtts://"))
 
 
-def parse_broker(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
+def parse_broker(
+    address: str, authority: Path | None = None, *, has_many_assets: bool = False
+) -> Broker:
     """Return the broker of an address.
 
     Parameters
@@ -58,15 +60,15 @@ def parse_broker(address: str, authority: Path | None = None, *, many: bool = Fa
         `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
     authority : Path, optional
         The file with the certificate of the authority.
-    many : bool
-        Whether the topic is that of many assets. It then ends with `/+`, which stands for the name
-        of each asset.
+    has_many_assets : bool
+        Whether the topic is that of many assets. Such a topic ends with `/+`, which stands for the
+        name of each asset.
 
     Raises
     ------
     MissionInputError
-        If paho-mqtt is not installed; if the address is not such a address, has a password in it,
-        or has a topic of many assets for one or of one for many; if the file holds no certificate.
+        If paho-mqtt is not installed, if the address has another form or contains a password, if
+        its topic does not fit the number of assets, or if the file holds no certificate.
     """
     if find_spec("paho") is None:
         raise MissionInputError(
@@ -87,9 +89,9 @@ def parse_broker(address: str, authority: Path | None = None, *, many: bool = Fa
         )
     has_wildcard = "#" in address or "+" in topic
     ends_with_wildcard = topic.endswith("/+") and "+" not in topic[:-1] and "#" not in address
-    if many and not ends_with_wildcard:
+    if has_many_assets and not ends_with_wildcard:
         raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
-    if has_wildcard and not many:
+    if has_wildcard and not has_many_assets:
         raise MissionInputError(
             f"{address}: a topic of one asset is expected, without `#` and `+`."
         )
