@@ -165,7 +165,7 @@ def test_what_is_no_run_of_a_wing_is_refused_in_one_sentence(run, tmp_path):
     copy = shutil.copytree(run, tmp_path / "copy")
     config = (copy / "config.json").read_text(encoding="utf-8")
     for section, key, value, error, words in (
-        ("observation", "role", "flow", CampaignFileError, "another asset"),
+        ("observation", "role", "flow", CampaignFileError, "is not a run of the wing: strains"),
         ("asset", "load", {"tip_force": 5.0}, CampaignDataError, "5 N at the tip"),
     ):
         changed = json.loads(config)

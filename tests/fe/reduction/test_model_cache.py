@@ -156,7 +156,7 @@ def test_a_damaged_entry_is_built_anew_and_said(builds, coarse_design, caplog, e
     for _ in range(2):
         assert make(coarse_design).to_bytes() == good
 
-    assert "built anew" in caplog.text
+    assert "built again" in caplog.text
     assert len(builds) == build_count
 
 

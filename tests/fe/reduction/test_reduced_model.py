@@ -203,7 +203,7 @@ def test_values_outside_validity_are_refused_by_name(pair, value):
 
 
 def test_an_unknown_value_is_refused(pair):
-    with pytest.raises(OutsideModelError, match="nothing named 'z9'"):
+    with pytest.raises(OutsideModelError, match="mass or control named 'z9'"):
         pair.model.static_response({"z9": 0.1})
 
 

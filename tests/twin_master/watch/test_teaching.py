@@ -294,7 +294,7 @@ def test_the_picture_of_a_patch_is_kept_beside_the_watch(patched_watch, tmp_path
 @pytest.mark.parametrize(
     ("kind", "gain", "sentence"),
     [
-        ("named", 0.3, "and is not adopted."),
+        ("named", 0.3, "are needed: it is not adopted."),
         ("named", -0.002, "nats of evidence, but 3 are needed: it is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
