@@ -98,7 +98,7 @@ def test_the_calibration_of_a_wing_is_not_overwritten_by_that_of_a_campaign(lab,
     file = save_calibration(make_calibration(), lab.parent / "out" / "calibration.nc")
     wing, content = make_calibration().asset, file.read_bytes()
     sentence = refused(*to(lab, wing))
-    kind = f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and"
+    kind = f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), but"
     assert kind in sentence
     assert "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out" in sentence
     assert file.read_bytes() == content
@@ -109,7 +109,7 @@ def test_the_calibration_of_a_campaign_is_not_overwritten_by_that_of_a_wing(lab)
     file = lab.parent / "out" / "calibration.nc"
     content = file.read_bytes()
     sentence = refused("calibrate", "--out", file.parent, "--asset", "spring 7", "--no-report")
-    assert "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one" in sentence
+    assert "of spring 7 from a campaign (`uav-twin calibrate campaign`), but one" in sentence
     assert file.read_bytes() == content
 
 

@@ -310,13 +310,13 @@ def test_a_campaign_tells_the_modulus_and_not_the_mass(calibrated_mission):
     error = abs(calibration.mean("e") - TRUTH["e"])
     assert error < 3.0 * calibration.standard_deviation("e") < 0.03
     assert calibration.explained is True
-    assert any("does not tell pump" in sentence for sentence in calibration.findings)
+    assert any("does not determine pump" in sentence for sentence in calibration.findings)
 
 
 def test_a_mission_says_what_was_calibrated_what_flies_and_what_is_believed(calibrated_mission):
     calibration, file = calibrated_mission.calibration, calibrated_mission.file
     beginning = (
-        f"The calibrated model was {calibration.model}; flown is the FMU of the structure bracket, and"
+        f"The calibrated model was {calibration.model}; the asset is the FMU of the structure bracket, and"
     )
     end = calibrated_mission.believed
     assert calibration.design_hash == packed_design_hash(file.parents[1] / "bracket.fmu")
@@ -346,7 +346,7 @@ def test_a_watch_says_what_is_believed(calibrated_mission, tmp_path, monkeypatch
     with begin_watch(scenario, mission().file, tmp_path / "watch", SilentProgress()):
         pass
     believed = calibrated_mission.believed
-    assert any("flown is the watched asset" in note and note.endswith(believed) for note in notes)
+    assert any("the asset is the watched asset" in note and note.endswith(believed) for note in notes)
 
 
 def test_the_mass_that_was_calibrated_beside_the_modulus_follows_its_draws(calibrated_mission, tmp_path):

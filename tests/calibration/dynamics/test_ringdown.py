@@ -256,7 +256,7 @@ BAD_RECORDS = {
     "zeros": BadRecord("constant", np.zeros(TIME.size)),
     "few samples": BadRecord("at least 64", GOOD_SIGNAL[:20], time=TIME[:20]),
     "a gap": BadRecord("after sample 100", GOOD_SIGNAL, time=TIME + 0.1 * IS_AFTER_SAMPLE_100),
-    "time that runs back": BadRecord("even steps", GOOD_SIGNAL, time=TIME[::-1]),
+    "time that runs back": BadRecord("must increase in equal steps", GOOD_SIGNAL, time=TIME[::-1]),
 }
 
 

@@ -255,7 +255,7 @@ def cut_off(path, fraction):
 
 DAMAGES = {
     "text": (lambda _: b"load,displacement\n", "cannot be read as NetCDF"),
-    "foreign": (make_foreign_file, "no calibration file, but 'uav-twin calibration 2'"),
+    "foreign": (make_foreign_file, "is not a calibration file, but 'uav-twin calibration 2'"),
     "older": (make_file_of_older_schema, "of the schema 'uav-twin wing calibration 0'"),
     "changed": (change_design, "content does not match its hash"),
     "nearly whole": (lambda path: cut_off(path, 0.999), r"c\.nc .*calibrate again\.$"),

@@ -280,7 +280,7 @@ def test_continuations_of_nastran_may_stand_behind_a_line_that_goes_on(tmp_path)
 
 
 def test_a_continuation_of_nastran_that_continues_nothing_is_refused(tmp_path):
-    sentence = r"line 2: the continuation '\+B' stands behind no line that it continues"
+    sentence = r"line 2: the continuation '\+B' follows no line that it could continue"
 
     with refused(MeshError, sentence):
         read_cards(tmp_path / "m.bdf", "GRID,1,,0.,0.,0.,,,+A", "+B,7,8", "GRID,2,,0.,0.,1.")

@@ -171,7 +171,7 @@ def test_an_asset_that_differs_from_the_model_is_told(run):
     origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
     page = report.render_page(run, {}, {})
     page_of_other = report.render_page(replace(run, summary={**run.summary, **origin}), {}, {})
-    sentence = "differ: flown was the strain library, and the twin believes the reduced model."
+    sentence = "differ: the asset was the strain library, and the twin believes the reduced model."
     assert "model differ" not in page
     assert sentence in page_of_other
 
