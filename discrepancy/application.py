@@ -171,7 +171,7 @@ def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> 
         VerdictKind.FAMILY: "with a named family, but no named law",
         VerdictKind.GROUP: (
             "one of a group that the data cannot tell apart, and not a name (group: "
-            "{', '.join(stored.verdict.group)})"
+            f"{', '.join(stored.verdict.group)})"
         ),
         VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: not a name",
     }
