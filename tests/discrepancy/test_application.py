@@ -409,7 +409,9 @@ def test_a_model_is_found_beside_its_patch(laboratory, tmp_path):
     there.rename(moved)
     assert len(uav_twin.load_model(moved / "patched.json").patch)
     (moved / "rig.toml").unlink()
-    with pytest.raises(ModelError, match="does not exist any more: put it back there, or into the folder of patched"):
+    with pytest.raises(
+        ModelError, match="does not exist any more: put it back there, or into the folder of patched"
+    ):
         uav_twin.load_model(moved / "patched.json")
 
 

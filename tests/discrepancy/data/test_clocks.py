@@ -136,10 +136,7 @@ def test_a_load_is_filled_in_by_its_hold_and_rows_without_it_are_left_out(tmp_pa
     assert (trial.time[0], trial.time[-1]) == pytest.approx((own[0], own[-1]))
     np.testing.assert_allclose(trial.inputs[0].values, reference(trial.time, own, values), atol=1e-12)
     sentence = found.clock_sentences[0]
-    assert (
-        f"loads are filled in there as they go between their samples: 'pull' ({hold.replace('_', ' ')})"
-        in sentence
-    )
+    assert f"loads are interpolated there: 'pull' ({hold.replace('_', ' ')})" in sentence
     assert sentence.endswith("stamps before or after their records are left out.")
 
 
