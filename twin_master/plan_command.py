@@ -123,7 +123,7 @@ def plan(
 
 
 def _print_plan(record: Record) -> None:
-    """Print the returns of the rules, the bounds of the plan, and the value of an information."""
+    """Print the returns of the rules, the bounds of the plan, and the value of inspections."""
     rows = []
     for rule, (mean, half_width) in record["rules"].items():
         rows.append([rule, f"{mean:.4g}", f"{half_width:.2g}"])
@@ -131,7 +131,7 @@ def _print_plan(record: Record) -> None:
     lower = record["lower"]
     upper = record["upper"]
     terminal.say(
-        f"Bounds of the return, were the mission without end: {lower:.5g} to {upper:.5g}, a gap of "
+        f"Bounds of the return of a mission without end: {lower:.5g} to {upper:.5g}, a gap of "
         f"{upper - lower:.2g}."
     )
     percent = 100 * record["beyond_limit"]

@@ -89,14 +89,14 @@ class ImportDialogue:
         return questions + sum(len(texts) for texts in self.understanding.assumptions.values())
 
     def ask_all(self) -> bool:
-        """Ask all open questions; return whether there was any.
+        """Ask all open questions; return whether there were any.
 
         Assumptions are defaults that the user may change; they are asked, too.
 
         Raises
         ------
         typer.Exit
-            If the user stops the dialogue; the command that goes on with it has been printed.
+            If the user stops the dialogue. The command that continues it was printed before.
         """
         has_questions = self.open_count > 0
         if has_questions:

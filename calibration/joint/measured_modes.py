@@ -148,12 +148,12 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
     expected_variance = math.fsum(error**2 for error in errors) / count
     sum_of_squares = math.fsum((value - mean) ** 2 for value in values)
     if count > 1:
-        # Under the null hypothesis the ratio of the two has a chi-square distribution.
+        # If the trials scatter only by their stated errors, the ratio of `sum_of_squares` to
+        # `expected_variance` has a chi-square distribution.
         quantile = float(chdtri(count - 1, 1.0 - _SIGNIFICANT_SCATTER))
         if sum_of_squares > expected_variance * quantile:
             # Ratio of the variance of Student's t with n - 1 degrees of freedom to that of a
-            # Gaussian. It is infinite for up to three trials; 4 is taken then, while four trials
-            # have 3.
+            # Gaussian. It is 3 for four trials and infinite for fewer, for which 4 is assumed.
             variance_ratio = (count - 1) / (count - 3) if count > 3 else 4.0
             return _Estimate(mean, math.sqrt(variance_ratio * sum_of_squares / (count - 1) / count))
     return _Estimate(mean, math.sqrt(expected_variance / count))

@@ -40,15 +40,16 @@ def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
 
 @style.publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
-    """Return the figure of samples pair by pair, with their correlations.
+    """Return a corner figure: a panel of samples for each pair of parameters, with correlations.
 
     Parameters
     ----------
     titles : sequence of str
         The title of each parameter, with its unit.
     sets : sequence of (str, (N, F) array)
-        The names and samples of up to three distributions, in the units of the titles. Correlations
-        are those of the first, and each histogram has a scale of its own.
+        The names and samples of up to three distributions, in the units of the titles. The printed
+        correlations are those of the first distribution. Each histogram is scaled to its own
+        maximum.
     """
     samples = [values for _, values in sets]
     correlation: Float = np.atleast_2d(np.corrcoef(samples[0], rowvar=False))

@@ -104,7 +104,7 @@ def _read_force(
     campaign: schema.CampaignSection,
     inputs: Sequence[RecordedInput],
 ) -> FloatArray:
-    """Return the force of a trial in each row (N,) [N].
+    """Return the force of a trial [N] in each row of its table; the shape is (rows,).
 
     It is the column `force` of a static or forced trial, else the first force or torque [N m] among
     the inputs, else zero.

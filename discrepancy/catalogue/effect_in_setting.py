@@ -132,9 +132,9 @@ class EffectInSetting:
     def force_ports(self, condition: Callable[[PortScale], bool] = lambda scale: True) -> Names:
         """Return the ports of the model at which a force of this effect may act.
 
-        Ports of states are excluded, because a law at such a port is a flow. For a wing, the
-        effect's `preferred` ports that the wing has stand for all its ports; if it has none of
-        them, and for any other model, all ports remain.
+        Ports of states are excluded, because a law at such a port is a flow. If the model is a wing
+        that has some of the effect's `preferred` ports, only these are returned. Otherwise all
+        other ports of the model are returned.
 
         Parameters
         ----------

@@ -378,9 +378,9 @@ class PortedTrial:
         inputs: FloatArray,
         step_of_sample: IntArray | None = None,
     ) -> FloatArray:
-        """Return the state (F, n) of the linear system under inputs to the rate of its state.
+        """Return the state (F, n) of the linear system s' = A s + directions u(t).
 
-        The system is s' = A s + directions u(t), with inputs u that are linear in time between
+        The inputs u are added to the rate of the state. They are linear in time between
         neighbouring fine stamps.
 
         Parameters
@@ -392,8 +392,8 @@ class PortedTrial:
         inputs : (F, D) array
             The inputs u at the fine stamps.
         step_of_sample : (N,) array of int, optional
-            The index in `intervals` of the length of the interval that ends at each of the N
-            samples that are simulated; by default all samples of the trial.
+            For each of the N simulated samples, the index in `intervals` of the length of the
+            interval that ends at this sample. By default all samples of the trial are simulated.
         """
         matrices = self.substep_matrices
         if step_of_sample is None:

@@ -226,8 +226,8 @@ def _passing_limit(gate: Gate) -> str:
 def _rank_hypotheses(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
     """Return the hypotheses that the table of evidence shows, with their roles.
 
-    Those of the verdict come first, then the most probable others, at most `MOST_SHOWN_HYPOTHESES`
-    in all. The hypothesis without effects is always included.
+    The hypotheses of the verdict come first. The most probable other hypotheses follow, so that at
+    most `MOST_SHOWN_HYPOTHESES` are shown. The hypothesis without effects is always included.
     """
     if verdict.group:
         members = [*verdict.group]

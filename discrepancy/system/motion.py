@@ -424,8 +424,8 @@ def _linear_steps(
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps
-    # The position and speed of a drive are prescribed: no transition from the previous step, and
-    # an increment that is the value itself, mass-normalised.
+    # The position and speed of a drive are prescribed. They do not depend on the previous step, so
+    # that their transition is zero and their increment is the prescribed value (mass-normalised).
     steps = steps._replace(transition=steps.transition.copy())
     coordinate_count = begin_force.shape[1]
     first_drive = len(system.angular_frequency)

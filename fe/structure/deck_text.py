@@ -80,14 +80,14 @@ def fail(where: str, sentence: str) -> NoReturn:
 def lines_of(
     files: tuple[Path, ...], comment: re.Pattern[str], include: re.Pattern[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the lines of a file, with the lines of the files that it includes in their places.
+    """Yield the lines of a file; a line that includes another file is replaced by its lines.
 
     Comments and empty lines are left out.
 
     Parameters
     ----------
     files : tuple of Path
-        The files that include one another, the one to be read last.
+        The chain of files of which each includes the next one. The last file is read.
     comment : pattern
         The pattern of a comment.
     include : pattern

@@ -224,7 +224,7 @@ class SystemStructure:
 
 
 def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
-    """Return the end that a scenario file names.
+    """Return the end of a connection from its text in a scenario file.
 
     Parameters
     ----------

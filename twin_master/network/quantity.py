@@ -239,7 +239,7 @@ def _error_moments(
     mean, variance : (..., G) array
         Moments of the sensor values without noise.
     scale : (..., G) or (..., 1) array
-        The error that costs one.
+        The absolute error of a sensor for which the reward is -1.
     """
     is_present = ~np.isnan(observation)
     distance = np.abs(observation - mean)[..., is_present]
