@@ -116,7 +116,7 @@ def test_effects_that_make_the_held_out_record_of_the_tanks_worse_are_not_named(
     found = investigate(*rig("two_tanks", tmp_path), effects, thorough=False)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
     assert "the error in one trial that was not fitted larger" in found.verdict.sentence
-    assert "nothing is named" in found.verdict.sentence
+    assert "no effect is named, and there is nothing to apply" in found.verdict.sentence
 
 
 def test_the_place_of_what_a_pendulum_lacks_is_said(tmp_path):
