@@ -13,6 +13,7 @@ from uav_twin import (
     calibrate_commands,
     discrepancy_campaigns,
     discrepancy_commands,
+    discrepancy_import,
     fmu,
     fmu_simulation,
     schema_command,
@@ -168,7 +169,7 @@ discrepancy_group.command("apply")(discrepancy_commands.apply)
 discrepancy_group.command("check")(discrepancy_commands.check)
 discrepancy_group.command("effects")(discrepancy_campaigns.effects)
 discrepancy_group.command("example")(discrepancy_campaigns.example)
-discrepancy_group.command("import")(discrepancy_campaigns.import_files)
+discrepancy_group.command("import")(discrepancy_import.import_files)
 discrepancy_group.command("convert")(discrepancy_campaigns.convert)
 
 fleet_group = _add_group("fleet", MISSIONS, "Fly fleets of assets, and learn across them.")

@@ -1,9 +1,6 @@
-"""`uav-twin discrepancy import`, `example`, `convert` and `effects`: what a search begins with."""
+"""`uav-twin discrepancy effects`, `example` and `convert`: the catalogue, and campaigns to try."""
 
-import re
 import shlex
-import sys
-from collections.abc import Sequence
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,359 +12,14 @@ from reporting import terminal
 from reporting.command_options import LARGEST_SEED
 from reporting.files import refuse_filled
 from reporting.words import comma_list, counted, in_one_line
-from uav_twin.completion import complete_effect, complete_model
-from uav_twin.import_dialogue import ImportCommand, ImportDialogue
+from uav_twin.completion import complete_effect
 from uav_twin.options import EffectFilesOption, ModelOption
 
 if TYPE_CHECKING:
-    from discrepancy.campaign.importing import LaboratoryImport
     from discrepancy.campaign.records import Campaign
     from discrepancy.catalogue.entry import Effect, EffectParameter, ShapeParameter
     from discrepancy.system.interface import Model
     from fe.runtime.patch import ModelPatch
-
-
-def import_files(
-    files: Annotated[
-        list[Path],
-        typer.Argument(show_default=False, help="CSV, FILE.xlsx, FILE.xlsx#SHEET or FILE.mat."),
-    ],
-    *,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", show_default="as the first file", help="The folder."),
-    ] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--column",
-            metavar="HEAD=WHAT",
-            help="The model's output that a column measures; time, force, temperature or "
-            "load_factor; input:NAME; or - to leave it out. May be given several "
-            "times.",
-        ),
-    ] = None,
-    unit: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--unit",
-            metavar="HEAD=UNIT",
-            help="Unit of a column whose head does not state it. May be given several times.",
-        ),
-    ] = None,
-    quantity: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--quantity",
-            metavar="HEAD=QUANTITY",
-            help=(
-                "Quantity of a column whose unit belongs to several, such as V, % and 1. May be "
-                "given several times."
-            ),
-        ),
-    ] = None,
-    scale: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--scale",
-            metavar="HEAD=SCALE",
-            help=(
-                "Factor from the cells to the measured quantity, such as 200 N/V; a plain number "
-                "multiplies them. May be given several times."
-            ),
-        ),
-    ] = None,
-    zero: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--zero",
-            metavar="[HEAD=]DEVIATION",
-            show_default="1%",
-            help="How well a zero is known: 0.1mm, 1% of the largest reading, exact or "
-            "free. May be given several times.",
-        ),
-    ] = None,
-    gain: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--gain",
-            metavar="[HEAD=]DEVIATION",
-            show_default="2%",
-            help="How well a gain is known: 2%, exact or free. May be given several times.",
-        ),
-    ] = None,
-    hold: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--hold",
-            metavar="[HEAD=]HOLD",
-            show_default="linear",
-            help="What a load does between samples: zero_order, linear or smooth. May be "
-            "given several times.",
-        ),
-    ] = None,
-    kind: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--kind",
-            metavar="[FILE=]KIND",
-            help=(
-                "Kind of the trial: static, ringdown, forced, driven or flight; noise for samples "
-                "at rest. May be given several times."
-            ),
-        ),
-    ] = None,
-    release: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--release",
-            metavar="[FILE=]SIZE",
-            help="Displacement at which the release point was held, such as 15.5mm. May be given "
-            "several times.",
-        ),
-    ] = None,
-    load_place: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--load-place",
-            metavar="[FILE=]PLACE",
-            show_default="tip_load",
-            help="Where a force acts. May be given several times.",
-        ),
-    ] = None,
-    decimal: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--decimal",
-            metavar="[FILE=]MARK",
-            help=(
-                "Decimal sign, a point or a comma, if 1,234 can mean two numbers. May be given "
-                "several times."
-            ),
-        ),
-    ] = None,
-    interval: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--interval",
-            metavar="[FILE=]SECONDS",
-            help="Seconds between rows, if no column is a time. May be given several times.",
-        ),
-    ] = None,
-    begins: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--begins",
-            metavar="[FILE=]START",
-            show_default="settled",
-            help="How a forced or driven trial begins: settled, still or unknown. May be "
-            "given several times.",
-        ),
-    ] = None,
-    held_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--held-out",
-            metavar="FILE[=no]",
-            help=(
-                "A file that is held out for the proof; =no takes it into the fit. May be given "
-                "several times."
-            ),
-        ),
-    ] = None,
-    reference_temperature: Annotated[
-        str | None,
-        typer.Option(
-            "--reference-temperature",
-            metavar="DEGC",
-            help="Temperature at which the model's parameters hold, if a column is a temperature.",
-        ),
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            "--model",
-            autocompletion=complete_model,
-            help="The same as for `discrepancy run`: columns may have the names of its outputs.",
-        ),
-    ] = None,
-    ask_nothing: Annotated[
-        bool,
-        typer.Option(
-            "--ask-nothing",
-            help="Take the defaults without questions, as if there were no terminal.",
-        ),
-    ] = False,
-) -> None:
-    """Make a campaign from the files of a laboratory: show how they are read, and ask for missing information.
-
-    Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
-    """  # noqa: E501
-    from discrepancy.campaign.writing import write_campaign
-
-    folder = out or Path(files[0].stem)
-    refuse_filled(folder)
-    options = {
-        "column": column,
-        "unit": unit,
-        "quantity": quantity,
-        "scale": scale,
-        "zero": zero,
-        "gain": gain,
-        "hold": hold,
-        "kind": kind,
-        "release": release,
-        "load-place": load_place,
-        "decimal": decimal,
-        "interval": interval,
-        "begins": begins,
-        "held-out": [_held_out_answer(text) for text in held_out or ()],
-    }
-    # The options are answers to questions about columns and files
-    answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
-    if reference_temperature is not None:
-        answers["reference-temperature"] = {"": reference_temperature}
-    understanding = _understand_files(files, answers, model)
-    _print_understanding(understanding)
-    # Without a terminal, a question that is still open is an error of `campaign`
-    is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
-    if is_interactive:
-        understanding = _ask_and_confirm(ImportCommand(files, out, model), understanding, folder)
-    campaign = understanding.campaign(folder.resolve().name)
-    write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
-    terminal.say(f"Wrote {folder}: {_campaign_size(campaign)}.")
-    if understanding.assumed:
-        terminal.say(
-            f"{understanding.assumed} Where you know better, give --zero and --gain, or correct "
-            f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
-        )
-    terminal.say(f"Next: uav-twin discrepancy check {_shell_arguments(folder, model)}")
-
-
-def _ask_and_confirm(
-    command: ImportCommand, understanding: "LaboratoryImport", folder: Path
-) -> "LaboratoryImport":
-    """Ask what is open, and whether to write the folder; return the import with the answers.
-
-    Raises
-    ------
-    CampaignFileError, CampaignDataError
-        If no campaign can be made with the answers.
-    typer.Exit
-        If the user stops the dialogue, or wants nothing to be written.
-    """
-    dialogue = ImportDialogue(command, understanding)
-    has_asked = dialogue.ask_all()
-    if has_asked:
-        _print_understanding(dialogue.understanding)
-    dialogue.understanding.campaign(folder.resolve().name)  # wrong files are told before
-    if has_asked:
-        dialogue.print_repetition()
-    if not dialogue.confirm(f"Write {folder}?"):
-        terminal.say("Nothing was written.")
-        raise typer.Exit(1)
-    return dialogue.understanding
-
-
-def _campaign_size(campaign: "Campaign") -> str:
-    """Return how many trials and channels a campaign has, as a text."""
-    trials = counted(len(campaign.trials), "trial")
-    return f"{trials}, {counted(len(campaign.channels), 'channel')}"
-
-
-def _held_out_answer(text: str) -> str:
-    """Return FILE=yes or FILE=no for the text of `--held-out`, which may be FILE alone."""
-    return text if text.endswith(("=yes", "=no")) else f"{text}=yes"
-
-
-def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
-    """Return the values of an option by subject.
-
-    Parameters
-    ----------
-    texts : sequence of str
-        The texts of the option, each SUBJECT=VALUE or VALUE. The subject is a column or a file; it
-        is the empty text for a value that holds for all of them.
-    """
-    answers = {}
-    for text in texts:
-        subject, _, value = text.rpartition("=")
-        answers[subject] = value
-    return answers
-
-
-def _understand_files(
-    files: list[Path], answers: dict[str, dict[str, str]], model: str | None
-) -> "LaboratoryImport":
-    """Read a laboratory's files, and return their import with the answers of the user.
-
-    Parameters
-    ----------
-    files : list of Path
-        The files.
-    answers : dict of str to (dict of str to str)
-        The values of the options, by the name of the option and then by its subject, which is a
-        column or a file.
-    model : str or None
-        The name or the file of a model. Columns with the name of an output of the model are
-        understood as measurements of this output. The model is loaded only after the files were
-        read, so that their mistakes are found first.
-    """
-    from discrepancy.campaign.importing import LaboratoryImport
-    from discrepancy.campaign.sheet import read_sheet
-    from discrepancy.model_choice import choose_model
-
-    sheets = [read_sheet(file) for file in files]
-    understanding = LaboratoryImport(sheets, answers)
-    if model is None:
-        return understanding
-    chosen_model = choose_model(model).model
-    return LaboratoryImport(
-        understanding.sheets,
-        answers,
-        chosen_model.output_quantity,
-        chosen_model.outputs_with_quantities,
-    )
-
-
-_DECIMAL_MARKS = {".": "points", ",": "commas"}
-"""The word for each decimal mark in the printed table."""
-
-
-def _print_understanding(understanding: "LaboratoryImport") -> None:
-    """Print how each file and each column is understood.
-
-    The row of a column has an example: its first cell that is not zero, or its last cell, and the
-    value of this cell in SI units.
-    """
-    for sheet in understanding.sheets:
-        kind = understanding.kinds[sheet.name] or "?"
-        decimal_mark = _DECIMAL_MARKS.get(understanding.decimals[sheet.name], "?")
-        terminal.say(f"{sheet.name}: {kind}; {sheet.remark}; decimal {decimal_mark}")
-    for sentence in understanding.clock_sentences:
-        terminal.say(sentence)
-    rows = []
-    for column in understanding.columns:
-        sheet = column.sheet
-        cells = sheet.columns[sheet.heads.index(column.head)]
-        # The decimal mark may be unknown, so that cells are texts: not zero means a digit 1 to 9
-        nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
-        row = nonzero_rows[0] if nonzero_rows else -1
-        si_value = column.cells_in_si(understanding.decimals[sheet.name])[row]
-        rows.append(
-            (
-                sheet.name,
-                column.head,
-                column.unit or "?",
-                column.role or "?",
-                column.quantity or "",
-                cells[row],
-                f"{float(si_value):.6g} {column.si}" if si_value else "",
-            )
-        )
-    if rows:
-        headings = ("file", "column", "unit", "is", "quantity", "a cell", "in SI")
-        terminal.print_table(headings, rows)
 
 
 def effects(
@@ -498,13 +150,19 @@ def example(
             patch = patch + _patch_of_hidden_effect(text, chosen_model, plain_campaign)
     campaign = write_example(chosen_model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
-    arguments = _shell_arguments(out, model)
-    terminal.say(f"Wrote {out}: {_campaign_size(campaign)}; hidden: {hidden}.")
+    arguments = shell_arguments(out, model)
+    terminal.say(f"Wrote {out}: {campaign_size(campaign)}; hidden: {hidden}.")
     terminal.say(f"Next: uav-twin discrepancy check {arguments}")
     terminal.say(f"Then: uav-twin discrepancy run {arguments}")
 
 
-def _shell_arguments(campaign: Path, model: str | None) -> str:
+def campaign_size(campaign: "Campaign") -> str:
+    """Return how many trials and channels a campaign has, as a text."""
+    trials = counted(len(campaign.trials), "trial")
+    return f"{trials}, {counted(len(campaign.channels), 'channel')}"
+
+
+def shell_arguments(campaign: Path, model: str | None) -> str:
     """Return a campaign and its model as the arguments of a further command."""
     model_option = [] if model is None else ["--model", model]
     return shlex.join([str(campaign), *model_option])

@@ -1,7 +1,7 @@
 """`uav-twin discrepancy run`, `check` and `apply`: a verdict on a campaign, a patched model.
 
 `check` says what a campaign can decide before anything is fitted. The commands that make campaigns
-are in `discrepancy_campaigns`.
+are in `discrepancy_import` and `discrepancy_campaigns`.
 """
 
 import dataclasses

@@ -50,9 +50,7 @@ def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = T
     process, which a χ² against the noise is meant to show. The noise of a channel without a record
     is estimated from the residuals of the fitted trials.
     """
-    precision = np.where(
-        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
-    )
+    precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
     predictions = _TrialPredictions(problem, fit, fit, precision)
     trials = predictions.fitted_trials(sensitivities=sensitivities)
     if problem.campaign.held_out:

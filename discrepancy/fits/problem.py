@@ -439,6 +439,19 @@ class Problem:
             precisions = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + bounded_sums))
         return np.where(n > 0, precisions, 1.0)
 
+    def recorded_or_estimated_precisions(self, squares: FloatArray) -> FloatArray:
+        """Return the noise precision of each channel over the recorded one.
+
+        It is 1 for a channel with a noise record. The noise of other channels is estimated from
+        their residuals, see `noise_precisions`.
+
+        Parameters
+        ----------
+        squares : (channels,) array
+            The sum of squared standardised residuals of each channel.
+        """
+        return np.where(self.record_freedom > 0.0, 1.0, self.noise_precisions(squares))
+
     # -------------------------------------------------------------------------- other problems
 
     def with_trials(self, trials: Sequence[Trial], model: Model | None = None) -> "Problem":

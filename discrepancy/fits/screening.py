@@ -110,9 +110,10 @@ class Screen:
     ) -> None:
         self.problem = problem
         self.fit = fit
-        precision = problem.noise_precisions(fit.squares_by_channel)
         if record_noise:
-            precision = np.where(problem.record_freedom > 0.0, 1.0, precision)
+            precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
+        else:
+            precision = problem.noise_precisions(fit.squares_by_channel)
         eliminated_effects = Candidate() if effect_precision is None else fit.candidate
         equations = normal_equations(problem, fit, eliminated_effects, precision, effect_precision)
         self._trials = equations.trials

@@ -22,6 +22,9 @@ from .sensor_estimates import sensor_estimates
 
 MOVED_DEVIATIONS = 2.0
 """Distance from the stated value, in stated deviations, above which an unknown is reported."""
+GAIN_OF = "gain of "
+ZERO_OF = "zero of "
+"""With what the name of a gain, or of a zero, begins."""
 LEAST_MOVE_WITHIN_PRIOR = 1.0
 """Distance from the stated value, in stated deviations, above which a move may use up a prior."""
 LEAST_RELATIVE_MOVE = 0.02
@@ -98,8 +101,18 @@ def unknowns_moved_within_prior(problem: Problem, fit: CandidateFit) -> tuple[Mo
 def _sensor_name(estimate: SensorEstimate) -> str:
     """Return the name of a gain or zero, as `MovedUnknown.name` has it."""
     if estimate.kind is SensorValue.GAIN:
-        return f"gain of {estimate.channel}"
-    return f"zero of {estimate.channel} in {estimate.trial!r}"
+        return _name_of_gain(estimate.channel)
+    return _name_of_zero(estimate.channel, estimate.trial)
+
+
+def _name_of_gain(channel: str) -> str:
+    """Return the name of the gain of a channel."""
+    return f"{GAIN_OF}{channel}"
+
+
+def _name_of_zero(channel: str, trial: str) -> str:
+    """Return the name of the zero of a channel in a trial."""
+    return f"{ZERO_OF}{channel} in {trial!r}"
 
 
 def _reference_sizes(problem: Problem) -> dict[str, float]:
@@ -108,14 +121,15 @@ def _reference_sizes(problem: Problem) -> dict[str, float]:
     It is the stated value of a parameter, one for a gain, and the largest reading for a zero.
     """
     layout = problem.shared
-    sizes = {f"gain of {channel}": 1.0 for channel in layout.gain_channels}
+    sizes = {_name_of_gain(channel): 1.0 for channel in layout.gain_channels}
+    # the centres of gains follow those of the parameters
     for parameter, centre in zip(problem.model.parameters, layout.centre, strict=False):
         sizes[parameter.name] = abs(float(centre))
     for data in problem.trials:
         for column, channel in enumerate(data.trial.channels):
             readings = data.trial.values[data.trial.used[:, column], column]
             largest_reading = float(np.max(np.abs(readings), initial=0.0))
-            sizes[f"zero of {channel} in {data.trial.name!r}"] = largest_reading
+            sizes[_name_of_zero(channel, data.trial.name)] = largest_reading
     return sizes
 
 
@@ -152,7 +166,9 @@ def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
         if layout.precision[shared_number] > 0.0:
             scaled_value = float(fit.point.shared[shared_number])
             scale = float(layout.scale[shared_number])
-            unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", scaled_value, scale, "1"))
+            unknowns.append(
+                _unknown_stated_as_zero(_name_of_gain(channel), scaled_value, scale, "1")
+            )
     return unknowns
 
 
@@ -180,7 +196,7 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
     for column in data.unknowns.zero_columns:
         channel = trial.channels[column]
         unit = UNITS[problem.campaign.channels[channel].quantity].si
-        names_and_units.append((f"zero of {channel} in {trial.name!r}", unit))
+        names_and_units.append((_name_of_zero(channel, trial.name), unit))
     for row in data.unknowns.offset_inputs:
         recorded_input = trial.inputs[row]
         unit = UNITS[recorded_input.quantity].si
@@ -200,7 +216,7 @@ def _unknown_stated_as_zero(
     scaled_value : float
         The scaled value of the unknown in the fit.
     scale : float
-        Its stated standard deviation [unit].
+        The stated standard deviation of the unknown [unit].
     unit : str
         The unit of the unknown.
     """
@@ -269,12 +285,12 @@ def _moved_text(unknown: MovedUnknown) -> str:
     deviation = unknown.deviation
     distance = f"{abs(unknown.deviations):.1f} deviations"
     unit = "" if unknown.unit == "1" else f" {unknown.unit}"
-    if name.startswith("gain of "):
+    if name.startswith(GAIN_OF):
         stated_text = f"stated to {100.0 * deviation:.3g} %"
         return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance})"
     if unknown.stated == 0.0:
         factor = 1.0
-        if name.startswith("zero of ") and unknown.unit == UNITS[Quantity.STRAIN].si:
+        if name.startswith(ZERO_OF) and unknown.unit == UNITS[Quantity.STRAIN].si:
             factor, strain_unit = UNITS[Quantity.STRAIN].drawn
             unit = f" {strain_unit}"
         return (

@@ -11,9 +11,10 @@ It grows with n only until the unknowns imitate the change. Then their prior dev
 and neither less noise nor more trials of the same kind help.
 """
 
-from math import inf, sqrt
+from math import inf
 
 import numpy as np
+from scipy.optimize import brentq
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.campaign.units import UNITS
@@ -44,9 +45,7 @@ class NoiseForecast:
     """
 
     def __init__(self, problem: Problem, fit: CandidateFit) -> None:
-        noise_precision = np.where(
-            problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
-        )
+        noise_precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
         equations = normal_equations(problem, fit, Candidate(), noise_precision)
         self._trials = equations.trials
         self._information = np.zeros_like(equations.matrix)
@@ -70,18 +69,16 @@ class NoiseForecast:
         float
             The factor; infinite if `LARGEST_NOISE_FACTOR` is not enough.
         """
-        low = 1.0
-        high = LARGEST_NOISE_FACTOR
-        if self._squared_distance(change, high) < detection_distance:
+
+        def excess(noise_factor: float) -> float:
+            return self._squared_distance(change, noise_factor) - detection_distance
+
+        # the excess grows with the factor, so that it has one zero at most
+        if excess(LARGEST_NOISE_FACTOR) < 0.0:
             return inf
-        # the distance grows with the factor, so bisection finds where it reaches the wanted one
-        while high / low > 1.001:
-            middle = sqrt(low * high)
-            if self._squared_distance(change, middle) < detection_distance:
-                low = middle
-            else:
-                high = middle
-        return high
+        if excess(1.0) >= 0.0:
+            return 1.0
+        return float(brentq(excess, 1.0, LARGEST_NOISE_FACTOR, rtol=1e-3))
 
     def imitating_unknowns(self, change: ScreenedChange) -> tuple[str, ...]:
         """Return the unknowns that imitate the change by an effect at much smaller noise.

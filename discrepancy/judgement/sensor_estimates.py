@@ -25,10 +25,7 @@ def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimat
         The fit, with the posterior covariance of what the trials share.
     """
     estimates = _gain_estimates(problem, fit)
-    # a channel without a noise record has the noise that its residuals show
-    noise_precision = np.where(
-        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fit.squares_by_channel)
-    )
+    noise_precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
     for trial_index in range(len(problem.trials)):
         estimates += _zero_estimates(problem, fit, trial_index, noise_precision)
     order = list(problem.campaign.channels)

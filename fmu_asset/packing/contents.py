@@ -296,7 +296,7 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Put the hash of an FMU's files in the place of the placeholder, and pack the files.
+    """Replace the placeholder in an FMU's files by their hash, and pack the files.
 
     The hash is taken over the names and contents of the files with the placeholder, so that equal
     files give equal bytes.

@@ -14,7 +14,6 @@ from tests.command_line import command, refused, said
 
 MODEL = "single_mass_rig"
 RIG = ("--model", MODEL)
-COLUMNS = ("--column", "Weg=displacement", "--column", "Dehnung=leaf_strain")
 
 
 @pytest.fixture(autouse=True)

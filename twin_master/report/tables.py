@@ -60,7 +60,8 @@ def add_figures_table(page: Page, run: Run) -> None:
     has_references = any(figure.reference is not None for figure in figures)
     columns = [PageColumn("result"), number_column("this run"), PageColumn("unit")]
     if has_references:
-        columns += [number_column("reference"), PageColumn("source of the reference")]
+        # a reference may be a text, such as "at most 2 steps", which has to wrap
+        columns += [PageColumn("reference"), PageColumn("source of the reference")]
     rows = []
     for figure, printed_figure in zip(figures, printed_figures(figures), strict=True):
         row = [figure.title, printed_figure.value, figure.unit]

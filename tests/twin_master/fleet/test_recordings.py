@@ -24,13 +24,6 @@ from twin_master.fleet.reading import group_figures
 from twin_master.fleet.report import write_fleet_report
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
 
-
-@pytest.fixture
-def fleet_file(library_file: Path, tmp_path: Path) -> Path:
-    """A fleet of three wings with a recording each."""
-    return write_fleet(library_file, tmp_path)
-
-
 NOTICES = ("alarm", "gauge_left_out")
 
 

@@ -40,12 +40,6 @@ from uav_twin import fly_fleet, open_fleet
 
 
 @pytest.fixture
-def fleet_file(library_file: Path, tmp_path: Path) -> Path:
-    """A fleet of three wings with a recording each."""
-    return write_fleet(library_file, tmp_path)
-
-
-@pytest.fixture
 def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
     """The journals of watches of one asset alone."""
     return watch_alone(tmp_path)
