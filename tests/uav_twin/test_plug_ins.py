@@ -18,7 +18,6 @@ from fe.runtime.plug_ins import find_plug_in, load_plug_ins
 from tests.kept import ROOT
 from twin_master.errors import MissionInputError
 from twin_master.mission.parts import object_by_name
-from twin_master.scenario.kinds import AssetSection, check_installed_kinds
 
 EXAMPLE = ROOT / "docs" / "how_to" / "add" / "example_plug_in"
 
@@ -26,12 +25,13 @@ USE_OF_ALL = """
 import json
 import sys
 
+import discrepancy.document
 import uav_twin
 from discrepancy.catalogue.library import load_catalogue
 from fe.runtime.laws import LAWS, force_and_slope
 from fe.runtime.patch import ModelPatch
 
-row = {"kind": "saturating_spring", "port": "root", "limit": 2.0, "half_width": 0.1}
+row = {"kind": "saturating_spring", "port": "root", "limit": 2.0, "transition": 0.1}
 (law,) = ModelPatch.from_list([row])
 force, slope = force_and_slope(LAWS.index(type(law)), law.parameter_row, None, 0.05, 0.0)
 parts = {"sensor_model": "student", "estimator": "wary"}
@@ -134,30 +134,6 @@ def test_two_plug_ins_with_one_name_are_refused_with_their_packages(packages):
         load_plug_ins("g")
 
 
-@pytest.mark.parametrize(
-    ("name", "module", "sentence"),
-    [
-        ("number", "Kind = 3", "must be a subclass of AssetSection, but is 3"),
-        ("other", "kind = 'rod'", "has another name than its kind, 'rod'"),
-        ("design", "kind = 'design'", "has the kind 'design', which uav-twin has itself"),
-    ],
-)
-def test_kinds_of_assets_that_do_not_fit_are_refused(packages, name, module, sentence):
-    package = f"kinds_of_{name}"
-    if module != "Kind = 3":
-        module = (
-            "from typing import Literal\n"
-            "from twin_master.scenario.kinds import AssetSection\n"
-            f"class Kind(AssetSection):\n    {module.replace('kind =', 'kind: str =')}\n"
-            "    def source(self, scenario):\n        raise NotImplementedError\n"
-        )
-    AssetSection.kinds()  # the shipped kinds are known first
-    install(packages, package, f"[uav_twin.assets]\n{name} = {package}:Kind\n", module)
-
-    with pytest.raises(PlugInError, match=f"{package} 1.0 {sentence}"):
-        check_installed_kinds.__wrapped__(AssetSection)
-
-
 def test_an_effect_that_is_no_function_is_refused(packages):
     install(packages, "no_function", "[uav_twin.effects]\nx = no_function:x\n", "x = 3")
 
@@ -172,20 +148,49 @@ def test_a_broken_estimator_is_refused_with_its_package(packages):
         object_by_name("estimator", "wary")
 
 
+KIND = """
+from typing import Literal
+
+from twin_master.scenario.kinds import AssetSection
+
+
+class Kind(AssetSection):
+    kind: Literal["{0}"] = "{0}"
+
+    def source(self, scenario):
+        raise NotImplementedError
+"""
+
+
 @pytest.mark.parametrize(
-    ("name", "law", "sentence"),
+    ("point", "module", "command", "sentence"),
     [
-        ("free_play", "class FreePlay(PortForce): pass", "'free_play', which uav-twin has itself"),
-        ("spring", "class Stop(PortForce): pass", "must be named 'stop', as its law is"),
+        (
+            "[uav_twin.laws]\nspring = misfit:Stop",
+            "from fe.runtime.laws.interface import PortForce\nclass Stop(PortForce): pass\n",
+            "discrepancy effects",
+            "in the package misfit 1.0 must be named 'stop', as its law is",
+        ),
+        (
+            "[uav_twin.assets]\ndesign = misfit:Kind",
+            KIND.format("design"),
+            "scenario check level_turns",
+            "in the package misfit 1.0 has the kind 'design', which uav-twin has itself",
+        ),
+        (
+            "[uav_twin.beliefs]\nrod = misfit:Kind",
+            KIND.format("rod"),
+            "scenario check level_turns",
+            "in the package misfit 1.0 must be a subclass of BeliefSection, but is",
+        ),
     ],
 )
-def test_laws_that_do_not_fit_are_refused_in_one_sentence(tmp_path, name, law, sentence):
-    attribute = "FreePlay" if name == "free_play" else "Stop"
-    module = f"from fe.runtime.laws.interface import PortForce\n{law}\n"
-    install(tmp_path, "stops", f"[uav_twin.laws]\n{name} = stops:{attribute}\n", module)
+def test_what_does_not_fit_is_refused_in_one_sentence(tmp_path, point, module, command, sentence):
+    """In a process of its own, because classes stay known as long as their process lives."""
+    install(tmp_path, "misfit", point, module)
 
     run = subprocess.run(
-        [sys.executable, "-m", "uav_twin", "discrepancy", "effects"],
+        [sys.executable, "-m", "uav_twin", *command.split()],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,
         text=True,

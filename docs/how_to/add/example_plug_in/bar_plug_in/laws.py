@@ -11,12 +11,12 @@ class SaturatingSpring(PortForce):
     """A spring whose force approaches a limit: F = F0 tanh(x / h)."""
 
     limit: Annotated[float, "N or N m"]
-    half_width: Annotated[float, "m or rad", POSITIVE]
+    transition: Annotated[float, "m or rad", POSITIVE]
 
     @staticmethod
     def force_and_slope(law, memory, x, duration):
         """Return the force at `x` and its derivative by `x`."""
         limit = law[0]
-        half_width = law[1]
-        ratio = np.tanh(x / half_width)
-        return limit * ratio, limit * (1.0 - ratio * ratio) / half_width
+        transition = law[1]
+        ratio = np.tanh(x / transition)
+        return limit * ratio, limit * (1.0 - ratio * ratio) / transition
