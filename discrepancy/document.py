@@ -17,6 +17,7 @@ from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchem
 
 from discrepancy.errors import VerdictFileError
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
 from reporting.format_schema import (
@@ -167,7 +168,13 @@ Patch = Annotated[
     WithJsonSchema(
         {
             "type": "array",
-            "items": {"oneOf": [_primitive_schema(primitive) for primitive in PRIMITIVES.values()]},
+            "items": {
+                "oneOf": [
+                    _primitive_schema(primitive)
+                    for primitive in PRIMITIVES.values()
+                    if primitive not in INSTALLED_LAWS  # editors know the shipped laws only
+                ]
+            },
         }
     ),
 ]

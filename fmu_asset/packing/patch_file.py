@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import NamedTuple, TypedDict
 
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import (
     EVERY_CHANNEL,
     SENSORS,
@@ -290,6 +291,12 @@ def _read_effect(row: Mapping[str, object], number: int, file_label: str) -> Pat
                 raise PatchFileError(
                     f"{file_label}: the effect {effect_id!r} is bound to the time of trials "
                     f"({primitive.kind}), which means nothing in an FMU: leave it out."
+                )
+            if isinstance(primitive, INSTALLED_LAWS):
+                raise PatchFileError(
+                    f"{file_label}: the effect {effect_id!r} has the law {primitive.kind!r} of an "
+                    "installed package, but an FMU has the laws of uav-twin only: leave it out, or "
+                    "add the law to fe/runtime/laws."
                 )
             if isinstance(primitive, PortForce) and primitive.magnitude:
                 primitive.check()
