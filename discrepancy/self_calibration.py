@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -30,6 +29,7 @@ from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import check_and_prepare, investigate
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"
@@ -401,7 +401,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
     return atomic_write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str, Any]:
+def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> JsonObject:
     """Return the proportions of all outcomes as plain data, by outcome.
 
     Parameters
@@ -417,7 +417,7 @@ def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str
     return table
 
 
-def _proportion_table(proportion: Proportion) -> dict[str, Any]:
+def _proportion_table(proportion: Proportion) -> JsonObject:
     """Return a proportion as plain data."""
     return {**plain_data(proportion), "share": plain_data(proportion.value)}
 

@@ -7,7 +7,7 @@ modes is split into them by bands of its spectrum.
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from discrepancy.location.map import (
     normal_equations_of,
 )
 from discrepancy.location.residuals import FittedTrial
+from reporting.arrays import AnyArray
 
 
 def mode_bands(frequencies: Sequence[float]) -> list[tuple[float, float]]:
@@ -116,22 +117,29 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     """
     longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
     count = len(longest_trial.time)
-    power = np.zeros((count - 1) // 2)
+    frequency_count = (count - 1) // 2
+    # the falling half of a Hann window, because most of a ring-down is at its start
+    taper = np.hanning(2 * count)[count:, np.newaxis]
+    # power of all channels and trials over their noise, without the constant
+    power = np.zeros(frequency_count)
     for fitted_trial in trials:
-        interval_ratio = fitted_trial.trial.interval / longest_trial.interval
-        if len(fitted_trial.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
+        trial = fitted_trial.trial
+        interval_ratio = trial.interval / longest_trial.interval
+        if len(trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
         values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)
-        # the falling half of a Hann window, because most of a ring-down is at its start
-        taper = np.hanning(2 * count)[count:, np.newaxis]
-        spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted_trial.noise_deviation**2
-        power += spectra[1 : power.size + 1].sum(axis=1)
-    frequencies = np.arange(1, power.size + 1) / (count * longest_trial.interval)
+        transform = np.fft.rfft(values * taper, axis=0)
+        spectra = np.abs(transform) ** 2 / fitted_trial.noise_deviation**2
+        power += spectra[1 : frequency_count + 1].sum(axis=1)
+    frequencies = np.arange(1, frequency_count + 1) / (count * longest_trial.interval)
+    # peaks
+    least_power = 1e-3 * power.max(initial=0.0)
     peaks = []
-    for index in range(3, power.size - 1):  # index 3 is four periods in the record
+    for index in range(3, frequency_count - 1):  # index 3 is four periods in the record
         frequency = float(frequencies[index])
         is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
-        if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
+        is_highest = power[index] >= power[is_neighbour].max()
+        if is_highest and power[index] > least_power:
             peaks.append((float(power[index]), frequency))
     highest_peaks = sorted(peaks, reverse=True)[:4]
     return tuple(sorted(frequency for _, frequency in highest_peaks))
@@ -402,7 +410,7 @@ class _UsedSamples:
         """
         return self.stack_arrays([values(fitted_trial) for fitted_trial in self.trials])
 
-    def stack_arrays(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def stack_arrays(self, arrays: Sequence[AnyArray]) -> AnyArray:
         """Return arrays (N, ...) of the trials at the used samples, stacked (n, ...)."""
         is_used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
         return np.concatenate(is_used)
