@@ -1,6 +1,6 @@
 """A lumped linear structure as a model, with named inputs, outputs and ports."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import ClassVar
@@ -353,14 +353,18 @@ class LumpedModel(DescribedModel, SystemModel):
     def port_units(self, port: str) -> tuple[str, str]:
         """Return the units of the force and of the motion at a port, `EITHER` if not known.
 
-        A port that is a sum or difference of unknowns has their unit (length or angle), and an
-        unknown has the unit of an output or an input that measures or prescribes it alone.
+        A port that an output or an input measures or prescribes has its unit. A port that is a sum
+        or difference of unknowns has their unit (length or angle), and an unknown has the unit of
+        an output or an input that measures or prescribes it alone.
         """
         row = self.port_rows.get(port)
         if row is None:
             return EITHER
         if not np.any(row[: self.description.displacement_count]):
             return self._units_of_state_port()
+        units_of_same_motion = self._units_of_motion(row)
+        if len(units_of_same_motion) == 1:
+            return units_of_same_motion.pop()
         if not np.all(np.isin(row, (-1.0, 0.0, 1.0))):
             return EITHER
         units_by_unknown = self._units_by_unknown()
@@ -386,15 +390,37 @@ class LumpedModel(DescribedModel, SystemModel):
         More than one pair of units for an unknown means that the file contradicts itself.
         """
         units: dict[int, set[tuple[str, str]]] = {}
+        for vector, units_of_vector in self._measured_motions():
+            if np.count_nonzero(vector) == 1 and max(vector) == 1.0:
+                units.setdefault(vector.index(1.0), set()).add(units_of_vector)
+        return units
+
+    def _units_of_motion(self, row: FloatArray) -> set[tuple[str, str]]:
+        """Return the units of the outputs and inputs whose motion is row . u, or its opposite.
+
+        Parameters
+        ----------
+        row : (n,) array
+            The motion of a port in the unknowns.
+        """
+        return {
+            units
+            for vector, units in self._measured_motions()
+            if np.array_equal(vector, row) or np.array_equal(np.negative(vector), row)
+        }
+
+    def _measured_motions(self) -> Iterator[tuple[tuple[float, ...], tuple[str, str]]]:
+        """Yield the vector of each motion that an output measures or an input prescribes.
+
+        The units of force and motion in its direction follow each vector.
+        """
         sections: list[InputSection | OutputSection] = [*self.description.output]
         sections += self.description.input
         for section in sections:
-            vector = section.vector or ()
-            moving = section.quantity.motion_chain
-            if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
-                unit = TURNS if Quantity.ANGLE in moving else MOVES
-                units.setdefault(vector.index(1.0), set()).add(unit)
-        return units
+            quantities_of_motion = section.quantity.motion_chain
+            if section.vector and quantities_of_motion:
+                units = TURNS if Quantity.ANGLE in quantities_of_motion else MOVES
+                yield tuple(section.vector), units
 
     # ------------------------------------------------------------ matrices
 

@@ -177,6 +177,6 @@ def loaded_steps(
         residual_position=residual_position,
         time=boundaries.time,
         sample_boundary=boundaries.sample_boundary,
-        stiffness=system.stiffness,
+        stiffness=np.ascontiguousarray(system.full_stiffness),
         damping=np.ascontiguousarray(system.damping),
     )
