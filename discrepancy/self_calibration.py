@@ -134,8 +134,23 @@ class SelfCalibration:
         null : bool
             True for campaigns in which nothing was hidden.
         """
-        cases = [case for case in self.cases if (case.hidden == NOTHING) is null]
-        return wilson_interval(sum(case.outcome == outcome for case in cases), len(cases))
+        outcomes = self.outcomes(null=null)
+        return wilson_interval(outcomes.count(outcome), len(outcomes))
+
+    def outcomes(self, *, null: bool) -> list[str]:
+        """Return the outcome of each campaign with a hidden effect, or of each one without.
+
+        Parameters
+        ----------
+        null : bool
+            True for campaigns in which nothing was hidden.
+        """
+        outcomes = []
+        for case in self.cases:
+            hides_nothing = case.hidden == NOTHING
+            if hides_nothing == null:
+                outcomes.append(case.outcome)
+        return outcomes
 
     def coverage(self) -> Proportion:
         """Return the fraction of 90 % intervals of named effects that contain the true value."""
@@ -432,8 +447,8 @@ def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[s
     null : bool
         True for campaigns in which nothing was hidden.
     """
-    occurred = {case.outcome for case in self_calibration.cases if (case.hidden == NOTHING) is null}
-    return [name for name in _OUTCOMES_IN_ORDER if name in occurred or name in ("right", "wrong")]
+    shown_outcomes = {"right", "wrong", *self_calibration.outcomes(null=null)}
+    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in shown_outcomes]
 
 
 _OUTCOMES_IN_ORDER = (

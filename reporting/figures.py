@@ -387,7 +387,8 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
     title : str
         A few words after the letter.
     """
-    axes.set_title("  ".join(text for text in (label, title) if text), loc="left")
+    stated_texts = [text for text in (label, title) if text]
+    axes.set_title("  ".join(stated_texts), loc="left")
 
 
 def to_svg(figure: Figure) -> bytes:

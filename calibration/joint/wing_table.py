@@ -270,8 +270,9 @@ def _interpolating_coefficients(
         The coefficients of ln f1 and ln f2.
     """
     x, y, z = nodes.T
-    # Each row of the matrix holds the products of the polynomials at one node.
-    coefficients = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequencies))
+    # each row of the matrix holds the products of the polynomials at one node
+    polynomials_at_nodes = chebvander3d(x, y, z, degrees)
+    coefficients = np.linalg.solve(polynomials_at_nodes, np.log(frequencies))
     counts = [degree + 1 for degree in degrees]
     return np.asarray(coefficients.reshape(*counts, 2))
 

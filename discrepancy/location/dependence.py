@@ -370,7 +370,8 @@ def dependence_bases(
     }
     temperature = samples.stack_used_samples(lambda fitted: fitted.trial.temperature)
     if np.ptp(temperature) > 0.0:
-        proportional = temperature * samples.prediction_features("x")[:, 0]
+        x = samples.prediction_features("x").squeeze(axis=1)
+        proportional = temperature * x
         bases["", "temperature"] = np.column_stack([temperature, proportional])
     if trials[0].trial.is_dynamic:
         return bases | _dynamic_bases(samples, modes)
@@ -428,8 +429,10 @@ class _UsedSamples:
         (n, k T) ndarray
             Block diagonal: the columns of a trial are zero at the samples of the others.
         """
-        ends = np.cumsum([int(rows.sum()) for rows in self.rows])
-        return np.asarray(block_diag(*np.split(functions, ends[:-1])))
+        used_counts = [int(rows.sum()) for rows in self.rows]
+        starts_of_next_trials = np.cumsum(used_counts)[:-1]
+        functions_by_trial = np.split(functions, starts_of_next_trials)
+        return np.asarray(block_diag(*functions_by_trial))
 
     def prediction_features(self, *names: str) -> FloatArray:
         """Return functions of the prediction at the n used samples of all trials, side by side.
@@ -437,19 +440,15 @@ class _UsedSamples:
         They are zero in a trial that lacks them. The names, such as "x", are those of
         `discrepancy.location.map.dependence_functions`.
         """
-        widths = [
-            feature.shape[1]
-            for features_of_trial in self._features
-            for name, feature in features_of_trial.items()
-            if name in names
-        ]
-        width = max(widths, default=1)
+        width = 1
+        for features_of_trial in self._features:
+            for name in features_of_trial.keys() & set(names):
+                width = max(width, features_of_trial[name].shape[1])
         stacked_features = []
         for features_of_trial, rows in zip(self._features, self.rows, strict=True):
             zeros = np.zeros((int(rows.sum()), width))
-            stacked_features.append(
-                np.hstack([features_of_trial.get(name, zeros) for name in names])
-            )
+            features = [features_of_trial.get(name, zeros) for name in names]
+            stacked_features.append(np.hstack(features))
         return np.vstack(stacked_features)
 
 
@@ -466,7 +465,7 @@ def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
         bases["", "time"] = np.column_stack([np.ones_like(time), time - time.mean()])
     load = samples.stack_used_samples(lambda fitted: fitted.trial.load)
     if np.ptp(load) > 0.0:
-        x = samples.prediction_features("x")[:, 0]
+        x = samples.prediction_features("x").squeeze(axis=1)
         bases["", "load (proportional)"] = np.column_stack([x, load])
         not_proportional = [load, np.abs(load) * load, load**2]
         bases["", "load (not proportional)"] = np.column_stack(not_proportional)

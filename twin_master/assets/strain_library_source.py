@@ -308,7 +308,8 @@ class StrainLibrarySource(AssetSource):
         """
         states = [tuple(state) for state in model.states.coordinates]
         rows = [self._library.states.index(state) for state in states]
-        return self._library.strain_per_draw[:, rows][:, :, self._control_indices]
+        strain_of_states = self._library.strain_per_draw[:, rows]
+        return strain_of_states[:, :, self._control_indices]
 
     def open(self) -> Asset:
         """Return an asset with the strains at the mean of the parameter, noise-free.

@@ -172,8 +172,10 @@ class StateSpace:
         grid = table.reshape(*self.shape, *table.shape[1:])
         changes = []
         for axis, factor in enumerate(self.factors):
-            change = _change_within_interval(np.moveaxis(grid, axis, -1), factor.levels)
-            changes.append(np.moveaxis(change, -1, axis).reshape(table.shape))
+            levels_last = np.moveaxis(grid, axis, -1)
+            change = _change_within_interval(levels_last, factor.levels)
+            change_in_place = np.moveaxis(change, -1, axis)
+            changes.append(change_in_place.reshape(table.shape))
         return np.stack(changes, axis=-1)
 
     def marginal(self, belief: ArrayLike, name: str) -> Float:
