@@ -156,24 +156,23 @@ def _simpler_forms(candidate: Candidate, effect: FloatArray) -> list[_ValuedCand
     effect : (E,) array
         The scaled parameters of the set, which the forms inherit.
     """
-    valued_terms = candidate.split_by_term(effect)
     forms = []
-    for number, (term, values) in enumerate(valued_terms):
-        before, after = valued_terms[:number], valued_terms[number + 1 :]
-        if before or after:
-            forms.append([*before, *after])
-        if term.free_shape:
-            # the parameters of the shape follow those of the canonical law
-            canonical_term = replace(term, free_shape=False)
-            canonical_values = values[: len(canonical_term.parameters)]
-            forms.append([*before, (canonical_term, canonical_values), *after])
-    return [
-        _ValuedCandidate(
-            Candidate(tuple(term for term, _ in form)),
-            np.concatenate([values for _, values in form]),
-        )
-        for form in forms
-    ]
+    numbers = range(len(candidate.terms))
+    if len(numbers) > 1:
+        for left_out in numbers:
+            kept = [number for number in numbers if number != left_out]
+            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, effect)))
+    for number, term in enumerate(candidate.terms):
+        if not term.free_shape:
+            continue
+        canonical_term = replace(term, free_shape=False)
+        terms = list(candidate.terms)
+        terms[number] = canonical_term
+        values = [values for _, values in candidate.split_by_term(effect)]
+        # the parameters of the shape follow those of the canonical law
+        values[number] = values[number][: len(canonical_term.parameters)]
+        forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(values)))
+    return forms
 
 
 def _estimate_from_values(

@@ -325,6 +325,7 @@ class Search(FittedCandidates):
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
         if not self.best().candidate.has_free_shape:
+            self.fit_effects_at_several_places()
             self.add_effects()
         if not self.best().candidate.has_free_shape and self.is_unexplained():
             self.fit_pairs()
@@ -435,7 +436,9 @@ class Search(FittedCandidates):
             current_score = self.score(current_fit)
             present_identifiers = {term.effect.identifier for term in current_fit.candidate.terms}
             other_effects = [
-                effect for effect in self.effects if effect.identifier not in present_identifiers
+                effect
+                for effect in self.effects
+                if effect.identifier not in present_identifiers or effect.at_several_places
             ]
             rough_fits = self.fit_one_more_effect(current_fit, other_effects)
             floor_score = current_score - SEARCH.largest_longer_set_deficit
@@ -443,6 +446,35 @@ class Search(FittedCandidates):
             if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
             current_fit = exact_fits[0]
+
+    def fit_effects_at_several_places(self) -> None:
+        """Fit effects that may act at several places at once at more and more places.
+
+        At one place such an effect explains little if it acts at two, so that errors of sensors may
+        lead and no set with it would be tried. The places are therefore compared beside each other
+        whatever leads.
+        """
+        for effect in self.effects:
+            if not effect.at_several_places:
+                continue
+            single_fits = [
+                fit
+                for fit in (*self.exact_fits.values(), *self.rough_fits.values())
+                if [term.effect.identifier for term in fit.candidate.terms] == [effect.identifier]
+            ]
+            if not single_fits:
+                continue
+            current_fit = max(single_fits, key=self.score)
+            if current_fit is self.best() and not self.is_unexplained():
+                continue  # one place is enough
+            while len(current_fit.candidate.terms) < SEARCH.largest_set:
+                current_score = self.score(current_fit)
+                rough_fits = self.fit_one_more_effect(current_fit, [effect])
+                floor_score = current_score - SEARCH.largest_longer_set_deficit
+                exact_fits = self.fit_best_exactly(rough_fits, floor_score)
+                if not exact_fits or self.score(exact_fits[0]) <= current_score:
+                    break
+                current_fit = exact_fits[0]
 
     def move_effects(self) -> None:
         """Fit the best set with one effect at another place, until the set explains the data.

@@ -81,8 +81,8 @@ def test_the_simpler_forms_of_a_pair_keep_its_values(friction, number):
     counts = [len(term.parameters) for term in terms]
     values = [0.1 + np.arange(counts[0]), 10.1 + np.arange(counts[1])]
     forms = _simpler_forms(Candidate(tuple(terms)), np.concatenate(values))
-    alone, canonical = forms[2 * number : 2 * number + 2]
     other = 1 - number
+    alone, canonical = forms[number], forms[2 + number]
     assert alone.candidate.terms == (terms[other],)
     np.testing.assert_array_equal(alone.effect, values[other])
     assert [term.free_shape for term in canonical.candidate.terms] == [number == 1, number == 0]
