@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
     bytes
         Magic, version, arrays, CRC-32.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for field in fields(ReducedArrays):
         values[field.name] = getattr(model, field.name)
     names_to_choose = (model.parameters, model.regions, model.masses, model.controls)
@@ -61,9 +61,11 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
     values["gauge_count"] = len(model.gauges)
     arrays = {}
     for name, value in values.items():
-        is_array = not isinstance(value, str | tuple) and np.size(value) > 0
-        if is_array and name not in _NOT_IN_DATA_FILE:
-            arrays[name] = np.asarray(value, dtype=np.float64)
+        if isinstance(value, str | tuple) or name in _NOT_IN_DATA_FILE:
+            continue
+        array = np.asarray(value, dtype=np.float64)
+        if array.size:
+            arrays[name] = array
     return pack_arrays(arrays)
 
 

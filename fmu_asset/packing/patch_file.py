@@ -20,7 +20,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import INSTALLED_LAWS
@@ -38,7 +38,7 @@ from fe.runtime.patch import (
 )
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
-from fmu_asset.slaves.effects import output_channels
+from fmu_asset.slaves.effects import EffectRecord, output_channels
 from reporting.json_file import parse_json, read_json
 from reporting.words import small
 
@@ -69,13 +69,6 @@ class PatchFileEffect(NamedTuple):
 
     id: str
     patch: ModelPatch
-
-
-class EffectRecord(TypedDict):
-    """An effect as `fmu_asset.slaves.effects` takes it."""
-
-    id: str
-    primitives: list[dict[str, object]]
 
 
 @dataclass(frozen=True)

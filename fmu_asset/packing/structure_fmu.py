@@ -43,13 +43,13 @@ from fmu_asset.packing.contents import (
     with_identity,
     write_fmu,
 )
-from fmu_asset.slaves.effects import effect_rows, switch_name
+from fmu_asset.slaves.effects import EffectRecord, effect_rows, switch_name
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.choices import require_one_of
 from reporting.files import hash_members
 from reporting.progress import Progress
 
-from .patch_file import EffectRecord, PatchFile
+from .patch_file import PatchFile
 
 FmuKind = Literal["python", "compiled", "source"]
 """The evaluation of the model: by Python, by compiled C, or by C sources that are yet to be

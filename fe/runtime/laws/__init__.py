@@ -12,11 +12,10 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any
 
 from ..errors import PlugInError
 from ..plug_ins import load_plug_ins
-from .interface import PARAMETERS, PortForce
+from .interface import PARAMETERS, FloatArray, PortForce
 
 GROUP = "uav_twin.laws"
 """Group of the entry points of laws: the name is the kind of the law, the object is its class."""
@@ -64,21 +63,49 @@ LAWS = (*_OWN_LAWS, *INSTALLED_LAWS)
 """The classes of the laws, by number."""
 
 
-def functions_by_law(name: str) -> tuple[Callable[..., Any], ...]:
+def functions_by_law(name: str) -> tuple[Callable[..., object], ...]:
     """Return one function of the interface for each law, by the number of the law."""
     return tuple(getattr(law, name) for law in LAWS)
 
 
-def _function_of_numbered_law(name: str) -> Callable[..., Any]:
-    """Return a function that takes the number of a law, and calls that law's function."""
-    functions = functions_by_law(name)
+def advance(number: int, law: FloatArray, memory: FloatArray, x: float) -> None:
+    """Carry the memory of a law's hysteretic elements to the position `x`, in place.
 
-    def call(number: int, *arguments: Any) -> Any:
-        return functions[number](*arguments)
+    Parameters
+    ----------
+    number : int
+        Number of the law in `LAWS`.
+    law : (5 + E,) array
+        Parameters of the law, then those of its hysteretic elements.
+    memory : (5 + E,) array
+        Memory of the law; changed in place.
+    x : float
+        Position of the law's port [m or rad].
+    """
+    LAWS[number].advance(law, memory, x)
 
-    call.__name__ = name
-    return call
 
+def force_and_slope(
+    number: int, law: FloatArray, memory: FloatArray, x: float, duration: float
+) -> tuple[float, float]:
+    """Return the force of a law at a position or speed, and its derivative by that.
 
-advance = _function_of_numbered_law("advance")
-force_and_slope = _function_of_numbered_law("force_and_slope")
+    Parameters
+    ----------
+    number : int
+        Number of the law in `LAWS`.
+    law : (5 + E,) array
+        Parameters of the law, then those of its hysteretic elements.
+    memory : (5 + E,) array
+        Memory of the law; it is not changed.
+    x : float
+        Position [m or rad] of the law's port, or its speed for a law of speed.
+    duration : float
+        Time since the last position [s].
+
+    Returns
+    -------
+    force, slope : float
+        The force [N or N m] and its derivative.
+    """
+    return LAWS[number].force_and_slope(law, memory, x, duration)
