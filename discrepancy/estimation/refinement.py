@@ -94,8 +94,9 @@ def _estimate_simpler_forms(
     """Estimate the simpler forms of the best hypothesis, as long as one of them is better.
 
     A set may lead only because its fit reached the right values of one effect, and the fit of that
-    effect alone did not. The same holds for a law of free shape and its canonical shape. Each
-    simpler form of the best hypothesis is therefore estimated from the values of that hypothesis.
+    effect alone did not. The same holds for a law of free shape and the named laws of its family,
+    such as dry friction. Each simpler form of the best hypothesis is therefore estimated, beginning
+    with the motion of that hypothesis.
 
     Parameters
     ----------
@@ -124,7 +125,13 @@ def _estimate_simpler_forms(
     }
     best_hypothesis = ranked_hypotheses[0]
     while best_hypothesis.speed_window is not None:
-        for form in _simpler_forms(best_hypothesis.candidate, best_hypothesis.effect):
+        simpler_forms = [
+            *_named_laws_of_family(best_hypothesis, tuple(by_effects.values())),
+            *_simpler_forms(best_hypothesis.candidate, best_hypothesis.effect),
+        ]
+        # the values of the best hypothesis are preferred where both have the same effects
+        form_by_effects = {form.candidate.key: form for form in simpler_forms}
+        for form in form_by_effects.values():
             on_progress(f"estimating {form.candidate.description} together with the motion")
             simpler_hypothesis = _estimate_from_values(search, best_hypothesis, form)
             if simpler_hypothesis is None:
@@ -173,6 +180,36 @@ def _simpler_forms(candidate: Candidate, effect: FloatArray) -> list[_ValuedCand
         values[number] = values[number][: len(canonical_term.parameters)]
         forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(values)))
     return forms
+
+
+def _named_laws_of_family(
+    hypothesis: ForceHypothesis, other_hypotheses: Sequence[ForceHypothesis]
+) -> list[_ValuedCandidate]:
+    """Return the sets in which named laws stand in place of the laws of free shape of a hypothesis.
+
+    They are taken from the other hypotheses, with the values that these have. A set that has been
+    estimated with the motion is left out.
+
+    Parameters
+    ----------
+    hypothesis : ForceHypothesis
+        The hypothesis, some of whose laws may have a free shape.
+    other_hypotheses : sequence of ForceHypothesis
+        The hypotheses that were fitted.
+    """
+
+    def laws(candidate: Candidate) -> list[tuple[str, str]]:
+        return sorted((term.effect.family, term.place) for term in candidate.terms)
+
+    if not hypothesis.candidate.has_free_shape:
+        return []
+    return [
+        _ValuedCandidate(other.candidate, other.effect)
+        for other in other_hypotheses
+        if other.speed_window is None
+        and not other.candidate.has_free_shape
+        and laws(other.candidate) == laws(hypothesis.candidate)
+    ]
 
 
 def _estimate_from_values(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from discrepancy.estimation import refinement
 from discrepancy.estimation.effects import EffectLaws
 from discrepancy.estimation.estimator import MotionEstimator
 from discrepancy.estimation.gauss_newton import EstimatorStart
@@ -55,6 +56,16 @@ def test_friction_that_ends_a_motion_leads_over_a_free_exponent(friction):
     assert followed[0].candidate.identifiers != ("coulomb_friction",)  # along a motion taken as known
     ranked = refine_hypotheses(search, followed, len(effects))
     assert ranked[0].candidate.identifiers == ("coulomb_friction",)
+
+
+def test_a_named_law_is_estimated_if_a_free_shape_of_its_family_leads(friction, monkeypatch):
+    monkeypatch.setattr(refinement, "MOST_REFINED", 1)
+    search, effects = friction
+    followed = search.rank_hypotheses(effects, largest_set=1)
+    assert followed[0].candidate.has_free_shape
+    best, *_ = refine_hypotheses(search, followed, len(effects))
+    assert best.candidate.identifiers == ("coulomb_friction",)
+    assert best.speed_window is not None
 
 
 def test_an_effect_that_only_a_set_found_is_estimated_alone(tmp_path):
