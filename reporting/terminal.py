@@ -122,8 +122,8 @@ LONGEST_WORD = 14
 def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
     """Return a table without empty columns, for a terminal of a given width.
 
-    In a narrow terminal long words are broken after underscores and hyphens. The first column is
-    not wrapped if it has room, since it holds the names of the rows.
+    In a terminal narrower than `WIDE` long words may break at underscores and hyphens. The first
+    column is not wrapped if it has room, since it holds the names of the rows.
 
     Parameters
     ----------
@@ -146,8 +146,9 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
         cells = [_with_broken_words(row, first_column) for row in cells]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for column in shown_columns:
-        # Rich wraps the other columns if the first one may not be wrapped. It has room if the
-        # terminal is not too narrow and no line of it takes more than half of the width.
+        # Rich wraps the other columns if the first one must not be wrapped. The first column has
+        # room if the terminal is at least `NARROWEST` wide, and no line of the column takes more
+        # than half of the width.
         lines_of_column = [line for row in cells for line in row[column].split("\n")]
         longest_line = max(map(len, lines_of_column), default=0)
         has_room = width >= NARROWEST and longest_line <= width // 2

@@ -210,9 +210,10 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
     """Return the conversion of a unit to SI, in fractions.
 
     Names with SI prefixes are joined by `.`, `*`, `/` or a blank. A power follows its name (`m2`,
-    `m^2`, `s-1`, `m**2`); it is not 0, and 1 only after a caret: `A0` and `N1` are names of pins
-    and gauges. A `/` divides by the next name or parenthesis only, as in Modelica. An angle has the
-    unit rad, and a hertz is not 1 rad/s.
+    `m^2`, `s-1`, `m**2`). A power of 0 is refused, and a power of 1 is accepted as `^1` only,
+    because `A0` and `N1` are usually names of pins and gauges. A `/` divides by the next name or
+    parenthesis only, as in Modelica. The angle has a base unit of its own, rad, and a hertz is not
+    taken for 1 rad/s.
 
     Parameters
     ----------
@@ -233,7 +234,8 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
     known_units = _known_units()
     try:
         parsed = known_units.parse_units(text)
-        factor_to_grams, root_units = known_units.get_root_units(parsed)
+        # pint's root units have the gram as their unit of mass
+        factor_to_root_units, root_units = known_units.get_root_units(parsed)
         offset = known_units.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
         raise ValueError(f"{unit!r} is not a unit") from cause
@@ -243,7 +245,7 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
     if has_other_units or any(exponent != int(exponent) for exponent in exponents):
         raise ValueError(f"{unit!r} is not an SI unit")
     exponent_of_mass = int(exponents[0])
-    factor = Fraction(str(factor_to_grams)) / Fraction(1000) ** exponent_of_mass
+    factor = Fraction(str(factor_to_root_units)) / Fraction(1000) ** exponent_of_mass
     if not _SMALLEST_FACTOR < abs(factor) < _LARGEST_FACTOR:
         raise ValueError(f"{unit!r} is beyond the numbers of a computer")
     return ExactMeaning(tuple(int(exponent) for exponent in exponents), factor, Fraction(offset))

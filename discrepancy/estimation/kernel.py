@@ -59,9 +59,11 @@ def weight_moved_to_end(
     """Return the fraction of a force's weight at the start of a substep that moves to its end.
 
     Let s be the stiffness of a law over the substep: the decrease of its force by the motion that
-    the force causes. The theta scheme changes no sign if theta is at least 1 - 1 / s. With a
-    fraction w moved to the end theta is (1 + w) / 2, so that w is 1 - 2 / s; it is zero below
-    s = 2.
+    a unit of the force causes. An error e of the force becomes
+    e (1 - (1 - theta) s) / (1 + theta s) in the theta scheme, which keeps the sign of e if theta is
+    at least 1 - 1 / s. The weights at start and end are equal at first, theta = 1/2. If a fraction
+    w of the weight at the start moves to the end, theta is (1 + w) / 2, so that w must be 1 - 2 / s
+    for s > 2, and zero below.
 
     Parameters
     ----------

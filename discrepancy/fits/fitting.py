@@ -364,15 +364,16 @@ class _Descent:
         state : FitState
             The point with its residuals and derivatives.
         damping : float
-            The factor on the diagonal of the matrix that is added to it.
+            The Levenberg-Marquardt factor d: the matrix H of the normal equations is replaced by
+            H + d diag(H).
 
         Returns
         -------
         step : Point
             The change of each unknown.
         predicted_decrease : float
-            The predicted decrease of the objective: half of the gradient times the step, which is
-            that of the quadratic model for a step without damping [nat].
+            The decrease of the objective that its quadratic model predicts for an undamped step,
+            g^T s / 2, with the negative gradient g and the step s [nat].
         """
         problem = self.problem
         first_effect = problem.shared.unknown_count

@@ -404,9 +404,10 @@ class Problem:
     def recorded_misfit(self, squares: FloatArray) -> float:
         """Return -ln L if the noise is exactly as recorded, up to a constant [nat].
 
-        Its constant is that of the evidence with a missing force, where the noise is taken as
-        recorded too, and where readings are counted in units of the noise's standard deviation. A
-        whitened reading has a smaller standard deviation, that of the innovations of the noise.
+        The misfit is the sum of squares / 2, plus ln(deviation of a whitened reading / standard
+        deviation of the noise) for each reading. The second term makes the constant equal to that
+        of the evidence with a missing force, which counts readings in standard deviations of the
+        noise. Coloured noise has the smaller deviation after whitening, that of its innovations.
 
         Parameters
         ----------

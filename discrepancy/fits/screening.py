@@ -249,7 +249,7 @@ class Screen:
     def changes_on_grid(
         self, term: EffectTerm, *, with_small_magnitude: bool = True
     ) -> Iterator[ScreenedChange]:
-        """Yield the changes by an effect over a grid of its parameters.
+        """Yield the changes of the readings by an effect, over a grid of its parameters.
 
         Points of the grid at which the model cannot be evaluated are left out.
 
@@ -263,11 +263,11 @@ class Screen:
         """
         has_change = False
         refusal = None
-        for start in parameter_grid(
+        for values in parameter_grid(
             term, self._spectral_peaks(term), with_small_magnitude=with_small_magnitude
         ):
             try:
-                change = self.change_by_effect(term, start)
+                change = self.change_by_effect(term, values)
             except DiscrepancyError as cause:  # such as more stiffness removed than there is
                 refusal = cause
             else:

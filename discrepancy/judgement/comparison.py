@@ -252,9 +252,9 @@ class Comparison(ABC, Generic[HypothesisT]):
     def nameable_hypotheses(self) -> list[HypothesisT]:
         """The hypotheses that may be named, in descending order of score.
 
-        Errors of readings are removed from sets that contain laws too, since together with a law
-        they describe whatever the law does not explain. A set without them keeps the score of the
-        whole set.
+        A set that contains both laws and errors of readings is fitted again without the errors of
+        readings: beside a law, these fit whatever remains. The smaller set is ranked by the score
+        of the whole set.
         """
         contenders_with_scores: dict[CandidateKey, tuple[HypothesisT, float]] = {}
         for hypothesis in self.ranked_hypotheses:

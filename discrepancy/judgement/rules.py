@@ -96,15 +96,16 @@ class VerdictCase:
     def probability(self) -> float:
         """The probability that the effects of the leading set are missing in the model.
 
-        It is summed over all sets that contain the leading one, with or without further effects.
-        For a law of free shape it includes all effects of its family.
+        It is the sum over all sets that contain the effects of the leading set. The exponents of a
+        law of free shape are fitted, so that all effects of its family (such as all dampings) can
+        become the same law. The probability of the family is then returned if it is larger.
         """
         leading_names = set(names_without_free_shape(self.leading_set))
         total_probability: float = 0
         for names, probability in self.probabilities.items():
             if leading_names <= set(names_without_free_shape(names)):
                 total_probability += probability
-        # with a free shape, a family is reached from several of its effects and at several places
+        # the same law of free shape is counted under several effects and at several places
         if self.leading_fit.candidate.has_free_shape:
             family = self.leading_fit.candidate.terms[0].effect.family
             total_probability = max(total_probability, _family_probability(self.search, family))

@@ -343,7 +343,7 @@ def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) 
 def _search_round(
     search: EventSearch, forces: ForcePair, paths: Sequence[BoolArray], evaluations: int
 ) -> Events:
-    """Return events after one round: new stretches, then the forces fitted to them.
+    """Return the events after one round: first new stretches of time, then forces fitted to them.
 
     Parameters
     ----------
@@ -352,7 +352,7 @@ def _search_round(
     forces : (Process, Process)
         The force of events, and the force throughout.
     paths : sequence of (N,) array of bool
-        The path of each trial to begin with.
+        For each trial the present stretches: true at samples within an event.
     evaluations : int
         The largest number of evaluations of the evidence in the fit.
     """

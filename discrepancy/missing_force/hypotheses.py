@@ -295,7 +295,7 @@ class ColumnBuilder:
         candidate: Candidate,
         values: FloatArray,
     ) -> EffectColumn | None:
-        """Return the column of all effects of a candidate together, along motions.
+        """Return how all effects of a candidate together change the readings, for given motions.
 
         Parameters
         ----------

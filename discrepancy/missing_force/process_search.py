@@ -193,7 +193,7 @@ class ProcessSearch:
     def _curvature(
         self, logs: FloatArray, value: float, values_above: FloatArray, values_below: FloatArray
     ) -> FloatArray:
-        """Return the second differences (2 P, 2 P) of the value, by all pairs of logarithms.
+        """Return the second differences (2 P, 2 P) of the value for all pairs of logarithms.
 
         They are the second derivatives, multiplied by `DIFFERENCE` squared.
 

@@ -222,7 +222,7 @@ class ForceShares:
             return hypothesis.linear_trials, motion_estimate.motions
         assert self._held_out is not None
         builder = self._held_out
-        linear_trials = self._held_out_trials_about_unknowns_of(hypothesis)
+        linear_trials = self._held_out_linearised_as(hypothesis)
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
         motions = linear_trials.smooth(processes, solution).motions
         # the laws act along the motion, which in turn depends on their force: iterate
@@ -236,8 +236,8 @@ class ForceShares:
             motions = linear_trials.smooth(processes, solution).motions
         return linear_trials, motions
 
-    def _held_out_trials_about_unknowns_of(self, hypothesis: ForceHypothesis) -> LinearTrials:
-        """Return the held-out trials, linear about the same shared unknowns as the fitted trials.
+    def _held_out_linearised_as(self, hypothesis: ForceHypothesis) -> LinearTrials:
+        """Return the held-out trials, linearised about the same values as the fitted trials.
 
         Parameters
         ----------

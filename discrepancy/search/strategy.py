@@ -530,7 +530,7 @@ class Search(FittedCandidates):
             self.record_fit(free_fit, exact=True)
 
     def fit_pairs(self) -> None:
-        """Fit the pairs of effects that reduce the misfit most by a screen without effect."""
+        """Fit the pairs of effects that reduce the misfit most, according to a linear screen."""
         screen = Screen(self.problem, self.no_effect)
         changes: list[ScreenedChange] = []
         for effect in self.effects:

@@ -183,7 +183,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return motions
 
     def _port_load(self, primitive: PortLoad) -> Load:
-        """Return the load of a force by a formula in time.
+        """Return the load for a force that is given as a formula of time.
 
         Raises
         ------

@@ -497,11 +497,12 @@ class SystemModel(Model):
         if excitation.release is None:
             directions, levels = excitation.load_levels
             return np.asarray(levels @ system.equilibrium_under(directions))
-        # shape under a force at the release point, scaled to the displacement of that point
-        row = excitation.release.row
-        shape = system.equilibrium_under(row[None])
-        displacement = excitation.release.release.displacement
-        return np.asarray(displacement / float(row @ shape[0]) * shape)
+        # The structure is held at the release point, so that it has the shape under a force there.
+        # The same row gives the direction of that force and the displacement of the point.
+        release_row = excitation.release.row
+        shape = system.equilibrium_under(release_row[None])
+        release_displacement = excitation.release.release.displacement
+        return np.asarray(release_displacement / float(release_row @ shape[0]) * shape)
 
 
 def _output_rows_at_rest(

@@ -193,7 +193,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     point : (3,) array
         The position of the point [m].
     where : str
-        Begins the sentence on a point that lies too far off.
+        The beginning of the error message, which says which point is meant.
 
     Raises
     ------
@@ -202,6 +202,9 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     """
     spheres = mesh.face_spheres
     centre_distance = np.linalg.norm(spheres.centre - point, axis=1)
+    # A face can be the nearest one only if its sphere comes as near as the nearest centre of a
+    # face, which itself lies on or close to the surface. A tenth is added, since a curved face may
+    # reach beyond its sphere.
     faces = np.flatnonzero(centre_distance - 1.1 * spheres.radius <= centre_distance.min())
     cells = mesh.boundary.cell[faces]
     nearest_points = _nearest_on_faces(mesh, point, cells, mesh.boundary.face[faces])

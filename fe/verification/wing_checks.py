@@ -279,12 +279,13 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
 
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
-    """Yield the checks of the wing's forces, masses and energies, at the load factor of its lift.
+    """Yield the checks of the wing's forces, masses and energies.
 
-    First, rigid motions must cause no elastic force. The figure is the largest entry of K r,
-    for all rigid motions r that the root allows and without the springs of the root, relative to
-    the largest entry of |K| |r|: the size of the terms that cancel, and so of their rounding
-    errors. Then come the balances of `wing_balance`, each as the relative difference of two sums.
+    First, rigid motions must cause no elastic force. With the stiffness K_0 without the springs of
+    the root, and all rigid motions r that the root allows, the figure is the largest entry of K_0 r
+    relative to the largest entry of |K| |r|. That is the size of the terms that cancel, and so of
+    their rounding errors. Then come the balances of `wing_balance` at the load factor of the lift
+    that the design states, each as the relative difference of two sums.
 
     Parameters
     ----------

@@ -44,15 +44,15 @@ class InputSlot(NamedTuple):
         return self.variable.kind not in FLOAT_KINDS
 
     def numbers(self, values: npt.ArrayLike, *, history: bool = False) -> Float:
-        """Return values in the FMU's unit, after checking all of them.
+        """Check the values of an input, and return them in the unit of the FMU.
 
         Parameters
         ----------
         values : float, str or array_like
-            The n values of the input in the binding's unit. For a history, either these for all
-            steps, or N times as many, one set for each step.
+            The n values of the input in the binding's unit. A history has N n values, n for each of
+            N steps, or n values that hold for all steps.
         history : bool
-            Whether it is a history.
+            Whether the values may differ from step to step.
 
         Returns
         -------

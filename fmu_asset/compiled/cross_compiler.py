@@ -51,7 +51,7 @@ def find_cross_compiler() -> list[str]:
 
 
 def cross_compile_library(sources: Mapping[str, bytes], targets: Sequence[Target]) -> bytes:
-    """Return the shared library of C sources for another platform than this host.
+    """Return the shared library of C sources for a platform other than this host.
 
     The same sources and version of ziglang give the same bytes.
 

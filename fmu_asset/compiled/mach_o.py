@@ -24,7 +24,7 @@ def fat_library(libraries: Sequence[bytes]) -> bytes:
     Parameters
     ----------
     libraries : sequence of bytes
-        64-bit Mach-O libraries, each for another processor.
+        64-bit Mach-O libraries, each for a different processor.
 
     Raises
     ------
@@ -33,7 +33,8 @@ def fat_library(libraries: Sequence[bytes]) -> bytes:
     """
     alignment = 2**_ALIGNMENT_EXPONENT
     header = _FAT_HEADER.pack(FAT_MAGIC, len(libraries))
-    content = bytes(_FAT_HEADER.size + len(libraries) * _FAT_ENTRY.size)  # the place of the header
+    # zeros take the place of the header until it is known
+    content = bytes(_FAT_HEADER.size + len(libraries) * _FAT_ENTRY.size)
     for library in libraries:
         if library[:4] != struct.pack("<I", THIN_MAGIC):
             raise FmuBuildError(
