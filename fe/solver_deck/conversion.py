@@ -1,0 +1,287 @@
+"""From a deck of CalculiX to a structure from matrices, checked against CalculiX itself."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import CalculixError
+from fe.structure.affine import AffineStructure, natural_frequencies, static_responses
+from fe.structure.abaqus import KeywordBlock
+from fe.structure.matrix_files import READ_WEIGHTS
+from fe.structure.operators import assemble_structure
+from fe.structure.tables import UNITS
+from fe.verification.calculix_run import required_calculix
+
+from .calculix_jobs import CalculixJobs, StoredMatrices
+from .linear_model import TRANSLATIONS, ContactChoice, HeldMotion, LinearModel, read_linear_model
+from .loads import DeckLoad, read_loads
+from .regions import (
+    Region,
+    choose_regions,
+    with_densities,
+    with_own_materials,
+    with_scaled_modulus,
+)
+from .structure_file import (
+    DeckStructure,
+    choose_output_sets,
+    has_rows_for,
+    row_counts,
+    write_structure_files,
+)
+
+_CHANGED_MODULUS = 0.5
+"""By what the modulus of a region is multiplied to find its stiffness."""
+_COMPARED_MODES = 6
+
+
+@dataclass(frozen=True)
+class DeckOptions:
+    """What a user chooses of a deck.
+
+    Attributes
+    ----------
+    length_unit : str
+        Unit of length of the deck.
+    regions, outputs : sequence of str
+        Sets of elements that may lose stiffness, and of nodes whose displacement is an output; if
+        empty, they are chosen.
+    contact : "tied" or "open"
+        What becomes of contact pairs.
+    time_limit : float
+        Time that a run of CalculiX may take [s].
+    tolerance : float
+        Largest relative deviation from CalculiX.
+    """
+
+    length_unit: str = "mm"
+    regions: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    contact: ContactChoice = "tied"
+    time_limit: float = 600.0
+    tolerance: float = 1e-5
+
+
+@dataclass(frozen=True)
+class DeckReport:
+    """A structure that was made from a deck, and how it agrees with CalculiX.
+
+    Attributes
+    ----------
+    unknowns : int
+        Number of unknowns.
+    regions : list of Region
+        The regions that may lose stiffness.
+    load_deviations : dict of str to float
+        For each load the largest difference of a nodal displacement to that of CalculiX, over the
+        largest displacement.
+    frequencies : (m,) array
+        Lowest frequencies [Hz]; empty if the deck has no density.
+    frequency_deviation : float
+        Largest relative difference of a frequency to that of CalculiX.
+    remarks : list of str
+        Sentences on what is linearised and what is left out.
+    """
+
+    unknowns: int
+    regions: list[Region]
+    load_deviations: dict[str, float]
+    frequencies: FloatArray
+    frequency_deviation: float
+    remarks: list[str]
+
+
+def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
+    """Write a deck as a structure from matrices, and compare it with CalculiX.
+
+    Parameters
+    ----------
+    deck : Path
+        The deck.
+    folder : Path
+        An existing empty folder for the structure. CalculiX works in its folder `calculix`.
+    name : str
+        Name of the structure and of its file.
+    options : DeckOptions
+        What the user chooses.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not installed or fails, or if the structure deviates from it by more than
+        the tolerance.
+    MeshError
+        If the deck cannot be read, or is not one of an elastic structure that is held.
+    """
+    required_calculix()
+    model = read_linear_model(deck, options.contact)
+    regions = choose_regions(model, options.regions)
+    jobs = CalculixJobs(model, folder / "calculix", options.time_limit)
+    blocks = with_densities(model, with_own_materials(model, regions))
+    structure, remarks = _structure_of_deck(jobs, blocks, regions, options)
+    file = write_structure_files(structure, folder, name)
+    report = _compare(file, structure, jobs, blocks, [*model.remarks, *remarks])
+    _refuse_deviations(deck, report, options.tolerance)
+    return report
+
+
+def _structure_of_deck(
+    jobs: CalculixJobs, blocks: list[KeywordBlock], regions: list[Region], options: DeckOptions
+) -> tuple[DeckStructure, list[str]]:
+    """Return a deck as matrices, and sentences on loads that are left out."""
+    model = jobs.model
+    matrices = jobs.matrices("whole", blocks)
+    region_stiffness = {}
+    for number, region in enumerate(regions, start=1):
+        changed = jobs.matrices(
+            f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
+        )
+        if changed.places != matrices.places:
+            raise CalculixError(
+                f"{model.path}: the matrices of one run have other rows when the modulus of "
+                f"{region.set_name} changes; name other regions by --region."
+            )
+        difference = matrices.stiffness - changed.stiffness
+        region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
+    deck_loads = read_loads(model)
+    remarks = deck_loads.remarks
+    counts = row_counts(matrices.places)
+    loads = []
+    for load in deck_loads.loads:
+        if has_rows_for(load, counts, set(model.held)):
+            loads.append(load)
+        else:
+            remarks.append(
+                f"the load {load.name} is left out: it acts on nodes that the matrices do not "
+                "have, such as those of a tied surface"
+            )
+    if not model.has_mass:
+        matrices = StoredMatrices(matrices.stiffness, 0.0 * matrices.mass, matrices.places)
+        remarks.append("the deck has no *DENSITY: the structure has no mass, hence no modes")
+    structure = DeckStructure(
+        model=model,
+        matrices=matrices,
+        region_stiffness=region_stiffness,
+        loads=loads,
+        gravity_forces=_gravity_forces(jobs, blocks, loads, matrices),
+        output_sets=choose_output_sets(model, counts, options.outputs),
+        length_unit=options.length_unit,
+    )
+    return structure, remarks
+
+
+def _gravity_forces(
+    jobs: CalculixJobs,
+    blocks: list[KeywordBlock],
+    loads: list[DeckLoad],
+    matrices: StoredMatrices,
+) -> dict[str, FloatArray]:
+    """Return the nodal forces (n,) of each load that has an acceleration.
+
+    The rows of held nodes are missing in the mass matrix, but their mass also loads the nodes
+    beside them. For this reason the mass matrix of the structure without supports is multiplied by
+    the acceleration, and the rows of both are matched by name.
+    """
+    accelerations = {
+        load.name: load.acceleration for load in loads if load.acceleration is not None
+    }
+    if not accelerations:
+        return {}
+    free = jobs.matrices("free", blocks, free=True)
+    forces = {}
+    for name, acceleration in accelerations.items():
+        field = [
+            acceleration[axis - 1] if node in jobs.model.mesh.points else 0.0
+            for node, axis in free.places
+        ]
+        free_forces = free.mass @ np.array(field)
+        forces[name] = _matched_rows(free_forces, free, matrices)
+    return forces
+
+
+def _matched_rows(
+    values: FloatArray, source: StoredMatrices, target: StoredMatrices
+) -> FloatArray:
+    """Return the values of the target's rows, matched by name and order.
+
+    Names with other numbers of rows belong to held nodes; their values are zero.
+    """
+    source_counts = row_counts(source.places)
+    target_counts = row_counts(target.places)
+    values_of_place: dict[tuple[int, int], list[float]] = {}
+    for place, value in zip(source.places, values.tolist(), strict=True):
+        values_of_place.setdefault(place, []).append(value)
+    matched = []
+    for place in target.places:
+        if source_counts.get(place) == target_counts[place]:
+            matched.append(values_of_place[place].pop(0))
+        else:
+            matched.append(0.0)
+    return np.array(matched)
+
+
+def _compare(
+    file: Path,
+    structure: DeckStructure,
+    jobs: CalculixJobs,
+    blocks: list[KeywordBlock],
+    remarks: list[str],
+) -> DeckReport:
+    """Return how a structure file agrees with CalculiX in statics and frequencies."""
+    assembled = assemble_structure(file)
+    deviations = {}
+    if structure.loads:
+        printed = jobs.displacements(structure.loads, blocks)
+        responses = static_responses(assembled)
+        for load, theirs in zip(structure.loads, printed, strict=True):
+            ours = assembled.full_displacement(responses[load.name].displacement)
+            scale = UNITS[structure.length_unit]
+            deviations[load.name] = _largest_deviation(structure, ours / scale, theirs)
+    frequencies = np.empty(0)
+    frequency_deviation = 0.0
+    if structure.model.has_mass:
+        count = min(_COMPARED_MODES, max(1, assembled.unknowns // 4))
+        frequencies = natural_frequencies(assembled, count).frequency
+        calculix_frequencies = jobs.frequencies(count, blocks)
+        frequency_deviation = float(np.abs(frequencies / calculix_frequencies - 1.0).max())
+    return DeckReport(
+        unknowns=assembled.unknowns,
+        regions=list(structure.region_stiffness),
+        load_deviations=deviations,
+        frequencies=frequencies,
+        frequency_deviation=frequency_deviation,
+        remarks=remarks,
+    )
+
+
+def _largest_deviation(
+    structure: DeckStructure, ours: FloatArray, theirs: dict[int, FloatArray]
+) -> float:
+    """Return the largest difference of a nodal displacement, over the largest displacement."""
+    counts = structure.row_counts()
+    held = set(structure.model.held)
+    nodes = sorted({node for node, _ in structure.matrices.places})
+    differences = [0.0]
+    largest = max(float(np.abs(row).max()) for row in theirs.values())
+    for node, displacement in zip(nodes, ours, strict=True):
+        for axis in TRANSLATIONS:
+            is_read = counts.get((node, axis)) in READ_WEIGHTS
+            if node in theirs and is_read and HeldMotion(node, axis) not in held:
+                differences.append(abs(float(displacement[axis - 1] - theirs[node][axis - 1])))
+    return max(differences) / largest if largest > 0.0 else 0.0
+
+
+def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
+    """Raise `CalculixError` if the structure deviates from CalculiX by more than the tolerance."""
+    deviations = {f"displacements under {name}": value for name, value in report.load_deviations.items()}
+    deviations["frequencies"] = report.frequency_deviation
+    worst = max(deviations, key=lambda name: deviations[name])
+    if not deviations[worst] <= tolerance:
+        raise CalculixError(
+            f"{deck}: the matrices and CalculiX must agree to {tolerance:g}, but the {worst} differ "
+            f"by {deviations[worst]:.2g}; no structure was written. Remove what is not linear, or "
+            "allow more by --tolerance."
+        )
