@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import CalculixError
+from fe.runtime.errors import CalculixError, MeshError
 from fe.structure.affine import AffineStructure, natural_frequencies, static_responses
 from fe.structure.abaqus import KeywordBlock
 from fe.structure.matrix_files import READ_WEIGHTS
@@ -231,7 +231,10 @@ def _compare(
     remarks: list[str],
 ) -> DeckReport:
     """Return how a structure file agrees with CalculiX in statics and frequencies."""
-    assembled = assemble_structure(file)
+    try:
+        assembled = assemble_structure(file)
+    except MeshError as error:
+        raise MeshError(f"{structure.model.path}: {error}") from None
     deviations = {}
     if structure.loads:
         printed = jobs.displacements(structure.loads, blocks)

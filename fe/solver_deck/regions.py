@@ -23,7 +23,6 @@ _PROPERTIES = {
 
 _MODULI = {
     "ISO": (0,),
-    "ISOTROPIC": (0,),
     "ORTHO": tuple(range(9)),
     "ANISO": tuple(range(21)),
     "ENGINEERING CONSTANTS": (0, 1, 2, 6, 7, 8),
@@ -32,7 +31,6 @@ _MODULI = {
 
 _CONSTANTS = {
     "ISO": 2,
-    "ISOTROPIC": 2,
     "ORTHO": 9,
     "ANISO": 21,
     "ENGINEERING CONSTANTS": 9,
@@ -276,11 +274,13 @@ def _element_set(section: KeywordBlock, name: str, members: Sequence[int]) -> Ke
 
 def _with_scaled_constants(block: KeywordBlock, factor: float) -> KeywordBlock:
     """Return an *ELASTIC whose moduli are multiplied by a factor, at every temperature."""
-    kind = block.parameters.get("TYPE", "ISO").upper() or "ISO"
-    if kind not in _MODULI:
+    type_name = block.parameters.get("TYPE", "ISO").upper()
+    # CalculiX reads the beginning of the word alone, so that ISOTROPIC is ISO.
+    kind = next((name for name in _MODULI if type_name.startswith(name[:5])), None)
+    if kind is None:
         raise MeshError(
             f"{block.where}: *ELASTIC of TYPE {comma_list(list(_MODULI))} is expected, but "
-            f"{kind} was given."
+            f"{type_name} was given."
         )
     constants = _scaled_records(block, _record_widths(kind), _MODULI[kind], factor)
     return block._replace(data=constants)
