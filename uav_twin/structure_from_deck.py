@@ -45,8 +45,8 @@ def from_deck(
         list[str] | None,
         typer.Option(
             "--output",
-            help="A set of nodes whose mean displacement is an output; may be given several times. "
-            "By default the first twelve sets that can move.",
+            help="A set of nodes whose mean displacement is an output, also along some axes alone, "
+            "as TIP:z; may be given several times. By default the first twelve sets that can move.",
         ),
     ] = None,
     contact: Annotated[

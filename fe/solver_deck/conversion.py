@@ -8,15 +8,15 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError, MeshError
-from fe.structure.affine import AffineStructure, natural_frequencies, static_responses
 from fe.structure.abaqus import KeywordBlock
+from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.matrix_files import READ_WEIGHTS
 from fe.structure.operators import assemble_structure
 from fe.structure.tables import UNITS
 from fe.verification.calculix_run import required_calculix
 
 from .calculix_jobs import CalculixJobs, StoredMatrices
-from .linear_model import TRANSLATIONS, ContactChoice, HeldMotion, LinearModel, read_linear_model
+from .linear_model import TRANSLATIONS, ContactChoice, HeldMotion, read_linear_model
 from .loads import DeckLoad, read_loads
 from .regions import (
     Region,
@@ -36,6 +36,8 @@ from .structure_file import (
 _CHANGED_MODULUS = 0.5
 """By what the modulus of a region is multiplied to find its stiffness."""
 _COMPARED_MODES = 6
+_ROUNDING = 1e-12
+"""A region changes nothing if it changes no entry by this fraction of the largest one."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,7 @@ def _structure_of_deck(
     """Return a deck as matrices, and sentences on loads that are left out."""
     model = jobs.model
     matrices = jobs.matrices("whole", blocks)
+    remarks: list[str] = []
     region_stiffness = {}
     for number, region in enumerate(regions, start=1):
         changed = jobs.matrices(
@@ -145,9 +148,14 @@ def _structure_of_deck(
                 f"{region.set_name} changes; name other regions by --region."
             )
         difference = matrices.stiffness - changed.stiffness
-        region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
+        if abs(difference).max() > _ROUNDING * abs(matrices.stiffness).max():
+            region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
+        else:
+            remarks.append(
+                f"{region.set_name} is no region: its modulus changes nothing that can move"
+            )
     deck_loads = read_loads(model)
-    remarks = deck_loads.remarks
+    remarks += deck_loads.remarks
     counts = row_counts(matrices.places)
     loads = []
     for load in deck_loads.loads:
@@ -202,9 +210,7 @@ def _gravity_forces(
     return forces
 
 
-def _matched_rows(
-    values: FloatArray, source: StoredMatrices, target: StoredMatrices
-) -> FloatArray:
+def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatrices) -> FloatArray:
     """Return the values of the target's rows, matched by name and order.
 
     Names with other numbers of rows belong to held nodes; their values are zero.
@@ -279,12 +285,14 @@ def _largest_deviation(
 
 def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
     """Raise `CalculixError` if the structure deviates from CalculiX by more than the tolerance."""
-    deviations = {f"displacements under {name}": value for name, value in report.load_deviations.items()}
+    deviations = {
+        f"displacements under {name}": value for name, value in report.load_deviations.items()
+    }
     deviations["frequencies"] = report.frequency_deviation
     worst = max(deviations, key=lambda name: deviations[name])
     if not deviations[worst] <= tolerance:
         raise CalculixError(
-            f"{deck}: the matrices and CalculiX must agree to {tolerance:g}, but the {worst} differ "
-            f"by {deviations[worst]:.2g}; no structure was written. Remove what is not linear, or "
+            f"{deck}: the matrices and CalculiX must agree to {tolerance:g}, but the {worst} "
+            f"differ by {deviations[worst]:.2g}; no structure was written. Remove what is not linear, or "
             "allow more by --tolerance."
         )

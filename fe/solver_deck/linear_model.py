@@ -128,7 +128,10 @@ class LinearModel:
     has_mass: bool
 
     def text(
-        self, *steps: Iterable[str], blocks: Sequence[KeywordBlock] | None = None, free: bool = False
+        self,
+        *steps: Iterable[str],
+        blocks: Sequence[KeywordBlock] | None = None,
+        free: bool = False,
     ) -> str:
         """Return the deck of this model with the given steps.
 
@@ -269,9 +272,7 @@ def _supports(
     return supports
 
 
-def _held_motions(
-    supports: list[KeywordBlock], mesh: DeckMesh
-) -> tuple[list[HeldMotion], bool]:
+def _held_motions(supports: list[KeywordBlock], mesh: DeckMesh) -> tuple[list[HeldMotion], bool]:
     """Return the motions that *BOUNDARY holds, and whether it moves any of them."""
     held: dict[HeldMotion, None] = {}
     moved = False
@@ -280,9 +281,7 @@ def _held_motions(
             name, first_text, last_text, value_text, *_ = [*values, "", "", "", ""]
             first = whole(where, first_text)
             last = whole(where, last_text) if last_text else first
-            directions = [
-                direction for direction in range(first, last + 1) if 1 <= direction <= 6
-            ]
+            directions = [direction for direction in range(first, last + 1) if 1 <= direction <= 6]
             moved = moved or bool(directions and real(where, value_text))
             for node in mesh.nodes_named(name, where):
                 held |= dict.fromkeys(HeldMotion(node, direction) for direction in directions)

@@ -20,7 +20,14 @@ NodalForces = dict[tuple[int, int], float]
 """Force at a node along an axis, by node and direction."""
 
 _KIND_BY_TYPE = {kind.calculix: kind for kind in DECK_KINDS.values()}
-_SHELL_SOLIDS = {"S3": "C3D6", "S4": "C3D8", "S4R": "C3D8", "S6": "C3D15", "S8": "C3D20", "S8R": "C3D20"}
+_SHELL_SOLIDS = {
+    "S3": "C3D6",
+    "S4": "C3D8",
+    "S4R": "C3D8",
+    "S6": "C3D15",
+    "S8": "C3D20",
+    "S8R": "C3D20",
+}
 """The solid whose first face has the shape functions of a shell."""
 
 
@@ -65,9 +72,7 @@ def read_loads(model: LinearModel) -> DeckLoads:
     """
     loads: list[DeckLoad] = []
     remarks: list[str] = []
-    steps_with_loads = [
-        step for step in model.steps if any(_is_load(block) for block in step)
-    ]
+    steps_with_loads = [step for step in model.steps if any(_is_load(block) for block in step)]
     for number, step in enumerate(steps_with_loads, start=1):
         suffix = f"_{number}" if len(steps_with_loads) > 1 else ""
         in_step: dict[str, DeckLoad] = {}
@@ -116,7 +121,9 @@ def _add_block(
         for place, force in forces.items():
             load.forces[place] = load.forces.get(place, 0.0) + force
         if acceleration is not None:
-            load.acceleration = acceleration + (0.0 if load.acceleration is None else load.acceleration)
+            load.acceleration = acceleration + (
+                0.0 if load.acceleration is None else load.acceleration
+            )
 
 
 def _entry(values: Sequence[str], number: int) -> str:

@@ -92,9 +92,9 @@ def _members(sets: dict[str, list[int]], text: str, where: str) -> list[int]:
     name = text.upper()
     if name in sets:
         return sets[name]
-    if text.isdigit():
-        return [int(text)]
-    fail(where, f"a number or the name of a set is expected, but {text!r} was given.")
+    if not text.isdigit():
+        fail(where, f"a number or the name of a set is expected, but {text!r} was given.")
+    return [int(text)]
 
 
 def _add_nodes(mesh: DeckMesh, block: KeywordBlock) -> None:

@@ -300,9 +300,7 @@ def _scaled_records(
     block: KeywordBlock, widths: Sequence[int], moduli: Sequence[int], factor: float
 ) -> list[DataLine]:
     """Return the lines of constants in which the moduli are multiplied by a factor."""
-    starts: Mapping[int, int] = {
-        line: sum(widths[:line]) for line in range(len(widths))
-    }
+    starts: Mapping[int, int] = {line: sum(widths[:line]) for line in range(len(widths))}
     lines = []
     for number, (where, values) in enumerate(block.data):
         start = starts[number % len(widths)]

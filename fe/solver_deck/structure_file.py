@@ -4,11 +4,13 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import MeshError
 from fe.structure.matrix_files import FORCE_WEIGHTS, READ_WEIGHTS
 from fe.structure.matrix_tables import Place
 
@@ -23,6 +25,24 @@ LARGEST_NAME = 28
 """Longest name of a set in the file, to which an axis is added."""
 MOST_OUTPUTS = 12
 """Sets of nodes that become outputs, if none is named."""
+
+
+class OutputSet(NamedTuple):
+    """A set of nodes whose mean displacement is an output.
+
+    Attributes
+    ----------
+    name : str
+        Name of the set in the deck.
+    nodes : list of int
+        Those of its nodes that can move and have rows in the matrices.
+    axes : str
+        The axes of the displacements: some of "xyz".
+    """
+
+    name: str
+    nodes: list[int]
+    axes: str
 
 
 @dataclass(frozen=True)
@@ -41,8 +61,8 @@ class DeckStructure:
         The loads.
     gravity_forces : dict of str to (n,) array
         Force of gravity of each load that has one.
-    output_sets : dict of str to list of int
-        Nodes of each set that is an output.
+    output_sets : list of OutputSet
+        The sets of nodes whose displacement is an output.
     length_unit : str
         Unit of length of the deck.
     """
@@ -52,7 +72,7 @@ class DeckStructure:
     region_stiffness: dict[Region, sparse.csr_array]
     loads: list[DeckLoad]
     gravity_forces: dict[str, FloatArray]
-    output_sets: dict[str, list[int]]
+    output_sets: list[OutputSet]
     length_unit: str
 
     def row_counts(self) -> dict[Place, int]:
@@ -70,8 +90,8 @@ def row_counts(places: Sequence[Place]) -> dict[Place, int]:
 
 def choose_output_sets(
     model: LinearModel, counts: dict[Place, int], names: Sequence[str]
-) -> dict[str, list[int]]:
-    """Return the nodes of each set whose displacement is an output.
+) -> list[OutputSet]:
+    """Return the sets of nodes whose displacement is an output.
 
     Parameters
     ----------
@@ -80,20 +100,53 @@ def choose_output_sets(
     counts : dict of Place to int
         How many rows each direction of a node has.
     names : sequence of str
-        Names of sets of nodes; if it is empty, the first sets that do not hold all nodes.
+        Names of sets of nodes, each alone or with axes, as `TIP` or `TIP:z`; if it is empty, the
+        first sets that hold at most half of the nodes.
+
+    Raises
+    ------
+    MeshError
+        If a name is no set or number of nodes, if its axes are none, or if none of its nodes can
+        be read.
     """
+    if not names:
+        return _sets_of_deck(model, counts)
+    sets = []
+    for text in names:
+        name, _, axes = text.partition(":")
+        axes = axes.lower() or "xyz"
+        if not set(axes) <= set("xyz"):
+            raise MeshError(
+                f"--output {text}: a set of nodes is expected, alone or with axes, as TIP:z, but "
+                f"the axes {axes} were given."
+            )
+        members = model.mesh.nodes_named(name, f"--output {text}")
+        nodes = _readable_nodes(model, counts, members)
+        if not nodes:
+            raise MeshError(
+                f"--output {text}: a set with nodes that can move is expected, but all its nodes "
+                "are held, or tied to others; name another set."
+            )
+        sets.append(OutputSet(name.upper(), nodes, axes))
+    return sets
+
+
+def _sets_of_deck(model: LinearModel, counts: dict[Place, int]) -> list[OutputSet]:
+    """Return the first sets of a deck that can move and hold at most half of the nodes."""
+    sets = []
+    for name, members in model.mesh.node_sets.items():
+        nodes = _readable_nodes(model, counts, members)
+        if nodes and len(nodes) <= 0.5 * len(model.mesh.points):
+            sets.append(OutputSet(name, nodes, "xyz"))
+    return sets[:MOST_OUTPUTS]
+
+
+def _readable_nodes(
+    model: LinearModel, counts: dict[Place, int], members: Sequence[int]
+) -> list[int]:
+    """Return the members whose displacement follows from the rows of the matrices, each once."""
     held = set(model.held)
-    sets = {}
-    for name in [name.upper() for name in names] or list(model.mesh.node_sets):
-        movable = [
-            node
-            for node in dict.fromkeys(model.mesh.nodes_named(name, "--output"))
-            if _can_be_read(node, counts, held)
-        ]
-        has_all_nodes = len(movable) > 0.5 * len(model.mesh.points) and not names
-        if movable and not has_all_nodes:
-            sets[name] = movable
-    return dict(list(sets.items())[: None if names else MOST_OUTPUTS])
+    return [node for node in dict.fromkeys(members) if _can_be_read(node, counts, held)]
 
 
 def _can_be_read(node: int, counts: dict[Place, int], held: set[HeldMotion]) -> bool:
@@ -143,8 +196,8 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
         lines += ["", "[[control]]", f'name = "{load.name}_factor"']
         lines += ["", "[[load]]", f'name = "{load.name}"', f'control = "{load.name}_factor"']
         lines += [f'vector = "{_write_load(structure, load, folder)}"']
-    for set_name, nodes in structure.output_sets.items():
-        lines += _output_lines(structure, set_name, nodes, folder)
+    for output in structure.output_sets:
+        lines += _output_lines(structure, output, folder)
     file = folder / f"{name}.toml"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return file
@@ -167,14 +220,14 @@ def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
     return file
 
 
-def _output_lines(
-    structure: DeckStructure, set_name: str, nodes: Sequence[int], folder: Path
-) -> Iterator[str]:
+def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> Iterator[str]:
     """Yield the lines of the outputs of a set: mean displacements, and the strain of a pair."""
-    name = name_in_file(set_name)[:LARGEST_NAME]
+    name = name_in_file(output.name)[:LARGEST_NAME]
     if not name[0].isalpha():
         name = f"n{name}"[:LARGEST_NAME]
-    for axis, letter in zip(TRANSLATIONS, "xyz", strict=True):
+    nodes = output.nodes
+    for letter in output.axes:
+        axis = "xyz".index(letter) + 1
         file = f"{name}_{letter}.txt"
         rows = [f"{node} {axis} {1.0 / len(nodes)!r}" for node in nodes]
         (folder / file).write_text("\n".join(rows) + "\n", encoding="ascii")
@@ -184,5 +237,5 @@ def _output_lines(
         span = second - first
         length = float(np.linalg.norm(span))
         if length > 0.0:
-            yield from ("", "[[gauge]]", f'name = "{name}"', f"nodes = {list(nodes)}")
+            yield from ("", "[[gauge]]", f'name = "{name}"', f"nodes = {nodes}")
             yield from (f"direction = {(span / length).tolist()}", f"length = {length!r}")
