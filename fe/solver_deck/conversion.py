@@ -293,6 +293,6 @@ def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None
     if not deviations[worst] <= tolerance:
         raise CalculixError(
             f"{deck}: the matrices and CalculiX must agree to {tolerance:g}, but the {worst} "
-            f"differ by {deviations[worst]:.2g}; no structure was written. Remove what is not linear, or "
-            "allow more by --tolerance."
+            f"differ by {deviations[worst]:.2g}; no structure was written. Remove what is not "
+            "linear, or allow more by --tolerance."
         )

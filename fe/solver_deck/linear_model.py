@@ -186,7 +186,7 @@ def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearMode
     all_blocks = list(read_blocks(path))
     _refuse_other_models(path, all_blocks)
     before_steps, steps = _split_steps(all_blocks)
-    blocks = []
+    blocks: list[KeywordBlock] = []
     for block in before_steps:
         if block.keyword == "CONTACT PAIR" and contact == "tied":
             blocks.append(_tie(block, len(blocks)))
